@@ -1,0 +1,1 @@
+"""The wire messages, by who speaks: workers, gateways, operators; all msgspec structs over msgpack."""

@@ -1,0 +1,49 @@
+"""What is said about environments and cases: the nouns that the other message modules are made of.
+
+In all messages unknown fields are skipped, and every field added later has a default.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+SpaceSchema = dict[str, Any]
+"""A space as a plain dict: `{"type": "Box", "shape": [2], "dtype": "float32", "low": …, "high": …}` and so on."""
+
+Split = Literal["train", "validation", "heldout"]
+PolicyScope = Literal["episode", "submit"]
+ObservationForm = Literal["arrays", "lists"]
+ObsStorage = Literal["inline", "npy", "npz"]
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """One initial condition of an environment: what its `reset` is given."""
+
+    seed: int
+    """Seed of the environment's own generator, 0 ≤ seed < 2**31."""
+    options: dict[str, Any] | None = None
+    """`reset(options=…)`; None for environments that take none."""
+
+
+class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
+    """All that anyone without the simulator knows of an environment; made by the worker that offers it."""
+
+    env: str
+    """Suite id, such as `gym/acrobot`."""
+    env_version: str
+    """Name and version of what is played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
+    obs_space: SpaceSchema
+    action_space: SpaceSchema
+    obs_storage: ObsStorage = "inline"
+    """Where feedback keeps observations: in the trajectory's rows, or in `observations.npy` / `.npz` beside it."""
+    max_episode_steps: int
+    reward_components: tuple[str, ...] = ()
+    """Names under which `info` reports parts of the reward; summed per episode in the summary."""
+    task_text: str
+    """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
+    deterministic: bool = True
+    """False when even a fresh environment does not repeat an episode from its seed and actions."""
+    renders: bool = False
+    """True when a recorded episode can have a video."""

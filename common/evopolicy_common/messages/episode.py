@@ -1,0 +1,143 @@
+"""A job, what limits it, and what came of it: what passes between coordinator and worker about episodes."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import Case, ObservationForm, PolicyScope
+
+FailureCategory = Literal[
+    # The bundle does not yield a Policy; decided by the episode at request index 0.
+    "missing_policy",
+    "denied_import",
+    "import_error",
+    "init_error",
+    # One episode's failure: the episode goes on with keyed uniform random actions.
+    "reset_error",
+    "act_error",
+    "act_timeout",
+    "episode_timeout",
+    "cpu_limit",
+    "oom",
+    "process_limit",
+    "file_limit",
+    "killed",
+]
+
+NO_POLICY: frozenset[str] = frozenset({"missing_policy", "denied_import", "import_error", "init_error"})
+"""Failure categories which, at request index 0, become the whole submit's verdict."""
+
+TIME_LIMITS: frozenset[str] = frozenset({"act_timeout", "episode_timeout", "cpu_limit"})
+"""Failure categories that the summary lists under `timeouts` too."""
+
+Record = Literal["full", "actions"]
+"""What a worker keeps of an episode: the whole trajectory, or for hidden episodes the action log only."""
+
+Tier = Literal["bwrap", "landlock", "none"]
+
+
+class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """What one episode's policy may use. All are visible in `/info.resource_limits`."""
+
+    episode_wall_s: float = 600.0
+    """Wall time of the policy's own work in one episode (import, init, reset, acts), seconds."""
+    act_wall_s: float = 20.0
+    """Wall time of one `act` or `reset`, seconds."""
+    init_wall_s: float = 60.0
+    """Wall time of importing the bundle and building the Policy, seconds."""
+    cpu_s: float = 300.0
+    """CPU time of the policy process in one episode, seconds."""
+    memory_bytes: int = 1 << 30
+    """Address space that the policy may add to what Python and the allowed packages take, bytes."""
+    processes: int = 16
+    """Threads of the policy process; it may start no process."""
+    file_bytes: int = 64 << 20
+    """What it may write to its copy of `system/` and `/tmp`, bytes together."""
+    output_bytes: int = 64 << 10
+    """What is kept of each of stdout and stderr of an episode, bytes."""
+    submit_wall_s: float | None = None
+    """Wall time of a whole submit, seconds; None (the default) for no limit."""
+
+
+class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode to play."""
+
+    index: int
+    """Request index: position in the submit's (or split's) list."""
+    episode_index: int
+    """What the policy's `reset` is given."""
+    case: Case
+    policy_seed: bytes
+    """16 bytes that seed the policy process's generators and the random actions that replace a failed policy."""
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True):
+    """Work that is leased as one piece: one episode, or with policy scope `submit` a submit's episodes in order."""
+
+    job_id: str
+    env: str
+    bundle: str | None
+    """Digest of the policy's bundle; None for keyed uniform random actions without a policy process."""
+    episodes: tuple[EpisodeSpec, ...]
+    policy_scope: PolicyScope = "episode"
+    policy_every: int = 0
+    """With scope `submit`: a new Policy every that many episodes; 0 for one Policy through all."""
+    env_meta: dict[str, Any] = {}
+    """Handed to `Policy.__init__` without the spaces, which the worker adds."""
+    observations: ObservationForm = "arrays"
+    record: Record = "full"
+    video: bool = False
+    """Also record a video of each episode (a rendered frame a row)."""
+    tier: Tier = "bwrap"
+    """The sandbox tier that the run demands."""
+    limits: ResourceLimits = ResourceLimits()
+
+
+class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
+    """Names bytes in a content-addressed store, or carries them where they are few."""
+
+    digest: str
+    """SHA-256 of the bytes, lowercase hex."""
+    size: int
+    inline: bytes | None = None
+    """The bytes themselves; None when they must be fetched by digest."""
+
+
+class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
+    """How a policy failed in one episode. A result, never a fault of ours."""
+
+    category: FailureCategory
+    step_index: int | None
+    """Step at which `act` failed, counted from 0; None before the first step."""
+    message: str
+    traceback: str = ""
+    limit: float | None = None
+    """Value of the limit that was hit, in its own unit; None when no limit was."""
+    used: float | None = None
+    """What the policy had used of it."""
+
+
+class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What one episode came to."""
+
+    index: int
+    episode_return: float
+    """Sum of the rewards; always finite."""
+    length: int
+    """Steps played."""
+    terminated: bool
+    truncated: bool
+    failure: PolicyFailure | None = None
+    reward_components: dict[str, float] = {}
+    """Per-episode sum of each of the environment's reward components."""
+    trajectory: BlobRef | None = None
+    """`trajectory` codec bytes: the whole episode, or with record `actions` the action log."""
+    video: BlobRef | None = None
+    """MP4 bytes."""
+    stdout: bytes = b""
+    stderr: bytes = b""
+    wall_s: float = 0.0
+    """Wall time from the policy's start to the last step, seconds."""
+    policy_cpu_s: float = 0.0

@@ -1,0 +1,183 @@
+"""What a run's gateway and the coordinator say to each other.
+
+No message here has a field for a seed, a hidden split, a hidden score, a worker's name or a path: what a gateway cannot
+be told, an agent cannot steal from it. A test walks every type in `GatewayReply`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import (
+    EnvironmentDescription,
+    ObservationForm,
+    PolicyScope,
+)
+from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits, Tier
+from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+
+SubmitStatus = Literal[
+    "ok",
+    "missing_policy",
+    "denied_import",
+    "import_error",
+    "init_error",
+    "rollout_timeout",
+    "quarantined",
+]
+VideoOption = Literal["off", "first", "all"]
+
+
+class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
+    """The gateway's first word, after every start of either side."""
+
+    run: str
+    token: str
+    """The run's capability; sent with every request and checked on each."""
+
+
+class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
+    """The submit that runs now."""
+
+    submit_index: int
+    n_episodes: int
+    n_done: int
+    waits_for: str = ""
+    """What it waits for when nothing of it runs, in words for the agent; empty while episodes run."""
+
+
+class RunState(msgspec.Struct, frozen=True, kw_only=True):
+    remaining_budget: int
+    n_submits: int
+    """Accepted submits so far."""
+    is_finalized: bool
+    """True when no more submits are taken."""
+    in_flight: SubmitInFlight | None = None
+
+
+class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
+    """All that is fixed for the run, and its state now."""
+
+    env: EnvironmentDescription
+    n_env_instances: int
+    """Train cases: the agent's ids are 0 … n − 1."""
+    episode_budget: int
+    min_episodes_per_submit: int
+    max_episodes_per_submit: int
+    policy_scope: PolicyScope
+    observations: ObservationForm
+    sandbox_tier: Tier
+    video: VideoOption
+    limits: ResourceLimits
+    allowed_imports: tuple[str, ...]
+    denied_imports: tuple[str, ...]
+    state: RunState
+
+
+class StateRequest(Message, frozen=True, kw_only=True, tag="state"):
+    run: str
+    token: str
+
+
+class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
+    state: RunState
+
+
+class Submit(Message, frozen=True, kw_only=True, tag="submit"):
+    """Evaluate a bundle on train cases. Safe to send again with the same key."""
+
+    run: str
+    token: str
+    key: str
+    """Idempotency key: one accepted submit for each."""
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    """Digest of the snapshot, uploaded before; None when `system/` could not be snapshot."""
+    bundle_error: PolicyFailure | None = None
+    """Why there is no bundle: becomes the verdict, charged as `protocol.md` says of a bundle without a Policy."""
+
+
+class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):
+    """The submit is durable and its episodes are charged; also the answer to a repeated key."""
+
+    submit_index: int
+    """Counts accepted submits from 0."""
+    first_global_episode: int
+    remaining_budget: int
+    """After this submit."""
+
+
+class ResultsRequest(Message, frozen=True, kw_only=True, tag="results"):
+    """A long poll for what has happened to a submit since `cursor`."""
+
+    run: str
+    token: str
+    submit_index: int
+    cursor: int
+    """0 at first, then the last page's."""
+    wait_s: float
+
+
+class EpisodeFeedback(msgspec.Struct, frozen=True, kw_only=True):
+    """One train episode as the agent may see it."""
+
+    index: int
+    """Request index."""
+    episode_return: float
+    length: int
+    failure: PolicyFailure | None
+    reward_components: dict[str, float]
+    trajectory: BlobRef
+    video: BlobRef | None
+    stdout: bytes
+    stderr: bytes
+
+
+class SubmitDone(msgspec.Struct, frozen=True, kw_only=True):
+    """A submit's end."""
+
+    status: SubmitStatus
+    n_episodes: int
+    env_instances: tuple[int, ...]
+    first_global_episode: int
+    remaining_budget: int
+    started_at: float
+    """When it was accepted, Unix time, seconds."""
+    completed_at: float
+    failure: PolicyFailure | None
+    """Why the status is not ok; None when it is."""
+    n_kept: int
+    """Episodes whose feedback is kept: all when ok; with `rollout_timeout` those before the first unfinished."""
+
+
+class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):
+    """Episodes in order of arrival; none before the submit is known to yield a Policy."""
+
+    cursor: int
+    episodes: tuple[EpisodeFeedback, ...]
+    done: SubmitDone | None
+    """Set on the page after which nothing more comes."""
+    waits_for: str = ""
+
+
+class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
+    """No more submits: sent once the agent and all its children are gone, which finalisation waits for."""
+
+    run: str
+    token: str
+    reason: str
+    """`budget_spent`, `agent_stopped`, `agent_failed`, `wall_limit`, `cancelled`."""
+    agent: dict[str, Any] = {}
+    """What the gateway has to say of the agent for `run.json`: turns, retries, tokens, version."""
+
+
+class RunClosed(Message, frozen=True, kw_only=True, tag="run_closed"):
+    """Taken; the outcome goes to the operator only."""
+
+
+GatewayRequest = OpenRun | StateRequest | Submit | ResultsRequest | CloseRun | BlobPut | BlobGet
+GatewayReply = (
+    RunOpened | StateReply | SubmitAccepted | ResultsPage | RunClosed | BlobAck | BlobChunk | Refused
+)

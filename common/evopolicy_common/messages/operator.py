@@ -1,0 +1,251 @@
+"""What an operator's commands and the coordinator say to each other. Only operators learn hidden results."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
+from evopolicy_common.messages.episode import EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
+from evopolicy_common.messages.worker import (
+    BlobAck,
+    BlobChunk,
+    BlobGet,
+    BlobPut,
+    Fingerprint,
+    Message,
+    Refused,
+)
+
+
+class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run is opened with. None means the suite's own number."""
+
+    env: str
+    entry: str
+    """Name of the agent in tables, such as `evolve` or `GPT-5.5 (Codex)`."""
+    model: str
+    exp_id: str
+    repeat: int = 0
+    attempt: int = 1
+    budget: int | None = None
+    min_episodes_per_submit: int | None = None
+    max_episodes_per_submit: int | None = None
+    n_validation: int | None = None
+    n_heldout: int | None = None
+    policy_scope: PolicyScope = "episode"
+    observations: ObservationForm = "arrays"
+    sandbox_tier: Tier = "bwrap"
+    video: VideoOption = "off"
+    limits: ResourceLimits = ResourceLimits()
+    notes: dict[str, str] = {}
+    """The operator's own labels; kept in `run.json`."""
+
+
+class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
+    token: str
+    key: str
+    """Idempotency key: creating twice with one key gives the same run."""
+    settings: RunSettings
+
+
+class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
+    run: str
+    capability: str
+    """Token of this run's gateway."""
+
+
+class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
+    """A finalised run as the coordinator knows it: the source of `run.json`."""
+
+    run: str
+    settings: RunSettings
+    status: Literal["completed", "no_ok_submit", "error", "cancelled"]
+    error: str | None
+    close_reason: str
+    agent: dict[str, Any]
+    final_score: float | None
+    """Held-out mean return of the selected checkpoint."""
+    best_submit_index: int | None
+    val_scores: dict[int, float]
+    heldout_returns: tuple[float, ...]
+    validation_ineligible: dict[int, str]
+    """Checkpoints that were quarantined while hidden, with the reason."""
+    policy_failures: dict[str, int]
+    """Hidden episodes in which the selected policy failed, by split."""
+    random_heldout_returns: tuple[float, ...]
+    """Uniform random actions on the same held-out cases."""
+    episode_budget: int
+    budget_used: int
+    split_hashes: dict[str, str]
+    """SHA-256 by split name."""
+    split_secret: bool
+    env_version: str
+    deterministic: bool
+    fingerprint: Fingerprint | None
+    created_at: float
+    closed_at: float
+    finished_at: float
+    submits: tuple[SubmitRecord, ...]
+    wall_s: dict[str, float]
+    """Seconds by phase: `queue`, `rollout`, `finalise`."""
+    infrastructure_retries: int = 0
+    nondeterministic_results: int = 0
+    """Repeated attempts of one job whose results differed."""
+
+
+class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One accepted submit, for checkpoints and `metrics.json`."""
+
+    submit_index: int
+    status: SubmitStatus
+    bundle: str | None
+    env_instances: tuple[int, ...]
+    remaining_budget: int
+    mean_return: float | None
+    """Visible mean over the train episodes; None unless ok."""
+    val_mean: float | None
+    started_at: float
+    completed_at: float
+
+
+class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
+    """A long poll until the run is finished; answered with `RunProgress` while it is not."""
+
+    token: str
+    run: str
+    wait_s: float
+
+
+class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
+    phase: Literal["open", "validation", "heldout", "random", "finished"]
+    done: int
+    """Episodes done of this phase."""
+    total: int
+    waits_for: str = ""
+    finished: RunFinished | None = None
+
+
+class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
+    """Play cases outside any run: `evopolicy try`, `evopolicy random`."""
+
+    token: str
+    key: str
+    env: str
+    bundle: str | None
+    """None for uniform random actions."""
+    split: Split
+    cases: tuple[int, ...] | None
+    """Ids in the split; None for all of it."""
+    record: Record = "full"
+    sandbox_tier: Tier = "bwrap"
+    limits: ResourceLimits = ResourceLimits()
+
+
+class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_started"):
+    evaluation: str
+
+
+class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
+    token: str
+    evaluation: str
+    cursor: int
+    wait_s: float
+
+
+class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
+    cursor: int
+    total: int
+    outcomes: tuple[EpisodeOutcome, ...]
+    finished: bool
+    waits_for: str = ""
+
+
+class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
+    token: str
+    run: str
+
+
+class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
+    token: str
+    worker: str
+    state: Literal["active", "draining"]
+
+
+class Done(Message, frozen=True, kw_only=True, tag="ok"):
+    """The request was carried out."""
+
+
+class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
+    token: str
+
+
+class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
+    worker: str
+    host: str
+    slots: int
+    state: Literal["active", "draining", "lost"]
+    tiers: tuple[Tier, ...]
+    environments: tuple[str, ...]
+    fingerprint: str
+    """Short class of the worker's fingerprint: equal for workers that may share a run."""
+    held: int
+    running: int
+    last_seen_s: float
+    """Seconds since its last heartbeat."""
+    refused: dict[str, str] = {}
+    """Run id to why this worker gets no work of it."""
+
+
+class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
+    run: str
+    entry: str
+    env: str
+    phase: str
+    budget: int
+    remaining_budget: int
+    n_submits: int
+    queued: int
+    running: int
+    done: int
+    """Episode jobs finished, train and hidden together."""
+    waits_for: str = ""
+
+
+class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
+    cluster: str
+    version: str
+    uptime_s: float
+    episodes_done: int
+    episodes_per_s: float
+    """Over the last minute."""
+    workers: tuple[WorkerStatus, ...]
+    runs: tuple[RunStatus, ...]
+    stalls: tuple[str, ...] = ()
+    """What waits longer than it should, and for what."""
+
+
+OperatorRequest = (
+    CreateRun
+    | WaitRun
+    | Evaluate
+    | EvaluationPoll
+    | CancelRun
+    | SetWorker
+    | StatusRequest
+    | BlobPut
+    | BlobGet
+)
+OperatorReply = (
+    RunCreated
+    | RunProgress
+    | EvaluationStarted
+    | EvaluationPage
+    | Done
+    | StatusReply
+    | BlobAck
+    | BlobChunk
+    | Refused
+)

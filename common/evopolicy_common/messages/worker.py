@@ -1,0 +1,173 @@
+"""What workers and the coordinator say to each other. A worker asks, the coordinator answers; never the reverse."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
+    """A message on the wire; `op` names its type."""
+
+
+class Refused(Message, frozen=True, kw_only=True, tag="refused"):
+    """The request was understood and is not served; nothing was changed by it."""
+
+    status: str
+    """One word for scripts: `bad_token`, `unknown_worker`, `unknown_run`, `busy`, `budget_invalid` …"""
+    message: str
+
+
+class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
+    """What a worker's numbers depend on, beside the seed."""
+
+    code_version: str
+    """Version and source digest of the worker's own code."""
+    python: str
+    packages: dict[str, str]
+    """Name to exact version of the packages that environments are made of."""
+    cpu: str
+    """CPU model and the features that numerical libraries choose their code by."""
+
+
+class Register(Message, frozen=True, kw_only=True, tag="register"):
+    """The first thing a worker says, and again whenever the coordinator does not know its session."""
+
+    worker: str
+    """The worker's name, unique in the cluster, such as `host-3f2a`."""
+    token: str
+    """The cluster's join token."""
+    protocol: int
+    """Wire protocol version; see `codec.WIRE_VERSION`."""
+    slots: int
+    tiers: tuple[Tier, ...]
+    environments: tuple[EnvironmentDescription, ...]
+    fingerprint: Fingerprint
+    host: str = ""
+
+
+class Registered(Message, frozen=True, kw_only=True, tag="registered"):
+    session: str
+    """To be sent with every later request; ends with the coordinator's or the worker's process."""
+    lease_ttl_s: float
+    """A lease that no heartbeat renews for so long is taken away."""
+    heartbeat_s: float
+
+
+class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
+    """A long poll for work: answered as soon as there is some, or empty after `wait_s`."""
+
+    worker: str
+    session: str
+    n: int
+    """How many leases the worker can take."""
+    wait_s: float
+    warm_bundles: tuple[str, ...] = ()
+    warm_environments: tuple[str, ...] = ()
+
+
+class Lease(msgspec.Struct, frozen=True, kw_only=True):
+    """The right, for a time, to play one job and hand in its result."""
+
+    lease_id: str
+    attempt: int
+    """Counts from 1 per job: fences off the results of attempts that were given up."""
+    stimulus_id: str
+    """Runs from the event that made the job through every log line about it."""
+    job: Job
+
+
+class Leases(Message, frozen=True, kw_only=True, tag="leases"):
+    leases: tuple[Lease, ...]
+
+
+class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
+    lease_id: str
+    job_id: str
+    attempt: int
+    running: bool
+    """False while it waits in the worker's prefetch queue."""
+    episodes_done: int = 0
+    steps: int = 0
+    """Environment steps done in the running job: a sign of progress."""
+
+
+class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
+    worker: str
+    session: str
+    held: tuple[HeldLease, ...]
+
+
+class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
+    cancelled: tuple[str, ...] = ()
+    """Leases to stop at once: expired, cancelled or preempted."""
+    drain: bool = False
+    """Ask for no more work; finish what runs."""
+
+
+ResultKind = Literal["done", "returned", "slot_died", "failed"]
+"""done: played; returned: given back unplayed (drained, preempted, cancelled); slot_died: the bundle brought its slot
+down, the supervisor lives (a strike); failed: infrastructure (environment crashed by itself, disk full, sandbox)."""
+
+
+class JobResult(msgspec.Struct, frozen=True, kw_only=True):
+    lease_id: str
+    job_id: str
+    attempt: int
+    kind: ResultKind
+    episodes: tuple[EpisodeOutcome, ...] = ()
+    """In the job's order; empty unless `done`."""
+    error: str = ""
+    """For operators; never shown to an agent."""
+
+
+class HandIn(Message, frozen=True, kw_only=True, tag="done"):
+    """Results. Answered once they are durable; sending the same again is safe."""
+
+    worker: str
+    session: str
+    results: tuple[JobResult, ...]
+
+
+class HandInReply(Message, frozen=True, kw_only=True, tag="done_reply"):
+    """Every result of the request was taken (committed, compared, or found to be of a closed job)."""
+
+    n: int
+
+
+class BlobPut(Message, frozen=True, kw_only=True, tag="blob_put"):
+    """One chunk; chunks of a blob go in order, each answered before the next."""
+
+    sender: str
+    """Worker's session or run id: whose right to write is checked."""
+    token: str
+    digest: str
+    size: int
+    """Bytes of the whole blob."""
+    offset: int
+    data: bytes
+
+
+class BlobAck(Message, frozen=True, kw_only=True, tag="blob_ack"):
+    have: int
+    """Bytes that the receiver has; equal to `size` when it is stored (also when it was already there)."""
+
+
+class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
+    sender: str
+    token: str
+    digest: str
+    offset: int
+
+
+class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
+    size: int
+    data: bytes
+
+
+WorkerRequest = Register | LeaseRequest | Heartbeat | HandIn | BlobPut | BlobGet
+WorkerReply = Registered | Leases | HeartbeatReply | HandInReply | BlobAck | BlobChunk | Refused

@@ -1,0 +1,1 @@
+"""The worker: leases episode jobs and plays them, the environment here, the policy locked in a sandbox."""
