@@ -1,0 +1,287 @@
+"""`run.json` and `checkpoints/submit_NNN/metrics.json`: what a run leaves behind, typed.
+
+The run's finaliser writes them, reports and `verify` read them. `run.json` is written once, last, after the agent and
+its children are gone: it holds hidden scores. Reading skips unknown fields and a field added later has a default; a
+file whose `schema_version` is higher than ours is refused. Paths are relative to the run directory. Instants are UTC
+texts as `summary.utc_text` writes them; durations are seconds and end in `_s`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
+from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
+from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
+
+SCHEMA_VERSION = 1
+"""Raised only when an older reader would misunderstand a file; fields may be added without it."""
+
+PROTOCOL_VERSION = "v2.0-draft"
+"""The agent-facing protocol that runs follow."""
+
+RunStatus = Literal["completed", "no_ok_submit", "error"]
+
+
+class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Token use of the whole run, as the paper's appendix on token accounting defines it. Counts, not millions."""
+
+    input_noncached: int
+    """Input tokens that no cache served (for streams that count cached ones in: input minus cached)."""
+    cache_read: int
+    cache_creation: int
+    output: int
+    """Output tokens, reasoning included."""
+    reasoning: int | None = None
+    """How much of `output` was reasoning; None when the stream does not tell."""
+    cost: float | None = None
+    """US dollars; None without prices."""
+
+
+class Agent(msgspec.Struct, frozen=True, kw_only=True):
+    """Who played: one leaderboard entry."""
+
+    entry: str
+    """Name of the leaderboard entry: model and harness, or the operator's name for it."""
+    harness: str
+    """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
+    cli_version: str | None = None
+    model_string: str | None = None
+    """What the harness was told to use; None for agents without a model."""
+    settings: dict[str, Any] = {}
+    """What else it was started with: effort, extra arguments, retry base; no secrets."""
+    retries: int = 0
+    """Times the session was resumed after a provider's or harness's failure."""
+    turns: int = 0
+    tokens: Tokens | None = None
+    """None when the agent tells nothing of tokens."""
+
+
+class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
+    """What defines the experiment beside agent and environment; runs that differ here are not one comparison."""
+
+    episode_budget: int
+    min_episodes_per_submit: int
+    max_episodes_per_submit: int
+    policy_scope: PolicyScope
+    observations: ObservationForm
+    n_train: int
+    n_validation: int
+    n_heldout: int
+    video: VideoOption = "off"
+    limits: ResourceLimits | None = None
+
+
+class Timing(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the wall time went. The phases need not add up to `wall_s`."""
+
+    started_at: str
+    finished_at: str
+    wall_s: float
+    """From the run's opening to `run.json`."""
+    agent_s: float = 0.0
+    """Agent alone: no submit of it in flight."""
+    queue_s: float = 0.0
+    """A submit waited and none of its episodes ran."""
+    rollout_s: float = 0.0
+    """At least one train episode ran."""
+    feedback_s: float = 0.0
+    """From the last episode's result to the submit's answer."""
+    finalise_s: float = 0.0
+    """From the agent's end to `run.json`."""
+
+
+class PolicyFailureRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A policy failed in one hidden episode (train failures are in the feedback)."""
+
+    split: Split
+    submit_index: int
+    episode: int
+    """Position in the split, from 0."""
+    category: FailureCategory
+    step_index: int | None = None
+    message: str = ""
+
+
+class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
+    """Uniform random actions on this run's own held-out cases."""
+
+    mean_return: float
+    std_return: float
+    """Population standard deviation."""
+    returns: tuple[float, ...] = ()
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What the run came to. Every score is None unless `status` is `completed`."""
+
+    status: RunStatus
+    error: str | None = None
+    """Why the status is `error`, for the operator."""
+    final_score: float | None = None
+    """The held-out mean return: the run's number in the paper's table."""
+    best_submit_index: int | None = None
+    """The selected checkpoint's submit."""
+    val_scores: dict[str, float] = {}
+    """Submit index (decimal text) to mean return on validation, for every eligible `ok` checkpoint."""
+    heldout_mean_return: float | None = None
+    heldout_std_return: float | None = None
+    """Population standard deviation."""
+    heldout_returns: tuple[float, ...] = ()
+    """In the order of the split's cases."""
+    policy_failures: tuple[PolicyFailureRecord, ...] = ()
+    quarantined_submits: tuple[int, ...] = ()
+    """`ok` checkpoints that brought their slot down in hidden evaluation: not eligible."""
+    random_reference: ReferenceScore | None = None
+    closed_reason: str = ""
+    """Why no more submits were taken: `budget_spent`, `agent_stopped`, `agent_failed`, `wall_limit`, `cancelled`."""
+    budget_used: int = 0
+    """Episodes charged."""
+    auxiliary: dict[str, Any] = {}
+    """What an environment reports beside the return, such as means of reward components."""
+
+
+class RejectedSubmit(msgspec.Struct, frozen=True, kw_only=True):
+    """A request that was refused before the snapshot and cost nothing."""
+
+    status: Literal["budget_invalid", "invalid_env_instance"]
+    message: str
+    at: str = ""
+    after_submits: int = 0
+    """Accepted submits before it."""
+
+
+class Replay(msgspec.Struct, frozen=True, kw_only=True):
+    """A recorded episode: a video, a rendered frame a row."""
+
+    path: str
+    """`video.mp4` under the run directory, such as `replays/heldout_000/video.mp4`."""
+    split: Split
+    episode: int
+    """Position in the split, from 0."""
+    submit_index: int
+    episode_return: float | None = None
+    length: int | None = None
+    """Steps."""
+    filmstrip: str | None = None
+    """A PNG with a few of its frames side by side; None when there is none."""
+
+
+class Artifacts(msgspec.Struct, frozen=True, kw_only=True):
+    """Where things are, relative to the run directory; None for what this run does not have."""
+
+    workspace: str | None = "workspace"
+    checkpoints: str | None = "checkpoints"
+    harness_log: str | None = "logs/harness.log"
+    agent_log: str | None = "logs/agent.jsonl"
+    replays: tuple[Replay, ...] = ()
+
+
+class Versions(msgspec.Struct, frozen=True, kw_only=True):
+    """What the run was made with. Hashes are SHA-256, lowercase hex."""
+
+    harness: str
+    """Version of this software."""
+    env: str
+    """Name and version of what was played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
+    agents_md_hash: str
+    data_train_hash: str
+    data_valid_hash: str
+    data_heldout_hash: str
+    fingerprint: dict[str, str]
+    """Library to version, as the workers that played it reported."""
+    data_secret: bool = True
+    """False when the splits came from a small public seed."""
+    initial_policy_hash: str | None = None
+    """Of the `policy.py` that the workspace started with."""
+    env_deterministic: bool = True
+    """False when the environment does not repeat an episode from its seed and actions."""
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """The whole of `run.json`."""
+
+    schema_version: int = SCHEMA_VERSION
+    protocol_version: str = PROTOCOL_VERSION
+    model: str
+    env: str
+    """Suite id."""
+    exp_id: str
+    repeat: int = 0
+    """Counts the repeats of one agent on one environment from 0."""
+    attempt: int = 0
+    """Times the operator started this run again from nothing."""
+    agent: Agent
+    sandbox_tier: Tier
+    jail: str
+    """How the agent was confined: `bwrap` or `none`; `bwrap+open-network` when asked for."""
+    experiment_dimensions: ExperimentDimensions
+    timing: Timing
+    outcome: Outcome
+    rejected_submits: tuple[RejectedSubmit, ...] = ()
+    artifacts: Artifacts = Artifacts()
+    versions: Versions
+
+
+class CheckpointMetrics(msgspec.Struct, frozen=True, kw_only=True):
+    """`checkpoints/submit_NNN/metrics.json`; the policy itself is beside it in `system/`."""
+
+    schema_version: int = SCHEMA_VERSION
+    submit_index: int
+    status: SubmitStatus
+    digest: str
+    """Of the bundle."""
+    n_episodes: int
+    consumed_budget: int
+    """Episodes charged up to and with this submit."""
+    mean_return: float | None = None
+    """Visible train mean; None when not ok."""
+    val_mean: float | None = None
+    """Hidden validation mean; None before finalisation or when not ok."""
+    policy_files: int = 0
+    policy_bytes: int = 0
+    """Files of the bundle and their sizes added up, bytes."""
+
+
+_runs = msgspec.json.Decoder(RunRecord)
+_metrics = msgspec.json.Decoder(CheckpointMetrics)
+
+
+def encode_run_record(record: RunRecord) -> bytes:
+    """The bytes of `run.json`: two-space indent, fields in declared order, one newline at the end."""
+    return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
+
+
+def decode_run_record(data: bytes) -> RunRecord:
+    """The record in `data`; ProtocolError when it is none that this version reads."""
+    try:
+        record = _runs.decode(data)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ProtocolError(f"not a run record: {error}") from error
+    _refuse_newer("run.json", record.schema_version)
+    return record
+
+
+def encode_checkpoint_metrics(metrics: CheckpointMetrics) -> bytes:
+    """The bytes of `metrics.json`."""
+    return msgspec.json.format(msgspec.json.encode(metrics), indent=2) + b"\n"
+
+
+def decode_checkpoint_metrics(data: bytes) -> CheckpointMetrics:
+    """The metrics in `data`; ProtocolError when they are none that this version reads."""
+    try:
+        metrics = _metrics.decode(data)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ProtocolError(f"not a checkpoint's metrics: {error}") from error
+    _refuse_newer("metrics.json", metrics.schema_version)
+    return metrics
+
+
+def _refuse_newer(name: str, version: int) -> None:
+    if version > SCHEMA_VERSION:
+        raise ProtocolError(
+            f"{name} has schema_version {version}, this version reads up to {SCHEMA_VERSION}: update evopolicy"
+        )

@@ -1,0 +1,85 @@
+"""`feedback/submit_NNN/summary.json`: what an agent is told of one submit, field by field and in this order.
+
+The gateway writes it last in a submit's folder and answers `POST /submit` with the same bytes; the analysis reads it.
+Nothing in it is hidden: no seed, no hidden score. A submit that is not `ok` has every array and aggregate null, while
+`n_episodes` and `remaining_budget` still tell what was charged.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.gateway import SubmitStatus
+
+SCHEMA_VERSION = 1
+"""Raised only when an older reader would misunderstand a file; fields may be added without it."""
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One submit's summary. Only the two reward-component fields have defaults, so only they may be left out."""
+
+    schema_version: int
+    submit_index: int
+    """Counts accepted submits from 0."""
+    env: str
+    """Suite id, such as `gym/acrobot`."""
+    status: SubmitStatus
+    n_episodes: int
+    """Episodes charged."""
+    first_global_episode: int
+    """Number of its first episode, counting attempted episodes through the run from 0."""
+    env_instances: tuple[int, ...] | None
+    """Train ids in request order, repeats kept; null when not ok."""
+    remaining_budget: int
+    """Episodes left after this submit."""
+    submit_started_at: str
+    """When it was accepted: UTC, ISO 8601 as `utc_text` writes it."""
+    submit_completed_at: str
+    wall_time_seconds: float
+    returns: tuple[float, ...] | None
+    """Return of each episode, request order."""
+    mean_return: float | None
+    std_return: float | None
+    """Population standard deviation (divides by n)."""
+    min_return: float | None
+    max_return: float | None
+    episode_lengths: tuple[int, ...] | None
+    """Steps of each episode."""
+    mean_episode_length: float | None
+    timeouts: tuple[int, ...] | None
+    """Local (request) indices of the episodes whose policy hit a time limit."""
+    errors: tuple[int, ...] | None
+    """Local indices of the episodes whose policy failed, time limits included."""
+    reward_components_mean: dict[str, float] | None = None
+    """Mean over episodes of each component's sum; left out when the environment reports none."""
+    reward_components_per_episode: tuple[dict[str, float], ...] | None = None
+    """Each episode's sums, request order; left out likewise."""
+
+
+_decoder = msgspec.json.Decoder(Summary)
+
+
+def encode_summary(summary: Summary) -> bytes:
+    """The file's bytes: JSON, two-space indent, fields in declared order, one newline at the end."""
+    return msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
+
+
+def decode_summary(data: bytes) -> Summary:
+    """The summary in `data`, unknown fields skipped; ProtocolError when it is none that this version reads."""
+    try:
+        summary = _decoder.decode(data)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ProtocolError(f"not a submit summary: {error}") from error
+    if summary.schema_version > SCHEMA_VERSION:
+        raise ProtocolError(
+            f"summary has schema_version {summary.schema_version}, this version reads up to {SCHEMA_VERSION}"
+        )
+    return summary
+
+
+def utc_text(unix_s: float) -> str:
+    """`unix_s` (seconds since 1970, UTC) as `2026-01-31T12:00:00.123456Z`; always microseconds, so texts sort."""
+    return datetime.fromtimestamp(unix_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
