@@ -1,0 +1,184 @@
+"""`evopolicy data`: making split files and checking them.
+
+An operator's commands: they read and write hidden cases, so they come with the coordinator's extra and must not be
+reachable from an agent's host. Exit codes: 0 all well, 1 findings, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import msgspec
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import Split
+from evopolicy_coordinator import splits
+
+app = typer.Typer(
+    name="data",
+    help="Make and check the split files of environments (hidden cases: keep them from agents).",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+
+@app.command(
+    epilog="Example: evopolicy data make --env core16 --root data --train 64 --valid 16 --heldout 32",
+)
+def make(
+    env: Annotated[list[str], typer.Option(help="Suite, suite id or glob; may be repeated.")],
+    root: Annotated[Path, typer.Option(help="Folder to write; one folder for each environment in it.")],
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Public seed: who knows it knows the cases, so they are stamped `secret: false`. "
+            "Left out, the cases come from fresh random bits that are kept nowhere.",
+        ),
+    ] = None,
+    train: Annotated[int | None, typer.Option(min=1, help="Train cases [the suite's number].")] = None,
+    valid: Annotated[int | None, typer.Option(min=1, help="Validation cases [the suite's number].")] = None,
+    heldout: Annotated[int | None, typer.Option(min=1, help="Held-out cases [the suite's number].")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+) -> None:
+    """Write train.json, valid.json and heldout.json of each environment."""
+    try:
+        planned = _plan(catalogue.resolve(env), root, seed, train, valid, heldout)
+        if not force:
+            _refuse_different(planned)
+        written = _write(planned)
+    except ConfigError as error:
+        _usage(str(error))
+    except OSError as error:
+        _usage(f"cannot write {error.filename}: {error.strerror}")
+    if as_json:
+        typer.echo(json.dumps({"root": str(root), "written": [str(path) for path in written]}))
+        return
+    kept = len(planned) - len(written)
+    typer.echo(
+        f"{len(written)} files written under {root}" + (f", {kept} were the same already" if kept else "")
+    )
+
+
+def _plan(
+    envs: list[str], root: Path, seed: int | None, train: int | None, valid: int | None, heldout: int | None
+) -> dict[Path, bytes]:
+    """The files to be, by path."""
+    secret = secrets.token_bytes(splits.SECRET_BYTES) if seed is None else splits.public_secret(seed)
+    planned: dict[Path, bytes] = {}
+    for env in envs:
+        suite = catalogue.suite_of(env)
+        counts: dict[Split, int] = {
+            "train": train or suite.n_train,
+            "validation": valid or suite.n_validation,
+            "heldout": heldout or suite.n_heldout,
+        }
+        for split, cases in splits.derive(secret, suite.name, env, counts).items():
+            stem = splits.FILE_STEMS[split]
+            content = splits.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)
+            planned[root / splits.folder_name(env) / f"{stem}.json"] = (
+                msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n"
+            )
+    return planned
+
+
+def _refuse_different(planned: dict[Path, bytes]) -> None:
+    for path, data in planned.items():
+        if path.exists() and path.read_bytes() != data:
+            raise ConfigError(
+                f"{path} exists and differs from what would be written; give --force to replace it"
+            )
+
+
+def _write(planned: dict[Path, bytes]) -> list[Path]:
+    written = []
+    for path, data in planned.items():
+        if path.exists() and path.read_bytes() == data:
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".json.new")
+        partial.unlink(missing_ok=True)
+        with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+        written.append(path)
+    return written
+
+
+@app.command(epilog="Example: evopolicy data check data --json")
+def check(
+    folder: Annotated[Path, typer.Argument(help="The root of a data tree, or one environment's folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings and hashes as JSON.")] = False,
+) -> None:
+    """Check that split files are well-formed and disjoint, and print their hashes."""
+    if not folder.is_dir():
+        _usage(f"{folder} is not a folder")
+    folders = [folder] if _holds_splits(folder) else sorted(p for p in folder.iterdir() if _holds_splits(p))
+    if not folders:
+        _usage(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
+    reports = [_report(item.resolve()) for item in folders]
+    if as_json:
+        typer.echo(json.dumps({"ok": not any(r["findings"] for r in reports), "environments": reports}))
+    else:
+        _print(reports)
+    if any(report["findings"] for report in reports):
+        raise typer.Exit(1)
+
+
+def _holds_splits(folder: Path) -> bool:
+    return any((folder / f"{stem}.json").is_file() for stem in splits.FILE_STEMS.values())
+
+
+def _report(folder: Path) -> dict[str, Any]:
+    """What is to be said of one environment's folder."""
+    loaded, findings = splits.load(folder)
+    if loaded is None:
+        return {"folder": str(folder), "env": None, "findings": findings}
+    if loaded.env not in catalogue.entries():
+        findings.append(f"{folder.name}: {loaded.env!r} is not in the catalogue")
+    return {
+        "folder": str(folder),
+        "env": loaded.env,
+        "cases": {split: len(loaded.cases(split)) for split in splits.SPLITS},
+        "sha256": loaded.hashes(),
+        "secret": loaded.secret,
+        "findings": findings,
+    }
+
+
+def _print(reports: list[dict[str, Any]]) -> None:
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("environment", "train", "valid", "heldout", "secret", "sha256 of each", "checks"):
+        table.add_column(heading, no_wrap=True)
+    for report in reports:
+        verdict = f"{len(report['findings'])} findings" if report["findings"] else "ok"
+        if report["env"] is None:
+            table.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
+            continue
+        counts = [str(report["cases"][split]) for split in splits.SPLITS]
+        hashes = " ".join(report["sha256"][split][:8] for split in splits.SPLITS)
+        table.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
+    console = Console()
+    # A row broken over several lines is worse than one that the terminal wraps.
+    console.print(table, width=max(console.width, 130))
+    for report in reports:
+        for finding in report["findings"]:
+            console.print(finding, style="red", markup=False, highlight=False, soft_wrap=True)
+
+
+def _usage(message: str) -> NoReturn:
+    typer.echo(f"error: {message}", err=True)
+    raise typer.Exit(2)

@@ -1,0 +1,264 @@
+"""Which cases are train, validation and held-out: read from files, or derived from the coordinator's secret.
+
+Rules that this module owns:
+- The three splits of an environment share no case (seed and options), and none repeats a case.
+- Derived seeds are HMAC-SHA256(secret, suite | environment | split | index | draw), cut to 31 bits, with further draws
+  where a seed is already taken. Seeds are drawn index by index over all three splits, so a case does not change when
+  any split is made longer or shorter.
+- `secret` tells whether hidden cases can be guessed: true for splits derived from a 256-bit secret, false for those made
+  from a public seed, and for files that do not say of themselves that they are secret.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import secrets
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import Case, Split
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
+FILE_STEMS: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}
+SECRET_BYTES = 32
+_SEED_LIMIT = 2**31
+
+
+class SplitFile(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One `train.json`, `valid.json` or `heldout.json`."""
+
+    env: str
+    split: str
+    """`train`, `valid` (or `validation`), `heldout`."""
+    cases: tuple[Case, ...]
+    secret: bool | None = None
+    """False when made from a public seed; None where the file does not say."""
+
+
+class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
+    """The cases of one environment."""
+
+    env: str
+    train: tuple[Case, ...]
+    validation: tuple[Case, ...]
+    heldout: tuple[Case, ...]
+    secret: bool
+    """Whether the hidden cases cannot be guessed from public facts."""
+
+    def cases(self, split: Split) -> tuple[Case, ...]:
+        """The cases of `split`, in order of their ids."""
+        return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 (hex) of each split's cases, by split name."""
+        return {split: cases_hash(self.cases(split)) for split in SPLITS}
+
+
+def folder_name(env: str) -> str:
+    """The folder that holds the split files of `env`."""
+    return env.replace("/", "_")
+
+
+def cases_hash(cases: Iterable[Case]) -> str:
+    """SHA-256 (hex) of the cases as canonical JSON: sorted keys, no spaces, `options` only where there are some."""
+    plain = [_plain(case) for case in cases]
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def _plain(case: Case) -> dict[str, Any]:
+    return {"seed": case.seed} if case.options is None else {"seed": case.seed, "options": case.options}
+
+
+def _identity(case: Case) -> tuple[int, str]:
+    """What makes two cases the same: an environment cannot tell no options from empty ones."""
+    return case.seed, json.dumps(case.options or None, sort_keys=True)
+
+
+def derive(secret: bytes, suite: str, env: str, counts: dict[Split, int]) -> dict[Split, tuple[Case, ...]]:
+    """`counts[split]` cases of each split; the same for the same secret, suite and environment."""
+    taken: set[int] = set()
+    drawn: dict[Split, list[Case]] = {split: [] for split in SPLITS}
+    for index in range(max(counts.values(), default=0)):
+        for split in SPLITS:
+            seed = _draw(secret, suite, env, split, index, taken)
+            taken.add(seed)
+            drawn[split].append(Case(seed=seed))
+    return {split: tuple(drawn[split][: counts.get(split, 0)]) for split in SPLITS}
+
+
+def _draw(secret: bytes, suite: str, env: str, split: Split, index: int, taken: set[int]) -> int:
+    draw = 0
+    while True:
+        name = f"{suite}|{env}|{split}|{index}|{draw}".encode()
+        digest = hmac.digest(secret, name, "sha256")
+        seed = int.from_bytes(digest[:4], "big") % _SEED_LIMIT
+        if seed not in taken:
+            return seed
+        draw += 1
+
+
+def public_secret(seed: int) -> bytes:
+    """The key that splits of a public seed are derived from: anyone who knows the number knows the cases."""
+    return hashlib.sha256(f"evopolicy public split seed {seed}".encode()).digest()
+
+
+def load_or_create_secret(state: Path) -> bytes:
+    """The coordinator's 256-bit secret in `state/secret` (mode 0600), made on first use.
+
+    ConfigError when the file is not 32 bytes, or others may read it.
+    """
+    path = state / "secret"
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return _create_secret(path)
+    if len(data) != SECRET_BYTES:
+        raise ConfigError(
+            f"{path} holds {len(data)} bytes instead of {SECRET_BYTES}; restore it from a backup"
+        )
+    mode = path.stat().st_mode & 0o777
+    if mode & 0o077:
+        raise ConfigError(f"{path} may be read by others (mode {mode:04o}); run: chmod 600 {path}")
+    return data
+
+
+def _create_secret(path: Path) -> bytes:
+    data = secrets.token_bytes(SECRET_BYTES)
+    partial = path.with_suffix(".new")
+    partial.unlink(missing_ok=True)
+    fd = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(fd, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.rename(partial, path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+    return data
+
+
+def read_split_file(path: Path) -> SplitFile:
+    """The file's content; ConfigError naming the file and what is wrong in it."""
+    try:
+        content = msgspec.json.decode(path.read_bytes(), type=SplitFile)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a split file: {error}") from error
+    for number, case in enumerate(content.cases):
+        if not 0 <= case.seed < _SEED_LIMIT:
+            raise ConfigError(f"{path}: case {number} has seed {case.seed}; seeds are 0 to {_SEED_LIMIT - 1}")
+    return content
+
+
+def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
+    """The splits in one environment's folder, and what is wrong with them (None when they cannot be read at all)."""
+    findings: list[str] = []
+    contents: dict[Split, SplitFile] = {}
+    for split in SPLITS:
+        try:
+            contents[split] = read_split_file(folder / f"{FILE_STEMS[split]}.json")
+        except ConfigError as error:
+            findings.append(str(error))
+    if len(contents) < len(SPLITS):
+        return None, findings
+    for split, content in contents.items():
+        findings.extend(_file_findings(folder, split, content, contents["train"].env))
+    findings.extend(overlaps({split: content.cases for split, content in contents.items()}))
+    splits = EnvironmentSplits(
+        env=contents["train"].env,
+        train=contents["train"].cases,
+        validation=contents["validation"].cases,
+        heldout=contents["heldout"].cases,
+        secret=all(content.secret is True for content in contents.values()),
+    )
+    return splits, findings
+
+
+def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> list[str]:
+    name = f"{folder.name}/{FILE_STEMS[split]}.json"
+    findings = []
+    if content.split not in (split, FILE_STEMS[split]):
+        findings.append(f"{name} says it is split {content.split!r}")
+    if content.env != env:
+        findings.append(f"{name} is of environment {content.env!r}, train.json of {env!r}")
+    if folder_name(content.env) != folder.name:
+        findings.append(
+            f"{name} is of environment {content.env!r}, which belongs in {folder_name(content.env)}/"
+        )
+    if not content.cases:
+        findings.append(f"{name} has no cases")
+    return findings
+
+
+def overlaps(cases: dict[Split, tuple[Case, ...]]) -> list[str]:
+    """Each case that stands twice in a split or in more than one, in words."""
+    findings: list[str] = []
+    first_seen: dict[tuple[int, str], tuple[Split, int]] = {}
+    for split, members in cases.items():
+        for number, case in enumerate(members):
+            where = first_seen.setdefault(_identity(case), (split, number))
+            if where == (split, number):
+                continue
+            findings.append(
+                f"seed {case.seed} is {FILE_STEMS[where[0]]} case {where[1]} and {FILE_STEMS[split]} case {number}"
+            )
+    return findings
+
+
+class SplitSource:
+    """Where a coordinator takes its splits from: a data folder, or its secret."""
+
+    def __init__(self, *, data: Path | None, secret: bytes) -> None:
+        """`data` None: derive everything from `secret`. ConfigError when `data` is no folder."""
+        if data is not None and not data.is_dir():
+            raise ConfigError(f"--data {data} is not a folder")
+        self._data = data
+        self._secret = secret
+
+    def splits(self, suite: str, env: str, counts: dict[Split, int]) -> EnvironmentSplits:
+        """The splits of `env`; derived ones have exactly `counts`, those from files are cut to `counts` where set.
+
+        `counts` of a split from files may be left out (all of the file's cases). ConfigError when files are missing,
+        wrong, or have fewer cases than asked for.
+        """
+        if self._data is None:
+            return EnvironmentSplits(
+                env=env, secret=True, **_by_field(derive(self._secret, suite, env, counts))
+            )
+        folder = self._data / folder_name(env)
+        splits, findings = load(folder)
+        if splits is None or findings:
+            more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
+            raise ConfigError(
+                f"splits of {env} in {folder} cannot be used: {findings[0]}{more}; see `evopolicy data check`"
+            )
+        if splits.env != env:
+            raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
+        cut = {split: _cut(folder, split, splits.cases(split), counts.get(split)) for split in SPLITS}
+        return EnvironmentSplits(env=env, secret=splits.secret, **_by_field(cut))
+
+
+def _by_field(cases: dict[Split, tuple[Case, ...]]) -> dict[str, tuple[Case, ...]]:
+    return {str(split): members for split, members in cases.items()}
+
+
+def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:
+    if count is None:
+        return tuple(cases)
+    if count > len(cases):
+        raise ConfigError(
+            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, {count} are asked for; make it longer or ask for fewer"
+        )
+    return tuple(cases[:count])
