@@ -1,0 +1,383 @@
+"""Zenoh sessions and the one pattern this project speaks over them: a query with one reply.
+
+Rules that this module keeps for everybody:
+- callbacks of Zenoh run on its threads and only hand over to the event loop;
+- nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire everyone's leases;
+- every declaration is held by an object, since dropping it undeclares it;
+- scouting is off and the admin space closed; who may say what is `access_control` below;
+- never fork a process that has a session open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import queue
+import threading
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from evopolicy_common import keys
+from evopolicy_common.credentials import Credentials, Role, TlsFiles
+from evopolicy_common.errors import TransportError
+
+MAX_MESSAGE_BYTES = 16 << 20
+_REPLY_LANES = 8
+_CLOSE_S = 3.0
+
+
+class IncomingQuery:
+    """A request to be answered once, from any coroutine or thread."""
+
+    __slots__ = ("_query", "_server", "key", "payload")
+
+    def __init__(self, server: Server, query: zenoh.Query) -> None:
+        self._server = server
+        self._query: zenoh.Query | None = query
+        self.key = str(query.key_expr)
+        self.payload = bytes(query.payload) if query.payload is not None else b""
+
+    def reply(self, payload: bytes, lane: int = 0) -> None:
+        """Sends the one answer, off the event loop. Answers of one lane go in order; a stalled peer stalls its lane."""
+        query, self._query = self._query, None
+        if query is not None:
+            self._server.send(lane, query, self.key, payload)
+
+    def drop(self) -> None:
+        """Ends the query without an answer: the asker hears so at once."""
+        query, self._query = self._query, None
+        if query is not None:
+            query.drop()  # type: ignore[no-untyped-call]
+
+
+class Server:
+    """A listening session whose queries arrive on the event loop in batches. Made by `serve`."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        loop: asyncio.AbstractEventLoop,
+        on_queries: Callable[[list[IncomingQuery]], None],
+    ) -> None:
+        self._session = session
+        self._loop = loop
+        self._on_queries = on_queries
+        self._inbox: deque[IncomingQuery] = deque()
+        self._scheduled = False
+        self._lock = threading.Lock()
+        self._held: list[Any] = []
+        self._lanes: list[queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]] = []
+        for index in range(_REPLY_LANES):
+            lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None] = queue.SimpleQueue()
+            threading.Thread(target=_send_replies, args=(lane,), name=f"reply-{index}", daemon=True).start()
+            self._lanes.append(lane)
+
+    def declare(self, expressions: Iterable[str]) -> None:
+        """Answers queries on these key expressions from now on."""
+        for expression in expressions:
+            self._held.append(self._session.declare_queryable(expression, self._arrived, complete=True))
+
+    def watch_liveliness(self, expression: str, on_change: Callable[[str, bool], None]) -> None:
+        """Calls `on_change(key, alive)` on the event loop as liveliness tokens come and go."""
+
+        def changed(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self._loop.call_soon_threadsafe(on_change, str(sample.key_expr), alive)
+
+        self._held.append(self._session.liveliness().declare_subscriber(expression, changed, history=True))
+
+    def send(self, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
+        self._lanes[lane % _REPLY_LANES].put((query, key, payload))
+
+    def close(self) -> None:
+        for lane in self._lanes:
+            lane.put(None)
+        self._held.clear()
+        _close(self._session)
+
+    def _arrived(self, query: zenoh.Query) -> None:
+        incoming = IncomingQuery(self, query)
+        with self._lock:
+            self._inbox.append(incoming)
+            if self._scheduled:
+                return
+            self._scheduled = True
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        with self._lock:
+            batch = list(self._inbox)
+            self._inbox.clear()
+            self._scheduled = False
+        self._on_queries(batch)
+
+
+class Link:
+    """A client's session. Made by `connect`; reconnects by itself for as long as it is open."""
+
+    def __init__(self, session: zenoh.Session, credentials: Credentials) -> None:
+        self.credentials = credentials
+        self._session = session
+        self._sender = ThreadPoolExecutor(max_workers=4, thread_name_prefix="ask")
+        self._held: list[Any] = []
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is linked now; a hint for messages to people."""
+        return bool(self._session.info.routers_zid())
+
+    async def ask(self, key: str, payload: bytes, timeout_s: float) -> bytes:
+        """The answer to one query.
+
+        Raises TransportError when none came in `timeout_s` seconds, or at once when nobody answers on that key or the
+        access rules forbid it. The request may have been carried out all the same: all requests of ours are safe to
+        send again.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[bytes | None] = loop.create_future()
+
+        def settle(value: bytes | None) -> None:
+            if not future.done():
+                future.set_result(value)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                _post(loop, settle, bytes(reply.ok.payload))
+
+        def on_drop() -> None:
+            _post(loop, settle, None)
+
+        send = partial(
+            self._session.get,
+            key,
+            zenoh.handlers.Callback(on_reply, on_drop),
+            payload=payload,
+            timeout=timeout_s,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        try:
+            await loop.run_in_executor(self._sender, send)
+            # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck.
+            answer = await asyncio.wait_for(future, timeout_s + 2.0)
+        except (zenoh.ZError, TimeoutError, RuntimeError) as error:
+            raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
+        if answer is None:
+            raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+        return answer
+
+    def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
+        """`ask` for a thread of its own, such as the heartbeat's."""
+        try:
+            replies = self._session.get(
+                key, payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload)
+        except zenoh.ZError as error:
+            raise TransportError(f"no answer on {_verb(key)}: {error}") from error
+        raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+
+    def declare_alive(self, key: str) -> None:
+        """Holds a liveliness token on `key` for as long as this link is open."""
+        self._held.append(self._session.liveliness().declare_token(key))
+
+    def close(self) -> None:
+        self._held.clear()
+        self._sender.shutdown(wait=False, cancel_futures=True)
+        _close(self._session)
+
+    def _where(self) -> str:
+        return ", ".join(self.credentials.endpoints)
+
+
+@contextlib.asynccontextmanager
+async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -> AsyncIterator[Link]:
+    """A client session, open inside the `async with`.
+
+    Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
+    a wrong password looks like: the router does not say.
+    """
+    session = await asyncio.to_thread(zenoh.open, client_config(credentials))
+    link = Link(session, credentials)
+    try:
+        await _wait_connected(link, timeout_s)
+        yield link
+    finally:
+        await asyncio.to_thread(link.close)
+
+
+@contextlib.asynccontextmanager
+async def serve(
+    config: zenoh.Config, on_queries: Callable[[list[IncomingQuery]], None]
+) -> AsyncIterator[Server]:
+    """A listening session made from `server_config`, open inside the `async with`; `declare` what it answers."""
+    try:
+        session = await asyncio.to_thread(zenoh.open, config)
+    except zenoh.ZError as error:
+        raise TransportError(f"cannot listen: {error}") from error
+    server = Server(session, asyncio.get_running_loop(), on_queries)
+    try:
+        yield server
+    finally:
+        await asyncio.to_thread(server.close)
+
+
+def client_config(credentials: Credentials) -> zenoh.Config:
+    """The configuration of a worker's, gateway's or operator's session."""
+    return _config(
+        {
+            **_COMMON,
+            "mode": "client",
+            "connect/endpoints": list(credentials.endpoints),
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "transport/auth/usrpwd/user": credentials.user,
+            "transport/auth/usrpwd/password": credentials.password,
+            **_tls(credentials.tls, "connect"),
+        }
+    )
+
+
+def server_config(
+    cluster: str,
+    listen: Iterable[str],
+    passwords: Path,
+    users: dict[Role, str],
+    tls: TlsFiles | None = None,
+    connect_to: Iterable[str] = (),
+) -> zenoh.Config:
+    """The configuration of the coordinator's session: a router that lets in only who is in the file `passwords`.
+
+    `passwords` holds a line `user:password` each; `users` tells the user name of each role, and the role its rights.
+    """
+    settings: dict[str, Any] = {
+        **_COMMON,
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect_to),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "transport/auth/usrpwd/dictionary_file": str(passwords),
+        "access_control": access_control(cluster, users),
+        **_tls(tls, "listen"),
+    }
+    return _config(settings)
+
+
+def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
+    """Zenoh's access rules: each role asks on its own keys and hears the answers, and nothing else.
+
+    `declare_queryable` goes out to clients only: were it let in, one gateway could answer another's queries.
+    """
+    asks: dict[Role, str] = {
+        "worker": keys.worker_expr(cluster),
+        "gateway": keys.gateway_expr(cluster),
+        "operator": keys.operator_expr(cluster),
+    }
+    rules = []
+    for role, expression in asks.items():
+        rules.append(_rule(f"{role}_asks", ["query"], "ingress", expression))
+        rules.append(_rule(f"{role}_hears", ["reply", "declare_queryable"], "egress", expression))
+    rules.append(_rule("worker_lives", ["liveliness_token"], "ingress", keys.liveliness_expr(cluster)))
+    granted = {role: [f"{role}_asks", f"{role}_hears"] for role in asks}
+    granted["worker"].append("worker_lives")
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": role, "usernames": [user]} for role, user in users.items()],
+        "policies": [{"subjects": [role], "rules": granted[role]} for role in users],
+    }
+
+
+_COMMON: dict[str, Any] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+    "adminspace": {"enabled": False},
+}
+
+
+def _rule(name: str, messages: list[str], flow: str, expression: str) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "messages": messages,
+        "flows": [flow],
+        "key_exprs": [expression],
+    }
+
+
+def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:
+    if tls is None:
+        return {}
+    prefix = "transport/link/tls"
+    return {
+        f"{prefix}/root_ca_certificate": tls.root_ca,
+        f"{prefix}/{side}_certificate": tls.certificate,
+        f"{prefix}/{side}_private_key": tls.private_key,
+        f"{prefix}/enable_mtls": True,
+        f"{prefix}/verify_name_on_connect": True,
+    }
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+async def _wait_connected(link: Link, timeout_s: float | None) -> None:
+    loop = asyncio.get_running_loop()
+    deadline = None if timeout_s is None else loop.time() + timeout_s
+    pause = 0.005
+    while not link.connected:
+        if deadline is not None and loop.time() > deadline:
+            raise TransportError(
+                f"no connection to {', '.join(link.credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
+                f" there, and are these the {link.credentials.role} credentials of its state folder?"
+            )
+        await asyncio.sleep(pause)
+        pause = min(0.25, pause * 1.5)
+
+
+def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None], value: bytes | None) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        loop.call_soon_threadsafe(call, value)
+
+
+def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]) -> None:
+    while (item := lane.get()) is not None:
+        query, key, payload = item
+        # The asker may be gone: it asks again if it is not.
+        with contextlib.suppress(zenoh.ZError):
+            query.reply(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        query.drop()  # type: ignore[no-untyped-call]
+        del query, item
+
+
+def _close(session: zenoh.Session) -> None:
+    """Closes the session, but waits no longer than `_CLOSE_S`: with a frozen peer it can take many seconds."""
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]
+
+    closer = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    closer.start()
+    closer.join(_CLOSE_S)
+
+
+def _verb(key: str) -> str:
+    return key.split("/", 3)[-1]

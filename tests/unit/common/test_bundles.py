@@ -1,0 +1,134 @@
+"""Snapshots of `system/` and their way back, against folders that an agent may have prepared."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evopolicy_common import bundles
+from evopolicy_common.bundles import BundleFile
+from evopolicy_common.errors import BundleError
+
+
+def make(folder: Path, files: dict[str, bytes]) -> Path:
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return folder
+
+
+def test_equal_folders_have_equal_digests_whatever_their_times(tmp_path: Path) -> None:
+    files = {"policy.py": b"class Policy: ...", "lib/gait.py": b"x = 1", "data.bin": bytes(range(256))}
+    one = bundles.snapshot(make(tmp_path / "one", files))
+    two = bundles.snapshot(make(tmp_path / "two", dict(reversed(files.items()))))
+    assert one == two
+
+
+def test_one_changed_byte_changes_the_digest(tmp_path: Path) -> None:
+    one = bundles.snapshot(make(tmp_path / "one", {"policy.py": b"a"}))
+    two = bundles.snapshot(make(tmp_path / "two", {"policy.py": b"b"}))
+    assert one.digest != two.digest
+
+
+def test_what_tools_leave_behind_is_left_out(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", {"policy.py": b"a", "__pycache__/policy.cpython-311.pyc": b"x", ".git/HEAD": b"y"})
+    assert [file.path for file in bundles.snapshot(folder).files] == ["policy.py"]
+
+
+def test_unpacked_bundle_snapshots_to_the_same_digest(tmp_path: Path) -> None:
+    bundle = bundles.snapshot(make(tmp_path / "s", {"policy.py": b"a", "a/b/c.txt": b"", "run.sh": b"#!"}))
+    bundles.unpack(bundles.load(bundle.packed, bundle.digest), tmp_path / "t")
+    assert bundles.snapshot(tmp_path / "t").digest == bundle.digest
+
+
+@pytest.mark.parametrize("kind", ["symlink", "folder symlink", "hard link", "fifo", "socket"])
+def test_special_files_are_refused_by_name(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    outside = tmp_path / "secret"
+    outside.mkdir()
+    (outside / "key").write_bytes(b"hidden")
+    folder = make(tmp_path / "s", {"policy.py": b"a"})
+    bad = folder / "bad"
+    if kind == "symlink":
+        bad.symlink_to(outside / "key")
+    elif kind == "folder symlink":
+        bad.symlink_to(outside)
+    elif kind == "hard link":
+        os.link(outside / "key", bad)
+    elif kind == "fifo":
+        os.mkfifo(bad)
+    else:
+        monkeypatch.chdir(folder)
+        with socket.socket(socket.AF_UNIX) as sock:
+            sock.bind("bad")
+    with pytest.raises(BundleError, match="bad"):
+        bundles.snapshot(folder)
+
+
+def test_a_link_in_place_of_system_itself_is_refused(tmp_path: Path) -> None:
+    make(tmp_path / "other", {"policy.py": b"a"})
+    (tmp_path / "system").symlink_to(tmp_path / "other")
+    with pytest.raises(BundleError, match="system"):
+        bundles.snapshot(tmp_path / "system")
+
+
+def test_a_two_gigabyte_file_is_refused_without_being_read(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", {"policy.py": b"a"})
+    with (folder / "huge.bin").open("wb") as file:
+        file.truncate(2 << 30)
+    with pytest.raises(BundleError, match=r"huge\.bin has 2,147,483,648 bytes"):
+        bundles.snapshot(folder)
+
+
+def test_thousands_of_files_are_refused(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", {f"f{i}": b"" for i in range(bundles.MAX_FILES + 1)})
+    with pytest.raises(BundleError, match="more than"):
+        bundles.snapshot(folder)
+
+
+def test_deep_nesting_is_refused(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", {"/".join(["d"] * (bundles.MAX_DEPTH + 2)) + "/f": b""})
+    with pytest.raises(BundleError, match="nest"):
+        bundles.snapshot(folder)
+
+
+def test_a_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", {"policy.py": b"a"})
+    with open(os.path.join(os.fsencode(folder), b"\xff\xfe"), "wb"):
+        pass
+    with pytest.raises(BundleError, match="UTF-8"):
+        bundles.snapshot(folder)
+
+
+@pytest.mark.parametrize("path", ["../evil", "/etc/passwd", "a/../../b", "a//b", ".", "", "a/./b", "a\\b", "a\0b"])
+def test_a_hostile_bundle_cannot_write_outside_its_folder(tmp_path: Path, path: str) -> None:
+    bundle = bundles.pack([BundleFile(path, False, b"x")])
+    with pytest.raises(BundleError):
+        bundles.load(bundle.packed, bundle.digest)
+    with pytest.raises(BundleError):
+        bundles.unpack(bundle, tmp_path / "t")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bundle_that_unpacks_to_too_much_is_refused() -> None:
+    bomb = bundles.pack([BundleFile("zeros", False, bytes(bundles.MAX_BYTES + (1 << 20)))])
+    assert len(bomb.packed) < 1 << 16
+    with pytest.raises(BundleError):
+        bundles.load(bomb.packed, bomb.digest)
+
+
+def test_bytes_of_another_bundle_are_refused() -> None:
+    bundle = bundles.pack([BundleFile("policy.py", False, b"x")])
+    with pytest.raises(BundleError, match="is not"):
+        bundles.load(bundle.packed, "0" * 64)
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_never_a_bundle(data: bytes) -> None:
+    with pytest.raises(BundleError):
+        bundles.load(data, "0" * 64)
