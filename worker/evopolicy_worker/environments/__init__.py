@@ -1,0 +1,21 @@
+"""Environments as the worker plays them: one interface, one adapter for Gymnasium, and toys without a simulator."""
+
+from __future__ import annotations
+
+from evopolicy_worker.environments.actions import ActionCodec, compile_actions
+from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.registry import describe, make, offered
+from evopolicy_worker.environments.settings import process_environment
+
+__all__ = [
+    "ActionCodec",
+    "Environment",
+    "Frame",
+    "Observation",
+    "Step",
+    "compile_actions",
+    "describe",
+    "make",
+    "offered",
+    "process_environment",
+]

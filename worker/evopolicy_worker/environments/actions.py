@@ -1,0 +1,325 @@
+"""Whether what a policy returned is an action, and the repair when it is not; also the uniform random action.
+
+Works from the schema of the action space alone, compiled once: `repair` runs on every step. Its rules:
+- Any reasonable form of a valid action is taken as it is meant and is not marked: Python and numpy numbers, 0-d arrays,
+  lists, tuples, arrays of any number type; axes of length one more or fewer; a bool counts as 0 or 1; a float without
+  fraction counts as an integer; a Box action is cast to the dtype of the space, and may stick out of its bounds by the
+  rounding of a float32.
+- Everything else is marked `invalid` and repaired: a number out of bounds is clipped; a wrong shape is broadcast where
+  that is possible; NaN becomes the lowest value of its element; a missing part of a Dict or Tuple, the lowest value of
+  that part; and anything that is no number at all (None, strings, ragged lists, objects) the lowest value of the space.
+- The lowest value of an element without a lower bound is zero, or the upper bound where that is negative.
+- What is returned is fresh, of exactly the dtype and shape of the space, and finite.
+"""
+
+from __future__ import annotations
+
+import string
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_worker.environments.spaces import bounds
+
+_FAST_ELEMENTS = 32
+"""Up to this many elements a loop over Python floats is faster than numpy's comparisons."""
+_MAX_UNWRAP = 8
+_CHARACTERS = string.ascii_letters + string.digits
+"""Gymnasium's default character set, of which random Text is made."""
+
+
+class ActionCodec(Protocol):
+    """An action space, compiled."""
+
+    def repair(self, raw: object) -> tuple[Any, bool]:
+        """A valid action for what the policy returned, and whether that changed its meaning. Never raises."""
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """A random action, distributed as Gymnasium's `space.sample()`, and of the same bits for the leaf spaces.
+
+        Bounded elements are uniform; unbounded ones normal; those with one bound shifted exponential.
+        """
+
+    def lowest(self) -> Any:
+        """The lowest value of the space."""
+
+
+def compile_actions(schema: SpaceSchema) -> ActionCodec:
+    """The codec of an action space. TypeError for an unknown kind of space."""
+    kind = schema["type"]
+    if kind == "Discrete":
+        return _Discrete(schema["n"], schema.get("start", 0))
+    if kind in ("Box", "Image"):
+        return _Box(schema)
+    if kind == "MultiDiscrete":
+        return _MultiDiscrete(schema["nvec"], schema.get("start", 0))
+    if kind == "MultiBinary":
+        return _MultiBinary(schema["n"])
+    if kind == "Text":
+        return _Text(schema["min_length"], schema["max_length"])
+    if kind == "Dict":
+        return _Dict({key: compile_actions(part) for key, part in schema["spaces"].items()})
+    if kind == "Tuple":
+        return _Tuple([compile_actions(part) for part in schema["spaces"]])
+    raise TypeError(f"no actions for a space of type {kind!r}")
+
+
+class _Discrete:
+    def __init__(self, n: int, start: int) -> None:
+        self._n = n
+        self._low = start
+        self._high = start + n - 1
+
+    def repair(self, raw: object) -> tuple[int, bool]:
+        value = raw if type(raw) is int else _integer(raw)
+        if value is None:
+            return self._low, True
+        if self._low <= value <= self._high:
+            return value, False
+        return (self._low if value < self._low else self._high), True
+
+    def sample(self, rng: np.random.Generator) -> int:
+        return self._low + int(rng.integers(self._n))
+
+    def lowest(self) -> int:
+        return self._low
+
+
+class _Box:
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._dtype = np.dtype(schema["dtype"])
+        self._shape = tuple(schema["shape"])
+        self._low, self._high = bounds(schema)
+        self._bounded_below = np.isfinite(self._low)
+        self._bounded_above = np.isfinite(self._high)
+        self._is_float = self._dtype.kind == "f"
+        limits: Any = np.finfo(self._dtype) if self._is_float else np.iinfo(self._dtype)
+        # An infinite element becomes the largest finite one: simulators do not survive infinities.
+        self._clip_low = np.maximum(self._low, _inside(limits.min))
+        self._clip_high = np.minimum(self._high, _inside(limits.max))
+        self._rounded_low = self._clip_low - _float32_spacing(self._clip_low)
+        self._rounded_high = self._clip_high + _float32_spacing(self._clip_high)
+        self._lowest = np.where(self._bounded_below, self._low, np.minimum(self._high, 0.0))
+        self._limits = tuple(
+            zip(self._clip_low.ravel().tolist(), self._clip_high.ravel().tolist(), strict=True)
+        )
+        self._fast = self._is_float and len(self._shape) == 1 and len(self._limits) <= _FAST_ELEMENTS
+
+    def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
+        if self._fast:
+            # Nearly every action of nearly every policy: right shape, within bounds.
+            if type(raw) is np.ndarray and raw.dtype.kind == "f" and raw.shape == self._shape:
+                for value, (low, high) in zip(raw.tolist(), self._limits, strict=True):
+                    if not low <= value <= high:
+                        break
+                else:
+                    return raw.astype(self._dtype), False
+            elif type(raw) is list and len(raw) == len(self._limits):
+                for value, (low, high) in zip(raw, self._limits, strict=True):
+                    if type(value) is not float or not low <= value <= high:
+                        break
+                else:
+                    return np.array(raw, dtype=self._dtype), False
+        with np.errstate(all="ignore"):
+            return self._repair_any(raw)
+
+    def _repair_any(self, raw: object) -> tuple[NDArray[Any], bool]:
+        numbers = _numbers(raw)
+        shaped, invalid = _shaped(numbers, self._shape) if numbers is not None else (None, True)
+        if shaped is None:
+            return self.lowest(), True
+        values = shaped.astype(np.float64)
+        lost = np.isnan(values)
+        if lost.any():
+            values = np.where(lost, self._lowest, values)
+            invalid = True
+        if bool((values < self._rounded_low).any() or (values > self._rounded_high).any()):
+            invalid = True
+        if not self._is_float:
+            whole = np.trunc(values)
+            invalid = invalid or bool((whole != values).any())
+            values = whole
+        return np.minimum(np.maximum(values, self._clip_low), self._clip_high).astype(self._dtype), invalid
+
+    def sample(self, rng: np.random.Generator) -> NDArray[Any]:
+        low, below, above = self._low, self._bounded_below, self._bounded_above
+        high = self._high if self._is_float else self._high + 1
+        values = np.empty(self._shape)
+        # Gymnasium's order of drawing, so that the same generator gives the same action.
+        free, only_high, only_low, both = ~below & ~above, ~below & above, below & ~above, below & above
+        values[free] = rng.normal(size=int(free.sum()))
+        values[only_low] = rng.exponential(size=int(only_low.sum())) + low[only_low]
+        values[only_high] = -rng.exponential(size=int(only_high.sum())) + high[only_high]
+        values[both] = rng.uniform(low=low[both], high=high[both], size=int(both.sum()))
+        if not self._is_float:
+            values = np.minimum(np.maximum(np.floor(values), self._clip_low), self._clip_high)
+        return values.astype(self._dtype)
+
+    def lowest(self) -> NDArray[Any]:
+        return self._lowest.astype(self._dtype)
+
+
+class _MultiDiscrete:
+    def __init__(self, nvec: Any, start: Any) -> None:
+        self._n = np.array(nvec, dtype=np.int64)
+        self._low = np.broadcast_to(np.array(start, dtype=np.int64), self._n.shape)
+        self._high = self._low + self._n - 1
+
+    def repair(self, raw: object) -> tuple[NDArray[np.int64], bool]:
+        numbers = _numbers(raw)
+        shaped, invalid = _shaped(numbers, self._n.shape) if numbers is not None else (None, True)
+        if shaped is None:
+            return self.lowest(), True
+        if shaped.dtype.kind == "f":
+            with np.errstate(all="ignore"):
+                whole = shaped == np.trunc(shaped)  # False for NaN, True for infinities, which are clipped
+            invalid = invalid or not bool(whole.all())
+            shaped = np.where(whole, shaped, self._low)
+        clipped = np.minimum(np.maximum(shaped, self._low), self._high)
+        return clipped.astype(np.int64), invalid or bool((clipped != shaped).any())
+
+    def sample(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        return (rng.random(self._n.shape) * self._n).astype(np.int64) + self._low
+
+    def lowest(self) -> NDArray[np.int64]:
+        return self._low.copy()
+
+
+class _MultiBinary:
+    def __init__(self, n: int | list[int]) -> None:
+        self._shape = (n,) if isinstance(n, int) else tuple(n)
+        self._codec = _MultiDiscrete(np.full(self._shape, 2), 0)
+
+    def repair(self, raw: object) -> tuple[NDArray[np.int8], bool]:
+        action, invalid = self._codec.repair(raw)
+        return action.astype(np.int8), invalid
+
+    def sample(self, rng: np.random.Generator) -> NDArray[np.int8]:
+        return rng.integers(low=0, high=2, size=self._shape, dtype=np.int8)
+
+    def lowest(self) -> NDArray[np.int8]:
+        return np.zeros(self._shape, dtype=np.int8)
+
+
+class _Text:
+    def __init__(self, min_length: int, max_length: int) -> None:
+        self._min = min_length
+        self._max = max_length
+
+    def repair(self, raw: object) -> tuple[str, bool]:
+        if not isinstance(raw, str):
+            return self.lowest(), True
+        if len(raw) > self._max:
+            return raw[: self._max], True
+        return raw.ljust(self._min), len(raw) < self._min
+
+    def sample(self, rng: np.random.Generator) -> str:
+        length = int(rng.integers(self._min, self._max + 1))
+        return "".join(_CHARACTERS[k] for k in rng.integers(len(_CHARACTERS), size=length).tolist())
+
+    def lowest(self) -> str:
+        return " " * self._min
+
+
+class _Dict:
+    def __init__(self, parts: dict[str, ActionCodec]) -> None:
+        self._parts = parts
+
+    def repair(self, raw: object) -> tuple[dict[str, Any], bool]:
+        if not isinstance(raw, dict):
+            return self.lowest(), True
+        invalid = raw.keys() != self._parts.keys()
+        action = {}
+        for key, part in self._parts.items():
+            action[key], changed = part.repair(raw.get(key))
+            invalid = invalid or changed
+        return action, invalid
+
+    def sample(self, rng: np.random.Generator) -> dict[str, Any]:
+        return {key: part.sample(rng) for key, part in self._parts.items()}
+
+    def lowest(self) -> dict[str, Any]:
+        return {key: part.lowest() for key, part in self._parts.items()}
+
+
+class _Tuple:
+    def __init__(self, parts: list[ActionCodec]) -> None:
+        self._parts = parts
+
+    def repair(self, raw: object) -> tuple[tuple[Any, ...], bool]:
+        if isinstance(raw, np.ndarray) and raw.ndim:
+            raw = list(raw[: len(self._parts) + 1])
+        if not isinstance(raw, list | tuple):
+            return self.lowest(), True
+        invalid = len(raw) != len(self._parts)
+        given = [*raw[: len(self._parts)], *[None] * (len(self._parts) - len(raw))]
+        action = []
+        for part, value in zip(self._parts, given, strict=True):
+            repaired, changed = part.repair(value)
+            action.append(repaired)
+            invalid = invalid or changed
+        return tuple(action), invalid
+
+    def sample(self, rng: np.random.Generator) -> tuple[Any, ...]:
+        return tuple(part.sample(rng) for part in self._parts)
+
+    def lowest(self) -> tuple[Any, ...]:
+        return tuple(part.lowest() for part in self._parts)
+
+
+def _integer(raw: object) -> int | None:
+    """The integer that `raw` stands for; None when it stands for none."""
+    for _ in range(_MAX_UNWRAP):
+        if isinstance(raw, int | np.integer | np.bool_):  # bool is an int
+            return int(raw)
+        if isinstance(raw, float | np.floating):
+            return int(raw) if np.isfinite(raw) and raw == np.trunc(raw) else None
+        if isinstance(raw, np.ndarray):
+            if raw.size != 1 or raw.dtype.kind not in "biuf":
+                return None
+            raw = raw.reshape(()).item()
+        elif isinstance(raw, list | tuple) and len(raw) == 1:
+            raw = raw[0]
+        else:
+            return None
+    return None
+
+
+def _numbers(raw: object) -> NDArray[Any] | None:
+    """`raw` as an array of numbers; None when it is not made of numbers alone."""
+    if not isinstance(raw, int | float | list | tuple | np.ndarray | np.number | np.bool_):
+        return None
+    try:
+        array = np.asarray(raw)
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        return None
+    if array.dtype.kind == "b":
+        return array.astype(np.int64)
+    return array if array.dtype.kind in "iuf" else None
+
+
+def _shaped(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[Any] | None, bool]:
+    """`array` in that shape and whether its meaning changed; None when it cannot be brought there."""
+    if array.shape == shape:
+        return array, False
+    if [n for n in array.shape if n != 1] == [n for n in shape if n != 1]:
+        return array.reshape(shape), False
+    try:
+        return np.broadcast_to(array, shape), True
+    except ValueError:
+        return None, True
+
+
+def _inside(limit: Any) -> float:
+    """`limit` of a dtype as a float that casts back: the limits of 64-bit integers round to beyond them."""
+    near = float(limit)
+    return near if abs(near) != 2.0**63 and near != 2.0**64 else float(np.nextafter(near, 0.0))
+
+
+def _float32_spacing(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far a float32 near each value may be from it: bounds are often computed in single precision."""
+    with np.errstate(all="ignore"):
+        spacing = np.spacing(np.abs(values).astype(np.float32)).astype(np.float64)
+    return np.where(np.isfinite(spacing), spacing, 0.0)

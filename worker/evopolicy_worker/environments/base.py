@@ -1,0 +1,68 @@
+"""What an environment is to the worker: one interface for all of them, whatever simulator is behind.
+
+Rules that this module owns:
+- An environment is used for many episodes, one after another, by one process. `reset(case)` followed by the same
+  actions gives the same episode bit for bit, whatever was played before; where a simulator does not promise that,
+  the adapter rebuilds it.
+- Observations are plain: numpy arrays (C-contiguous, exactly the dtype of the space, never an alias of a buffer that
+  the simulator writes again), ints, strings, dicts in the order of the space, tuples.
+- `info` is plain too (see `info.py`) and names no seed.
+- `step` trusts its action: what a policy returned goes through `action_codec.repair` first.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
+from evopolicy_worker.environments.actions import ActionCodec
+
+Observation = Any
+"""numpy array, int, str, dict or tuple of these, as the observation space says."""
+Frame = NDArray[np.uint8]
+"""A rendered picture, height × width × 3, RGB."""
+
+
+class Step(NamedTuple):
+    """What one step gave. `obs` is what the policy is shown next."""
+
+    obs: Observation
+    reward: float
+    terminated: bool
+    """The task itself ended: goal reached, fallen, crashed."""
+    truncated: bool
+    """The step limit was reached."""
+    info: dict[str, Any]
+    """Plain values only; parts of the reward under the names in `description.reward_components`."""
+
+
+class Environment(ABC):
+    """One environment, kept warm for episode after episode. Not thread-safe."""
+
+    description: EnvironmentDescription
+    action_codec: ActionCodec
+    """Repairs what a policy returns, and draws uniform random actions."""
+
+    @abstractmethod
+    def reset(self, case: Case) -> Observation:
+        """Start the episode of `case`; its first observation."""
+
+    @abstractmethod
+    def step(self, action: Any) -> Step:
+        """Play one valid action. Not defined after an episode has ended."""
+
+    def render(self) -> Frame:
+        """The current state as a picture. WorkerError unless made with `render=True` and `description.renders`.
+
+        Rendering never changes what the episode does next.
+        """
+        raise WorkerError(f"{self.description.env} was not made to render; make it with render=True")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what the simulator holds. The environment is not used afterwards; a second close does nothing."""

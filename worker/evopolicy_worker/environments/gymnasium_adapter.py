@@ -1,0 +1,169 @@
+"""Any Gymnasium environment as an `Environment`; what differs between families is a small hook.
+
+A family subclasses `GymnasiumFamily`: which packages it needs, how an environment is made, whether a reused one gives
+the same episode as a fresh one, what its `info` says about the reward. Simulators are imported when an environment of
+their family is made, and not before: this module imports none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import warnings
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
+from evopolicy_worker.environments import settings, spaces
+from evopolicy_worker.environments.actions import compile_actions
+from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.info import plain_info
+from evopolicy_worker.environments.observations import compile_observation
+from evopolicy_worker.environments.tasks import task_text
+
+if TYPE_CHECKING:
+    import gymnasium
+
+_PLAIN_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
+"""Wrappers that change no value; the adapter counts the steps itself, and calls in order."""
+
+
+class GymnasiumFamily:
+    """How the environments of one package are made and read. The defaults suit most."""
+
+    distributions: tuple[str, ...] = ("gymnasium",)
+    """Distributions whose versions decide what is played, the one that registers the environments first."""
+    modules: tuple[str, ...] = ("gymnasium",)
+    """Packages to import; a family is offered where all of them are installed."""
+    components: Mapping[str, tuple[str, ...]] = {}
+    """Names in `info` of the parts of the reward, by Gymnasium id."""
+
+    def installed(self) -> bool:
+        """Whether all packages are there, found out without importing them."""
+        return all(find_spec(module) is not None for module in self.modules)
+
+    def load(self) -> None:
+        """Import the packages and register their environments."""
+        import gymnasium
+
+        for name in self.modules:
+            module = importlib.import_module(name)
+            if module is not gymnasium:
+                gymnasium.register_envs(module)
+
+    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+        """A fresh environment with Gymnasium's defaults."""
+        import gymnasium
+
+        assert entry.gymnasium_id is not None
+        return gymnasium.make(
+            entry.gymnasium_id, render_mode="rgb_array" if render else None, disable_env_checker=True
+        )
+
+    def rebuilds(self, entry: Entry) -> bool:
+        """True when a reused environment may play another episode than a fresh one of the same case."""
+        return False
+
+    def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        """The plain part of a step's `info`."""
+        return plain_info(info) if info else {}
+
+    def render(self, env: gymnasium.Env[Any, Any]) -> Any:
+        """A picture of the current state, without changing it."""
+        return env.render()
+
+    def version(self, entry: Entry) -> str:
+        """What is played, with the versions that decide it: `Ant-v5 (gymnasium 1.4.0, mujoco 3.10.0)`."""
+        versions = ", ".join(f"{name} {version(name)}" for name in self.distributions)
+        return f"{entry.gymnasium_id} ({versions})"
+
+
+class GymnasiumEnvironment(Environment):
+    """One Gymnasium environment of a family. Made fresh again for a case where reuse could show."""
+
+    def __init__(self, entry: Entry, family: GymnasiumFamily, *, render: bool = False) -> None:
+        self._entry = entry
+        self._family = family
+        self._render = render
+        settings.apply(render=render)
+        with _quiet():
+            family.load()
+        self._rebuilds = family.rebuilds(entry)
+        self._used = False
+        self._options_used = False
+        self._steps = 0
+        self._build()
+        obs_schema = spaces.to_schema(self._env.observation_space)
+        action_schema = spaces.to_schema(self._env.action_space)
+        self._observe = compile_observation(obs_schema)
+        self._plain = family.info
+        self.action_codec = compile_actions(action_schema)
+        self.description = EnvironmentDescription(
+            env=entry.id,
+            env_version=family.version(entry),
+            obs_space=obs_schema,
+            action_space=action_schema,
+            obs_storage=spaces.obs_storage(obs_schema),
+            max_episode_steps=self._limit,
+            reward_components=tuple(family.components.get(entry.gymnasium_id or "", ())),
+            task_text=task_text(entry.id),
+            renders="rgb_array" in self._env.metadata.get("render_modes", ()),
+        )
+
+    def reset(self, case: Case) -> Observation:
+        # `reset(options=…)` may reconfigure an environment for good (highway-env does), so none is reused after it.
+        if self._used and (self._rebuilds or self._options_used):
+            self._env.close()
+            self._build()
+        self._used = True
+        self._options_used = case.options is not None
+        self._steps = 0
+        obs, _ = self._env.reset(seed=case.seed, options=case.options)
+        return self._observe(obs)
+
+    def step(self, action: Any) -> Step:
+        obs, reward, terminated, truncated, info = self._env.step(action)
+        self._steps += 1
+        return Step(
+            self._observe(obs),
+            float(reward),
+            bool(terminated),
+            bool(truncated) or self._steps >= self._limit,
+            self._plain(info),
+        )
+
+    def render(self) -> Frame:
+        if not self._render:
+            return super().render()
+        frame = np.asarray(self._family.render(self._env))
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise WorkerError(f"{self._entry.id} rendered {frame.dtype} {frame.shape}, not uint8 H x W x 3")
+        return np.array(frame, order="C")
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _build(self) -> None:
+        with _quiet():
+            env = self._family.make(self._entry, render=self._render)
+        self._limit = self._entry.max_episode_steps
+        while type(env).__name__ in _PLAIN_WRAPPERS:
+            self._limit = min(self._limit, getattr(env, "_max_episode_steps", None) or self._limit)
+            env = env.env  # type: ignore[attr-defined]
+        self._env = env
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing that a library has to say at import or make: deprecations, notices, greetings."""
+    sink = io.StringIO()
+    with warnings.catch_warnings(), contextlib.redirect_stdout(sink), contextlib.redirect_stderr(sink):
+        warnings.simplefilter("ignore")
+        yield

@@ -1,0 +1,73 @@
+"""What of a simulator's `info` goes into a trajectory: plain scalars, short strings, short lists, one level of dicts.
+
+Nothing that names a seed passes, and nothing of the simulator's own types: the result is JSON and msgpack as it is
+(NaN and infinities are the trajectory codec's to spell).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+MAX_ELEMENTS = 16
+"""Longer arrays, lists and nested dicts are dropped."""
+MAX_CHARACTERS = 256
+"""Longer strings are dropped."""
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _small_int(value: Any) -> int | None:
+    plain = int(value)
+    return plain if -(2**63) <= plain < 2**63 else None
+
+
+_SCALARS: dict[type, Callable[[Any], Any]] = {
+    float: _same,
+    bool: _same,
+    int: _small_int,
+    np.bool_: bool,
+    **dict.fromkeys((np.float16, np.float32, np.float64), float),
+    **dict.fromkeys((np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32), int),
+}
+
+
+def plain_info(info: Mapping[Any, Any]) -> dict[str, Any]:
+    """The part of `info` that may be kept, as plain values, in the simulator's order."""
+    plain: dict[str, Any] = {}
+    for key, value in info.items():
+        convert = _SCALARS.get(type(value))
+        kept = convert(value) if convert is not None else _compound(value)
+        if kept is not None and _may_name(key):
+            plain[key] = kept
+    return plain
+
+
+def _compound(value: Any) -> Any:
+    """A short string, list or dict as plain values; None when it is not kept."""
+    if isinstance(value, str):
+        return str(value) if len(value) <= MAX_CHARACTERS else None
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.size <= MAX_ELEMENTS and value.dtype.kind in "biuf" else None
+    if isinstance(value, Mapping):
+        flat = {key: _scalar(item) for key, item in value.items() if _may_name(key)}
+        return flat if len(flat) <= MAX_ELEMENTS and None not in flat.values() else None
+    if isinstance(value, list | tuple):
+        items = [_scalar(item) for item in value[: MAX_ELEMENTS + 1]]
+        return items if len(items) <= MAX_ELEMENTS and None not in items else None
+    return None
+
+
+def _scalar(value: Any) -> Any:
+    convert = _SCALARS.get(type(value))
+    return convert(value) if convert is not None else None
+
+
+@lru_cache(maxsize=4096)
+def _may_name(key: Any) -> bool:
+    return isinstance(key, str) and "seed" not in key.lower()

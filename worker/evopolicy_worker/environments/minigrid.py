@@ -1,0 +1,13 @@
+"""MiniGrid: grid worlds seen through a 7 × 7 egocentric window."""
+
+from __future__ import annotations
+
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+
+
+class MiniGridFamily(GymnasiumFamily):
+    distributions = ("minigrid",)
+    modules = ("gymnasium", "minigrid")
+
+
+FAMILY = MiniGridFamily()

@@ -1,0 +1,36 @@
+"""Gymnasium-Robotics: the Fetch tasks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+
+if TYPE_CHECKING:
+    import gymnasium
+
+
+class RoboticsFamily(GymnasiumFamily):
+    distributions = ("gymnasium-robotics", "mujoco")
+    modules = ("gymnasium", "mujoco", "gymnasium_robotics")
+
+    def render(self, env: gymnasium.Env[Any, Any]) -> Any:
+        """A picture; the callback that moves the target's marker also runs the forward dynamics, so both are put back.
+
+        Without that a rendered FetchPickAndPlace goes another way than an unrendered one.
+        """
+        import mujoco
+
+        simulator: Any = env.unwrapped
+        model, data = simulator.model, simulator.data
+        saved = mujoco.MjData(model)
+        mujoco.mj_copyData(saved, model, data)
+        sites = model.site_pos.copy()
+        try:
+            return env.render()
+        finally:
+            mujoco.mj_copyData(data, model, saved)
+            model.site_pos[:] = sites
+
+
+FAMILY = RoboticsFamily()

@@ -1,0 +1,47 @@
+"""The process environment in which simulators run: threads, drivers, hash seed, locale, time zone.
+
+A simulator may read these only while it is imported, so a slot process is *started* with them. `apply` is for callers
+that make an environment in a process of another's making (tests, `evopolicy try`): it fills in what is unset.
+"""
+
+from __future__ import annotations
+
+import os
+
+_ALWAYS = {
+    # One slot has one core; and the order of summation in a threaded BLAS depends on the number of threads.
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMEXPR_NUM_THREADS": "1",
+    # "dummy" makes the frames of highway-env black; "offscreen" draws, and needs no display either.
+    "SDL_VIDEODRIVER": "offscreen",
+    "SDL_AUDIODRIVER": "dummy",
+    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "PYGLET_HEADLESS": "1",
+    # With its hidden window a process that forks afterwards hangs.
+    "PYGLET_SHADOW_WINDOW": "0",
+    "MPLBACKEND": "Agg",
+    "PYTHONHASHSEED": "0",
+    "LC_ALL": "C.UTF-8",
+    "TZ": "UTC",
+}
+_ONLY_AT_START = {"PYTHONHASHSEED", "LC_ALL", "TZ"}
+"""Read once by a starting interpreter or C library: setting them later would only confuse children."""
+
+
+def process_environment(*, render: bool = False) -> dict[str, str]:
+    """Variables that a slot process is started with. `render=True` also selects MuJoCo's off-screen renderer."""
+    variables = dict(_ALWAYS)
+    if render:
+        # Without it the second MuJoCo environment that draws aborts the process.
+        variables["MUJOCO_GL"] = "egl"
+        variables["PYOPENGL_PLATFORM"] = "egl"
+    return variables
+
+
+def apply(*, render: bool = False) -> None:
+    """Set in this process what is not set yet; for simulators that are imported after this call."""
+    for name, value in process_environment(render=render).items():
+        if name not in _ONLY_AT_START:
+            os.environ.setdefault(name, value)

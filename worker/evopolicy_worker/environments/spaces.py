@@ -1,0 +1,137 @@
+"""Spaces as plain dicts: from a Gymnasium space to the schema that policies, `/info` and the codecs read.
+
+Forms (protocol, section Policy): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
+value_range, storage}`, `MultiDiscrete {nvec, start?}`, `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
+{min_length, max_length}`. Infinities are `"inf"` and `"-inf"`; a Box of more than 32 values states `min` and `max`
+over all of its values in place of `low` and `high`. A schema is JSON and msgpack by construction.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_common.messages.environment import ObsStorage, SpaceSchema
+
+if TYPE_CHECKING:
+    import gymnasium
+
+MAX_LISTED_BOUNDS = 32
+"""A Box with more values than this states one minimum and one maximum."""
+MIN_IMAGE_SIDE = 16
+"""A uint8 height × width × {1, 3} array is a picture from this side on; smaller ones are symbolic grids."""
+
+
+def to_schema(space: gymnasium.Space[Any], *, storage: ObsStorage = "npy") -> SpaceSchema:
+    """`space` as a plain dict. `storage` is what an Image at the top says; nested Images say `npz`.
+
+    TypeError for a kind of space that the protocol has no form for.
+    """
+    from gymnasium import spaces
+
+    if isinstance(space, spaces.Discrete):
+        schema: SpaceSchema = {"type": "Discrete", "n": int(space.n)}
+        if int(space.start):
+            schema["start"] = int(space.start)
+        return schema
+    if isinstance(space, spaces.Box):
+        return _box(space.shape, space.dtype, space.low, space.high, storage)
+    if isinstance(space, spaces.MultiDiscrete):
+        schema = {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
+        if np.any(space.start):
+            schema["start"] = space.start.tolist()
+        return schema
+    if isinstance(space, spaces.MultiBinary):
+        n = space.n
+        return {
+            "type": "MultiBinary",
+            "n": int(n) if isinstance(n, int | np.integer) else [int(k) for k in n],
+        }
+    if isinstance(space, spaces.Tuple):
+        return {"type": "Tuple", "spaces": [to_schema(part, storage="npz") for part in space.spaces]}
+    if isinstance(space, spaces.Dict):
+        return {
+            "type": "Dict",
+            "spaces": {key: to_schema(part, storage="npz") for key, part in space.spaces.items()},
+        }
+    if isinstance(space, spaces.Text):
+        return {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
+    if hasattr(space, "mission_func"):
+        return _mission(space)
+    raise TypeError(f"no schema for a space of type {type(space).__name__}: {space}")
+
+
+def obs_storage(schema: SpaceSchema) -> ObsStorage:
+    """Where feedback keeps observations of this space: in the rows, or beside them when there is a picture in it."""
+    if schema["type"] == "Image":
+        return "npy"
+    return "npz" if _has_image(schema) else "inline"
+
+
+def parts(schema: SpaceSchema) -> list[SpaceSchema]:
+    """The spaces that a Dict or Tuple is made of, in order; of any other, none."""
+    inner = schema.get("spaces", ())
+    return list(inner.values()) if isinstance(inner, dict) else list(inner)
+
+
+def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape."""
+    shape = tuple(schema["shape"])
+    if schema["type"] == "Image":
+        lowest, highest = schema["value_range"]
+        return np.full(shape, float(lowest)), np.full(shape, float(highest))
+    if "low" in schema:
+        return _floats(schema["low"]).reshape(shape), _floats(schema["high"]).reshape(shape)
+    return np.full(shape, float(schema["min"])), np.full(shape, float(schema["max"]))
+
+
+def _has_image(schema: SpaceSchema) -> bool:
+    return schema["type"] == "Image" or any(_has_image(part) for part in parts(schema))
+
+
+def _box(
+    shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[Any], storage: ObsStorage
+) -> SpaceSchema:
+    name = np.dtype(dtype).name
+    if name == "uint8" and len(shape) == 3 and min(shape[:2]) >= MIN_IMAGE_SIDE and shape[2] in (1, 3):
+        return {
+            "type": "Image",
+            "shape": list(shape),
+            "dtype": name,
+            "layout": "HWC",
+            "value_range": [0, 255],
+            "storage": storage,
+        }
+    schema: SpaceSchema = {"type": "Box", "shape": list(shape), "dtype": name}
+    if low.size > MAX_LISTED_BOUNDS:
+        return schema | {"min": _number(low.min()), "max": _number(high.max())}
+    return schema | {"low": _numbers(low.tolist()), "high": _numbers(high.tolist())}
+
+
+def _mission(space: Any) -> SpaceSchema:
+    """MiniGrid's sentence of a fixed pattern: as short and as long as its placeholders make it."""
+    choices = space.ordered_placeholders or []
+    lengths = [len(space.mission_func(*words)) for words in itertools.product(*choices)]
+    return {"type": "Text", "min_length": min(lengths), "max_length": max(lengths)}
+
+
+def _number(value: Any) -> int | float | str:
+    plain: int | float = value.item() if isinstance(value, np.generic) else value
+    if isinstance(plain, float) and math.isinf(plain):
+        return "inf" if plain > 0 else "-inf"
+    return plain + 0  # no negative zero
+
+
+def _numbers(value: Any) -> Any:
+    return [_numbers(item) for item in value] if isinstance(value, list) else _number(value)
+
+
+def _floats(value: Any) -> NDArray[np.float64]:
+    def convert(item: Any) -> Any:
+        return [convert(part) for part in item] if isinstance(item, list) else float(item)
+
+    return np.array(convert(value), dtype=np.float64)
