@@ -1,21 +1,19 @@
 """Policy bundles: a snapshot of `system/` as one blob, and that blob as a folder again.
 
-A bundle is the zstd-compressed msgpack list of `[path, executable, bytes]`, sorted by path, so equal folders give equal
-bytes and an equal digest (SHA-256 of the *uncompressed* list, so that it does not depend on the compressor). Both
-directions treat the other side as hostile: a snapshot opens every component without following links and takes regular
+A bundle is the msgpack list of `[path, executable, bytes]`, sorted by path, so equal folders give equal bytes and an
+equal digest (not compressed: the digest must not depend on a compressor's version). Both directions treat the other side as hostile: a snapshot opens every component without following links and takes regular
 files only; unpacking accepts plain relative paths only.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 from pathlib import Path, PurePosixPath
 
 import msgspec
-import zstandard
 
+from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import BundleError
 
 MAX_FILES = 2000
@@ -39,7 +37,7 @@ class BundleFile(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Bundle(msgspec.Struct, frozen=True):
-    """A snapshot: its digest, its compressed bytes and what is in it."""
+    """A snapshot: its digest (SHA-256 of `packed`), its bytes and what is in it."""
 
     digest: str
     packed: bytes
@@ -70,23 +68,18 @@ def snapshot(folder: Path) -> Bundle:
 def pack(files: list[BundleFile]) -> Bundle:
     """The bundle of these files; the order in which they are given does not matter."""
     ordered = tuple(sorted(files, key=lambda file: file.path))
-    plain = msgspec.msgpack.encode(ordered)
-    packed = zstandard.ZstdCompressor(level=3).compress(plain)
-    return Bundle(hashlib.sha256(plain).hexdigest(), packed, ordered)
+    packed = msgspec.msgpack.encode(ordered)
+    return Bundle(digest_of(packed), packed, ordered)
 
 
 def load(packed: bytes, digest: str) -> Bundle:
     """The bundle in `packed`; BundleError when it is damaged, too big, or not the one that `digest` names."""
-    limit = MAX_BYTES + MAX_FILES * (MAX_PATH_BYTES + 32)
-    try:
-        plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=limit, allow_extra_data=False)
-        files = _files_decoder.decode(plain)
-    except (zstandard.ZstdError, msgspec.DecodeError, MemoryError) as error:
-        raise BundleError(f"not a bundle: {error}") from error
-    if len(plain) > limit:
-        raise BundleError(f"not a bundle: {len(plain)} bytes unpacked, limit {limit}")
-    if hashlib.sha256(plain).hexdigest() != digest:
+    if digest_of(packed) != digest:
         raise BundleError(f"bundle is not {digest}")
+    try:
+        files = _files_decoder.decode(packed)
+    except msgspec.DecodeError as error:
+        raise BundleError(f"not a bundle: {error}") from error
     _check(files)
     return Bundle(digest, packed, files)
 

@@ -39,6 +39,11 @@ class TransportError(EvopolicyError):
 class RefusedError(EvopolicyError):
     """The coordinator answered, and refused: a wrong token, an unknown run, a closed run."""
 
+    def __init__(self, status: str, message: str) -> None:
+        super().__init__(f"{message} ({status})")
+        self.status = status
+        self.message = message
+
 
 class SandboxError(EvopolicyError):
     """The sandbox itself failed (not the policy in it): infrastructure, retried and never charged."""

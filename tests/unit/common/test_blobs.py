@@ -33,7 +33,9 @@ def test_a_damaged_blob_is_refused_and_set_aside(tmp_path: Path) -> None:
 
 
 @given(data=st.binary(min_size=1, max_size=400), step=st.integers(1, 100))
-def test_chunks_in_order_make_the_blob(tmp_path_factory: pytest.TempPathFactory, data: bytes, step: int) -> None:
+def test_chunks_in_order_make_the_blob(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, step: int
+) -> None:
     store = BlobStore(tmp_path_factory.mktemp("blobs"))
     digest = digest_of(data)
     have = 0

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common import bundles
+from evopolicy_common.blobs import digest_of
 from evopolicy_common.bundles import BundleFile
 from evopolicy_common.errors import BundleError
 
@@ -37,7 +38,9 @@ def test_one_changed_byte_changes_the_digest(tmp_path: Path) -> None:
 
 
 def test_what_tools_leave_behind_is_left_out(tmp_path: Path) -> None:
-    folder = make(tmp_path / "s", {"policy.py": b"a", "__pycache__/policy.cpython-311.pyc": b"x", ".git/HEAD": b"y"})
+    folder = make(
+        tmp_path / "s", {"policy.py": b"a", "__pycache__/policy.cpython-311.pyc": b"x", ".git/HEAD": b"y"}
+    )
     assert [file.path for file in bundles.snapshot(folder).files] == ["policy.py"]
 
 
@@ -48,7 +51,9 @@ def test_unpacked_bundle_snapshots_to_the_same_digest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["symlink", "folder symlink", "hard link", "fifo", "socket"])
-def test_special_files_are_refused_by_name(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_special_files_are_refused_by_name(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     outside = tmp_path / "secret"
     outside.mkdir()
     (outside / "key").write_bytes(b"hidden")
@@ -105,7 +110,9 @@ def test_a_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
         bundles.snapshot(folder)
 
 
-@pytest.mark.parametrize("path", ["../evil", "/etc/passwd", "a/../../b", "a//b", ".", "", "a/./b", "a\\b", "a\0b"])
+@pytest.mark.parametrize(
+    "path", ["../evil", "/etc/passwd", "a/../../b", "a//b", ".", "", "a/./b", "a\\b", "a\0b"]
+)
 def test_a_hostile_bundle_cannot_write_outside_its_folder(tmp_path: Path, path: str) -> None:
     bundle = bundles.pack([BundleFile(path, False, b"x")])
     with pytest.raises(BundleError):
@@ -115,11 +122,10 @@ def test_a_hostile_bundle_cannot_write_outside_its_folder(tmp_path: Path, path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bundle_that_unpacks_to_too_much_is_refused() -> None:
-    bomb = bundles.pack([BundleFile("zeros", False, bytes(bundles.MAX_BYTES + (1 << 20)))])
-    assert len(bomb.packed) < 1 << 16
-    with pytest.raises(BundleError):
-        bundles.load(bomb.packed, bomb.digest)
+def test_a_bundle_over_the_limit_is_refused() -> None:
+    bundle = bundles.pack([BundleFile("zeros", False, bytes(bundles.MAX_BYTES + 1))])
+    with pytest.raises(BundleError, match="limit"):
+        bundles.load(bundle.packed, bundle.digest)
 
 
 def test_bytes_of_another_bundle_are_refused() -> None:
@@ -128,7 +134,10 @@ def test_bytes_of_another_bundle_are_refused() -> None:
         bundles.load(bundle.packed, "0" * 64)
 
 
-@given(st.binary(max_size=200))
+@given(st.binary(max_size=200).filter(lambda data: data != b"\x90"))
 def test_garbage_is_never_a_bundle(data: bytes) -> None:
+    # 0x90 is the empty list: a bundle of an empty folder.
     with pytest.raises(BundleError):
         bundles.load(data, "0" * 64)
+    with pytest.raises(BundleError):
+        bundles.load(data, digest_of(data))
