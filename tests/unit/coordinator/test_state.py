@@ -1,0 +1,103 @@
+"""The state folder: private, one coordinator at a time, the same identity after a restart."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from evopolicy_common import credentials
+from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator.state import StateFolder, reachable, resolve_listen
+
+
+def test_identity_survives_a_restart_and_nobody_else_reads_it(tmp_path: Path) -> None:
+    root = tmp_path / "state"
+    first = StateFolder.open(root)
+    first.write_passwords()
+    first.write_credentials(("tcp/127.0.0.1:7447",))
+    first.close()
+    again = StateFolder.open(root)
+    assert again.identity == first.identity
+    assert again.identity.cluster == "local"
+    again.close()
+    for path in [root, *(p for p in root.rglob("*"))]:
+        assert path.stat().st_mode & 0o077 == 0, path
+
+
+def test_each_role_gets_its_own_password_and_only_its_own_token(tmp_path: Path) -> None:
+    state = StateFolder.open(tmp_path / "state", "lab")
+    files = state.write_credentials(("tcp/10.0.0.5:7447",))
+    found = {role: credentials.read(path) for role, path in files.items()}
+    assert {c.cluster for c in found.values()} == {"lab"}
+    assert len({c.password for c in found.values()}) == 3
+    assert found["worker"].token == state.identity.worker_token
+    assert found["operator"].token == state.identity.operator_token
+    assert found["gateway"].token == ""
+    state.close()
+
+
+def test_second_coordinator_on_one_folder_is_refused_and_told_by_whom(tmp_path: Path) -> None:
+    state = StateFolder.open(tmp_path)
+    with pytest.raises(ConfigError, match=f"in use by another coordinator \\(process {os.getpid()}\\)"):
+        StateFolder.open(tmp_path)
+    state.close()
+    StateFolder.open(tmp_path).close()
+
+
+def test_folder_that_others_may_enter_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    with pytest.raises(ConfigError, match="chmod 700"):
+        StateFolder.open(tmp_path)
+
+
+def test_folder_of_another_cluster_or_a_damaged_one_is_refused_and_unlocked(tmp_path: Path) -> None:
+    StateFolder.open(tmp_path, "lab").close()
+    with pytest.raises(ConfigError, match="is of cluster 'lab', not 'field'"):
+        StateFolder.open(tmp_path, "field")
+    (tmp_path / "identity.json").write_text("{")
+    with pytest.raises(ConfigError, match="damaged"):
+        StateFolder.open(tmp_path, "lab")
+    with pytest.raises(ConfigError, match="--cluster 'a/b'"):
+        StateFolder.open(tmp_path, "a/b")
+
+
+def test_too_long_a_socket_path_is_told(tmp_path: Path) -> None:
+    state = StateFolder.open(tmp_path / ("x" * 100))
+    with pytest.raises(ConfigError, match="shorter one with --state"):
+        _ = state.socket_endpoint
+    state.close()
+
+
+def test_port_0_becomes_a_free_port() -> None:
+    (endpoint,) = resolve_listen(["tcp/127.0.0.1:0"])
+    assert int(endpoint.rsplit(":", 1)[1]) > 0
+    assert resolve_listen(["tcp/[::1]:7447", "tls/host:1"]) == ("tcp/[::1]:7447", "tls/host:1")
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "",
+        "7447",
+        "tcp",
+        "tcp/host",
+        "tcp/:7447",
+        "tcp/host:x",
+        "tcp/host:70000",
+        "udp/host:1",
+        "tcp/no.such.host.invalid:0",
+    ],
+)
+def test_endpoint_that_cannot_be_listened_on_is_told(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match="--listen"):
+        resolve_listen([endpoint])
+
+
+def test_wildcard_address_is_dialled_as_loopback() -> None:
+    assert reachable(("tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.5:7447")) == (
+        "tcp/127.0.0.1:7447",
+        "tcp/[::1]:7447",
+        "tcp/10.0.0.5:7447",
+    )
