@@ -100,6 +100,8 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
     worker: str
     session: str
     held: tuple[HeldLease, ...]
+    wait_s: float = 0.0
+    """The answer may be held back for so long, and then comes at once when there is a lease to stop."""
 
 
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):

@@ -1,0 +1,232 @@
+"""What has happened: everything that a core is told, in the past tense.
+
+Rules that this module owns:
+- The shell has checked every token before it raises an event: join token, operator's token, a run's capability.
+  Worker sessions are checked by the core, which knows when they end.
+- Randomness comes in through events (`secret`, `capability`, `session`, ids); the core makes none of its own.
+- `request` is the shell's opaque handle of the query that waits for an answer. Every event that has one is answered by
+  exactly one effect with that handle (`Reply`, `ReadResults`, `ReadEvaluation` or `ReadFinished`): at once or, for long
+  polls, later.
+- `stimulus_id` names the event in every effect and log line that follows from it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
+from evopolicy_common.messages.episode import PolicyFailure, Record, ResourceLimits, Tier
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.worker import Fingerprint, HeldLease, JobResult
+
+RequestId = int | str
+
+
+class Event(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that happened outside."""
+
+    stimulus_id: str = ""
+
+
+# ---- operators ----
+
+
+class RunCreated(Event, frozen=True, kw_only=True):
+    """An operator asked for a run. All numbers are resolved; a known `key` gives the run it made before."""
+
+    request: RequestId
+    run: str
+    """A fresh id, valid in a Zenoh key (`keys.valid_name`)."""
+    key: str
+    capability: str
+    secret: bytes
+    """32 fresh random bytes."""
+    settings: RunSettings
+    budget: int
+    min_episodes_per_submit: int
+    max_episodes_per_submit: int
+    train: tuple[Case, ...]
+    validation: tuple[Case, ...]
+    heldout: tuple[Case, ...]
+    split_hashes: dict[str, str]
+    split_secret: bool
+    allowed_imports: tuple[str, ...] = ()
+    denied_imports: tuple[str, ...] = ()
+
+
+class RunWaited(Event, frozen=True, kw_only=True):
+    """An operator waits for a run to finish (long poll)."""
+
+    request: RequestId
+    run: str
+    wait_s: float
+
+
+class RunCancelled(Event, frozen=True, kw_only=True):
+    request: RequestId
+    run: str
+
+
+class RunRepinned(Event, frozen=True, kw_only=True):
+    """An operator lets a run go on with the workers of another fingerprint class, for the reason given."""
+
+    request: RequestId
+    run: str
+    fingerprint_class: str
+    reason: str
+
+
+class EvaluationRequested(Event, frozen=True, kw_only=True):
+    """An operator asked for cases to be played outside any run. A known `key` gives the evaluation it made before."""
+
+    request: RequestId
+    evaluation: str
+    key: str
+    env: str
+    bundle: str | None
+    split: Split
+    case_ids: tuple[int, ...]
+    cases: tuple[Case, ...]
+    """In the order of `case_ids`."""
+    secret: bytes
+    record: Record
+    tier: Tier
+    limits: ResourceLimits = ResourceLimits()
+
+
+class EvaluationPolled(Event, frozen=True, kw_only=True):
+    request: RequestId
+    evaluation: str
+    cursor: int
+    wait_s: float
+
+
+class WorkerStateSet(Event, frozen=True, kw_only=True):
+    """An operator drained a worker, or took it back."""
+
+    request: RequestId
+    worker: str
+    state: Literal["active", "draining"]
+
+
+# ---- gateways ----
+
+
+class RunOpened(Event, frozen=True, kw_only=True):
+    """A run's gateway started and asks what the run is."""
+
+    request: RequestId
+    run: str
+
+
+class StateRequested(Event, frozen=True, kw_only=True):
+    request: RequestId
+    run: str
+
+
+class SubmitRequested(Event, frozen=True, kw_only=True):
+    """A gateway asked for an evaluation. The shell has seen to it that the bundle's blob is stored."""
+
+    request: RequestId
+    run: str
+    key: str
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    bundle_error: PolicyFailure | None = None
+
+
+class ResultsRequested(Event, frozen=True, kw_only=True):
+    request: RequestId
+    run: str
+    submit_index: int
+    cursor: int
+    wait_s: float
+
+
+class RunClosed(Event, frozen=True, kw_only=True):
+    """A gateway said that its agent is gone: no more submits, finalisation may begin."""
+
+    request: RequestId
+    run: str
+    reason: str
+    agent: dict[str, Any] = {}
+
+
+# ---- workers ----
+
+
+class WorkerRegistered(Event, frozen=True, kw_only=True):
+    request: RequestId
+    worker: str
+    session: str
+    """A fresh id made by the shell; what the worker's later requests carry."""
+    slots: int
+    tiers: tuple[Tier, ...]
+    environments: tuple[EnvironmentDescription, ...]
+    fingerprint: Fingerprint
+    host: str = ""
+
+
+class LeaseRequested(Event, frozen=True, kw_only=True):
+    request: RequestId
+    worker: str
+    session: str
+    n: int
+    wait_s: float
+    warm_bundles: tuple[str, ...] = ()
+    warm_environments: tuple[str, ...] = ()
+
+
+class HeartbeatReceived(Event, frozen=True, kw_only=True):
+    request: RequestId
+    worker: str
+    session: str
+    held: tuple[HeldLease, ...]
+    wait_s: float = 0.0
+    """How long the answer may be held back; it comes at once when there is a lease to stop."""
+
+
+class ResultsHandedIn(Event, frozen=True, kw_only=True):
+    request: RequestId
+    worker: str
+    session: str
+    results: tuple[JobResult, ...]
+
+
+class LivenessLost(Event, frozen=True, kw_only=True):
+    """A worker's liveliness token went: a hint to look at its leases, no proof."""
+
+    worker: str
+
+
+# ---- transport ----
+
+
+class RequestAbandoned(Event, frozen=True, kw_only=True):
+    """The asker of a long poll is gone: nothing need be answered. Optional: polls end by themselves."""
+
+    request: RequestId
+
+
+AnyEvent = (
+    RunCreated
+    | RunWaited
+    | RunCancelled
+    | RunRepinned
+    | EvaluationRequested
+    | EvaluationPolled
+    | WorkerStateSet
+    | RunOpened
+    | StateRequested
+    | SubmitRequested
+    | ResultsRequested
+    | RunClosed
+    | WorkerRegistered
+    | LeaseRequested
+    | HeartbeatReceived
+    | ResultsHandedIn
+    | LivenessLost
+    | RequestAbandoned
+)

@@ -1,0 +1,258 @@
+"""What the store keeps: the rows that `Persist` writes, and the snapshot a core is loaded from.
+
+Rules that this module owns:
+- A row is written whole (insert or replace) under its key; a `Persist` is one transaction, all of its rows or none.
+- Nothing about queues, leases, sessions and long polls is here: those are soft, and come back from the workers' own
+  heartbeats and the clients' own retries. Jobs are not stored either: they follow from runs, submits and outcomes.
+- What a finished job came to is in its `OutcomeRow` and nowhere else; a core keeps only heads, of open groups only.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
+from evopolicy_common.messages.episode import (
+    EpisodeOutcome,
+    FailureCategory,
+    PolicyFailure,
+    Record,
+    ResourceLimits,
+    Tier,
+)
+from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
+from evopolicy_common.messages.operator import RunFinished, RunSettings
+
+Phase = Literal["open", "closed", "finished"]
+
+
+class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
+    """A run as it was created; never changed. Key: `run`."""
+
+    run: str
+    key: str
+    """The operator's idempotency key; unique."""
+    capability: str
+    """Token of the run's gateway."""
+    secret: bytes
+    """32 random bytes that policy seeds are derived from; never leaves the coordinator."""
+    settings: RunSettings
+    budget: int
+    """Train episodes granted."""
+    min_episodes_per_submit: int
+    max_episodes_per_submit: int
+    train: tuple[Case, ...]
+    validation: tuple[Case, ...]
+    heldout: tuple[Case, ...]
+    split_hashes: dict[str, str]
+    split_secret: bool
+    allowed_imports: tuple[str, ...] = ()
+    denied_imports: tuple[str, ...] = ()
+    created_at: float = 0.0
+    """Unix time, seconds (so are all `*_at`)."""
+    stimulus_id: str = ""
+
+
+class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
+    """What changes of a run. Key: `run`."""
+
+    run: str
+    phase: Phase = "open"
+    fingerprint_class: str | None = None
+    """The class of workers that the run is pinned to; None until a worker offers its environment."""
+    description: EnvironmentDescription | None = None
+    """As told by the worker it was pinned by."""
+    fingerprint: Any = None
+    """That worker's `Fingerprint`, as builtins."""
+    overrides: tuple[str, ...] = ()
+    """An operator's changes of the pin, in words, oldest first."""
+    closed_at: float | None = None
+    close_reason: str = ""
+    agent: dict[str, Any] = {}
+    infrastructure_retries: int = 0
+    nondeterministic_results: int = 0
+
+
+class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
+    """An accepted submit. Key: `run`, `submit_index`; `run`, `key` is unique too."""
+
+    run: str
+    submit_index: int
+    key: str
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    first_global_episode: int
+    remaining_budget: int
+    """After this submit."""
+    accepted_at: float
+    stimulus_id: str = ""
+    status: SubmitStatus | None = None
+    """None while it is open."""
+    failure: PolicyFailure | None = None
+    completed_at: float | None = None
+    first_leased_at: float | None = None
+    released: int = 0
+    """Outcomes with `seq` below this may be shown to the gateway; final once `status` is set."""
+    n_kept: int = 0
+    mean_return: float | None = None
+    """Visible mean return; None unless ok."""
+    val_mean: float | None = None
+    """Hidden validation mean; None until every validation case is done."""
+    ineligible: str | None = None
+    """Why the checkpoint cannot be selected, when it brought its slots down while hidden."""
+    refunded: bool = False
+    """The run was cancelled while this submit was open: nothing is charged for it."""
+
+
+class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
+    """What one episode came to. Key: `group`, `index`."""
+
+    group: str
+    """Which list of cases the episode belongs to; see `groups`."""
+    index: int
+    """Position in that list: the request index of a train episode."""
+    seq: int
+    """Order of arrival in its group, from 0 without gaps."""
+    outcome: EpisodeOutcome
+    job_id: str
+    attempt: int
+    worker: str
+    fingerprint_class: str
+    at: float
+
+
+class StrikeRow(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
+    """A bundle brought its slot down, by the word of a living supervisor. Key: `group`, `lease_id`."""
+
+    group: str
+    lease_id: str
+    worker: str
+    error: str
+    at: float
+
+
+class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation"):
+    """Cases to play outside any run. Key: `evaluation`; `key` is unique."""
+
+    evaluation: str
+    key: str
+    env: str
+    bundle: str | None
+    split: Split
+    case_ids: tuple[int, ...]
+    """Ids in the split, as asked for; `cases` in the same order."""
+    cases: tuple[Case, ...]
+    secret: bytes
+    record: Record
+    tier: Tier
+    limits: ResourceLimits
+    created_at: float
+    stimulus_id: str = ""
+    fingerprint_class: str | None = None
+    finished: bool = False
+    error: str = ""
+    """Why it ended early (the policy brought its slot down too often); empty when it ran through."""
+
+
+class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
+    """A finalised run: the source of `run.json`. Key: `run`."""
+
+    run: str
+    result: RunFinished
+
+
+class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
+    """An operator's word on a worker. Key: `worker`."""
+
+    worker: str
+    state: Literal["active", "draining"]
+
+
+Row = RunRow | RunStateRow | SubmitRow | OutcomeRow | StrikeRow | EvaluationRow | FinishedRow | WorkerRow
+
+
+class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
+    """The part of an outcome that a core needs while its group is open."""
+
+    group: str
+    index: int
+    seq: int
+    episode_return: float
+    length: int
+    failure: FailureCategory | None = None
+    trajectory: str | None = None
+    """Digest of the trajectory; None when there is none."""
+
+
+def head_of(row: OutcomeRow) -> OutcomeHead:
+    """What the store gives back of `row` in a snapshot."""
+    outcome = row.outcome
+    return OutcomeHead(
+        group=row.group,
+        index=row.index,
+        seq=row.seq,
+        episode_return=outcome.episode_return,
+        length=outcome.length,
+        failure=None if outcome.failure is None else outcome.failure.category,
+        trajectory=None if outcome.trajectory is None else outcome.trajectory.digest,
+    )
+
+
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """All that a core starts from, read in one transaction.
+
+    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `outcomes`
+    and `strikes` are wanted only for runs whose phase is not `finished`, and `outcomes` and `strikes` also for
+    evaluations that are not finished; more does no harm. Order does not matter.
+    """
+
+    incarnation: int
+    """How often a core was loaded from this store, this time included: incremented durably *before* loading."""
+    runs: tuple[RunRow, ...] = ()
+    states: tuple[RunStateRow, ...] = ()
+    submits: tuple[SubmitRow, ...] = ()
+    outcomes: tuple[OutcomeHead, ...] = ()
+    strikes: tuple[StrikeRow, ...] = ()
+    evaluations: tuple[EvaluationRow, ...] = ()
+    workers: tuple[WorkerRow, ...] = ()
+
+
+def submit_done(row: SubmitRow) -> SubmitDone | None:
+    """The end of a submit as its gateway is told; None while it is open."""
+    if row.status is None or row.completed_at is None:
+        return None
+    return SubmitDone(
+        status=row.status,
+        n_episodes=len(row.env_instances),
+        env_instances=row.env_instances,
+        first_global_episode=row.first_global_episode,
+        remaining_budget=row.remaining_budget,
+        started_at=row.accepted_at,
+        completed_at=row.completed_at,
+        failure=row.failure,
+        n_kept=row.n_kept,
+    )
+
+
+def train_group(run: str, submit_index: int) -> str:
+    """Group id of a submit's train episodes; `OutcomeRow.group` of what `ReadResults` reads."""
+    return f"{run}/s{submit_index}/train"
+
+
+def validation_group(run: str, submit_index: int) -> str:
+    return f"{run}/s{submit_index}/validation"
+
+
+def heldout_group(run: str, submit_index: int) -> str:
+    return f"{run}/s{submit_index}/heldout"
+
+
+def random_group(run: str) -> str:
+    return f"{run}/random"
+
+
+def evaluation_group(evaluation: str) -> str:
+    """Group id of an evaluation's episodes; `OutcomeRow.group` of what `ReadEvaluation` reads."""
+    return f"evaluation/{evaluation}"

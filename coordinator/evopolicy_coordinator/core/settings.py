@@ -1,0 +1,43 @@
+"""The core's numbers: times to live, back-off, batching. All have defaults that suit one machine and a fleet alike."""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """Numbers the core decides by. Units are in the names."""
+
+    lease_ttl_s: float = 15.0
+    """A lease that no heartbeat has named for so long is given up."""
+    heartbeat_s: float = 2.0
+    """What workers are told to beat at; well below `lease_ttl_s`."""
+    liveness_grace_s: float = 5.0
+    """After its liveliness token went, a worker has so long to be heard from."""
+    adoption_s: float = 4.0
+    """After a restart, jobs that may be running somewhere wait so long for a heartbeat that names them."""
+    late_s: float = 1.0
+    """A deadline served later than this means the loop stood still: then nothing expires for one time to live."""
+    retry_base_s: float = 0.5
+    """First back-off after an infrastructure failure; doubles with each."""
+    retry_max_s: float = 60.0
+    avoid_s: float = 20.0
+    """How long a retried job is kept from the worker it failed on, so that another may take it."""
+    strikes: int = 3
+    """Slots brought down by a bundle before it is quarantined."""
+    batch_s: float = 0.1
+    """Leases are handed out in batches of about so much play time per slot."""
+    batch_max: int = 32
+    """Most leases a slot may hold ahead, however short its episodes."""
+    warm_bonus_s: float = 2.0
+    """How far a run may get ahead of its fair share, in slot seconds, on a worker that has its environment warm."""
+    preemptions_max: int = 3
+    """A hidden job of a closed run is stopped at most so often for the sake of train jobs."""
+    job_deadline_s: float = 3600.0
+    """Longest that one episode may be played, limits of the policy aside; then it is taken to hang."""
+    stall_s: float = 60.0
+    """What waits longer is listed among the stalls."""
+    fingerprint_cpu: bool = False
+    """Count the CPU's features into a worker's fingerprint class too, not only packages and code."""
+    max_wait_s: float = 60.0
+    """Upper bound on any long poll."""
