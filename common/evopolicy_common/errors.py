@@ -53,5 +53,9 @@ class WorkerError(EvopolicyError):
     """A worker, or one of its slots, was lost or cannot do what it was asked: infrastructure, never charged."""
 
 
+class SlotDiedError(WorkerError):
+    """A slot's processes died under a job while its supervisor lives: a strike against the job's bundle."""
+
+
 class StorageError(EvopolicyError):
     """The store could not persist or read back; what was not persisted did not happen."""

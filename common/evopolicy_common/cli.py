@@ -1,0 +1,52 @@
+"""What all commands share: logging to stderr, and errors of ours as one line with exit code 2."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from collections.abc import Iterator
+from typing import NoReturn
+
+import structlog
+
+from evopolicy_common.errors import ConfigError, EvopolicyError
+
+USAGE_ERROR = 2
+FAILURE = 1
+
+
+def setup_logging(level: str = "info") -> None:
+    """Structured logs on stderr: for people on a terminal, JSON lines otherwise."""
+    terminal = sys.stderr.isatty()
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso" if not terminal else "%H:%M:%S", utc=not terminal),
+            structlog.processors.format_exc_info,
+            structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
+        logger_factory=structlog.PrintLoggerFactory(file=sys.stderr),
+        cache_logger_on_first_use=True,
+    )
+
+
+def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
+    """Ends the command with one line on stderr."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+@contextlib.contextmanager
+def fail_on_our_errors() -> Iterator[None]:
+    """Turns our errors into one line: exit code 2 for wrong options and files, 1 for what went wrong later."""
+    try:
+        yield
+    except ConfigError as error:
+        fail(str(error), USAGE_ERROR)
+    except EvopolicyError as error:
+        fail(str(error), FAILURE)
+    except KeyboardInterrupt:
+        fail("interrupted", 130)

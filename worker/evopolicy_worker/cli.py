@@ -1,0 +1,173 @@
+"""`evopolicy-worker`: offers this machine's cores to a cluster."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import multiprocessing
+import os
+import secrets
+import signal
+import socket
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import structlog
+import typer
+
+from evopolicy_common import catalogue, credentials, keys, transport
+from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import Tier
+from evopolicy_worker import environments
+from evopolicy_worker.cores import Cores
+from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.sandbox import available_tiers
+from evopolicy_worker.slot import Slot
+from evopolicy_worker.supervisor import Options, Supervisor
+
+app = typer.Typer(add_completion=False, no_args_is_help=False)
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+@app.callback(invoke_without_command=True)
+def work(
+    context: typer.Context,
+    env: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Suite (core16), suite id (gym/acrobot) or glob (gymnasium/MiniGrid-*); may be repeated."
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint of the coordinator or a router before it, such as tcp/10.0.0.5:7447."),
+    ] = None,
+    slots: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Episodes at once; default: one per core.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="This worker's name; default: host and a random part.")
+    ] = None,
+    credentials_file: Annotated[
+        Path | None,
+        typer.Option("--credentials", help="STATE/credentials/worker.json of the coordinator, copied here."),
+    ] = None,
+    allow_package: Annotated[
+        list[str] | None,
+        typer.Option(help="Package that policies may import beside numpy; may be repeated."),
+    ] = None,
+    grace: Annotated[
+        float, typer.Option(min=0.0, help="Seconds that running episodes get on SIGTERM.")
+    ] = 10.0,
+) -> None:
+    """Leases episodes from a coordinator and plays them, each policy locked in a sandbox.
+
+    Example: evopolicy-worker --env core16 --connect tcp/10.0.0.5:7447
+
+    Waits for the coordinator when it is not up yet. SIGTERM or Ctrl-C: finishes what runs, gives the rest back, exits.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    setup_logging()
+    with fail_on_our_errors():
+        if not env:
+            raise ConfigError(
+                f"--env is missing: name a suite ({', '.join(catalogue.suites())}), an id or a glob"
+            )
+        worker_name = name or f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
+        if not keys.valid_name(worker_name):
+            raise ConfigError(f"--name {worker_name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
+        wanted = catalogue.resolve(env)
+        missing = [env_id for env_id in wanted if env_id not in environments.offered()]
+        if missing:
+            raise ConfigError(
+                f"{', '.join(missing)}: not installed here; install the worker's extra: pip install 'evopolicy[worker]'"
+            )
+        found = credentials.find("worker", tuple(connect or ()), credentials_file)
+        tiers = available_tiers()
+        if not tiers:
+            raise ConfigError("no sandbox tier works here; run `evopolicy-worker doctor` to see why")
+        with tempfile.TemporaryDirectory(prefix="evopolicy-worker-") as scratch:
+            asyncio.run(
+                _run(
+                    found, worker_name, wanted, slots, tiers, Path(scratch), tuple(allow_package or ()), grace
+                )
+            )
+
+
+def describe_all(env_ids: list[str]) -> tuple[EnvironmentDescription, ...]:
+    """Descriptions of environments, made in a process of its own: this one must stay free of simulators."""
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        return tuple(pool.map(environments.describe, env_ids))
+
+
+async def _run(
+    found: credentials.Credentials,
+    name: str,
+    env_ids: list[str],
+    slots: int | None,
+    tiers: tuple[Tier, ...],
+    scratch: Path,
+    allowed_packages: tuple[str, ...],
+    grace_s: float,
+) -> None:
+    cores = Cores()
+    descriptions = await asyncio.to_thread(describe_all, env_ids)
+    options = Options(
+        name=name,
+        slots=slots or cores.count,
+        tiers=tiers,
+        environments=descriptions,
+        fingerprint=fingerprint(),
+        host=socket.gethostname(),
+        scratch=scratch,
+        grace_s=grace_s,
+    )
+    taken = [cores.take() for _ in range(options.slots)]
+
+    def make_slot(index: int, tier: Tier) -> Slot:
+        return Slot(taken[index], tier, scratch / f"slot-{index}", ("numpy", *allowed_packages))
+
+    log.info("waiting for the coordinator", endpoints=found.endpoints)
+    loop = asyncio.get_running_loop()
+    main = asyncio.current_task()
+    assert main is not None
+    supervisor: Supervisor | None = None
+
+    def stop() -> None:
+        # A second signal, or one before there is anything to drain, ends the worker at once.
+        if supervisor is None or supervisor.draining:
+            main.cancel()
+        else:
+            log.info("draining; once more to stop at once")
+            supervisor.drain()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop)
+    try:
+        with contextlib.suppress(asyncio.CancelledError):
+            async with transport.connect(found, timeout_s=None) as link:
+                supervisor = Supervisor(link, options, make_slot)
+                await supervisor.run()
+                log.info("stopped", jobs_done=supervisor.jobs_done)
+    finally:
+        cores.close()
+
+
+def main() -> None:
+    """The console script."""
+    # Simulators and numpy in slots take their thread counts from here; see `environments.process_environment`.
+    os.environ.update(environments.process_environment())
+    if sys.platform != "linux":
+        fail("evopolicy-worker runs on Linux (or WSL2): its sandbox is made of Linux namespaces")
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""Which CPU core a slot is pinned to, agreed between all workers of this machine by file locks.
+
+Env and policy process of a slot share one core: a pipe round trip costs 7 µs there and over 100 µs across cores.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+from pathlib import Path
+from typing import IO
+
+
+class Cores:
+    """Hands out cores; those not taken by any worker of this machine first."""
+
+    def __init__(self) -> None:
+        self._allowed = sorted(os.sched_getaffinity(0))
+        self._locks: dict[int, IO[bytes]] = {}
+        self._shared = 0
+        self._folder = Path(tempfile.gettempdir()) / f"evopolicy-cores-{os.getuid()}"
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+
+    @property
+    def count(self) -> int:
+        """How many cores this process may use: the default number of slots."""
+        return len(self._allowed)
+
+    def take(self) -> int:
+        """A core for one more slot: a free one, or when all are taken the next in turn."""
+        for core in self._allowed:
+            if core in self._locks:
+                continue
+            lock = (self._folder / f"core-{core}.lock").open("ab")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.close()
+                continue
+            self._locks[core] = lock
+            return core
+        core = self._allowed[self._shared % len(self._allowed)]
+        self._shared += 1
+        return core
+
+    def close(self) -> None:
+        for lock in self._locks.values():
+            lock.close()
+        self._locks.clear()

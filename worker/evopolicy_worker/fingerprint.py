@@ -1,0 +1,60 @@
+"""What a worker's numbers depend on, read without importing a simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+import evopolicy_common
+import evopolicy_worker
+from evopolicy_common.messages.worker import Fingerprint
+
+PACKAGES = (
+    "numpy",
+    "gymnasium",
+    "gymnasium-robotics",
+    "mujoco",
+    "Box2D",
+    "minigrid",
+    "highway-env",
+    "pygame-ce",
+    "pandas",
+)
+"""Distributions that Core16's environments are made of: another version may play another episode."""
+
+
+def fingerprint() -> Fingerprint:
+    """This worker's fingerprint; a package that is not installed is left out."""
+    packages: dict[str, str] = {}
+    for name in PACKAGES:
+        try:
+            packages[name.lower()] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return Fingerprint(
+        code_version=f"{evopolicy_common.__version__}+{_source_digest()[:12]}",
+        python=platform.python_version(),
+        packages=packages,
+        cpu=f"{platform.machine()} {_simd_features()}",
+    )
+
+
+def _source_digest() -> str:
+    """SHA-256 over the worker's and the common package's own sources."""
+    digest = hashlib.sha256()
+    for package in (evopolicy_common, evopolicy_worker):
+        root = Path(package.__path__[0])
+        for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".md")):
+            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _simd_features() -> str:
+    """The instruction sets that numpy dispatches on here: numerical libraries choose their code by them."""
+    found = np.show_config(mode="dicts")
+    simd = found.get("SIMD Extensions", {}) if isinstance(found, dict) else {}
+    return "+".join([*simd.get("baseline", []), *simd.get("found", [])])

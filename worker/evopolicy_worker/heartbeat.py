@@ -1,0 +1,92 @@
+"""The heartbeat, from a thread of its own: a busy event loop must not lose its leases."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+
+import structlog
+
+from evopolicy_common import codec, keys
+from evopolicy_common.errors import ProtocolError, TransportError
+from evopolicy_common.messages.worker import Heartbeat, HeartbeatReply, HeldLease, Refused
+from evopolicy_common.transport import Link
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class HeldLeases:
+    """The leases this worker holds, shared between the event loop, which changes them, and the heartbeat."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: dict[str, HeldLease] = {}
+
+    def put(self, lease: HeldLease) -> None:
+        with self._lock:
+            self._held[lease.lease_id] = lease
+
+    def drop(self, lease_id: str) -> None:
+        with self._lock:
+            self._held.pop(lease_id, None)
+
+    def snapshot(self) -> tuple[HeldLease, ...]:
+        with self._lock:
+            return tuple(self._held.values())
+
+
+class HeartbeatThread:
+    """Sends what is held every `every_s` seconds and hands the answers to the event loop."""
+
+    def __init__(
+        self,
+        link: Link,
+        cluster: str,
+        worker: str,
+        held: HeldLeases,
+        on_reply: Callable[[HeartbeatReply | Refused], None],
+    ) -> None:
+        """`on_reply` is called on the event loop that makes this object."""
+        self._link = link
+        self._key = keys.worker_key(cluster, "beat")
+        self._worker = worker
+        self._held = held
+        self._on_reply = on_reply
+        self._loop = asyncio.get_running_loop()
+        self._session = ""
+        self._every_s = 1.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+
+    def start(self, session: str, every_s: float) -> None:
+        """Begins, or goes on with a new session after a new registration."""
+        self._session, self._every_s = session, every_s
+        if not self._thread.is_alive():
+            self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+
+    def _run(self) -> None:
+        last_sent = time.monotonic()
+        while not self._stop.wait(self._every_s):
+            gap = time.monotonic() - last_sent
+            if gap > 5 * self._every_s + 1.0:
+                log.warning(
+                    "this worker was frozen; its leases may have been given to others", frozen_s=round(gap, 1)
+                )
+            last_sent = time.monotonic()
+            message = Heartbeat(worker=self._worker, session=self._session, held=self._held.snapshot())
+            try:
+                answer = self._link.ask_blocking(self._key, codec.encode(message), max(1.0, self._every_s))
+                reply = codec.decode(codec.worker_replies, answer)
+            except (TransportError, ProtocolError) as error:
+                log.debug("heartbeat unanswered", why=str(error))
+                continue
+            if isinstance(reply, HeartbeatReply | Refused):
+                try:
+                    self._loop.call_soon_threadsafe(self._on_reply, reply)
+                except RuntimeError:  # the loop is closed: the worker is on its way out
+                    return

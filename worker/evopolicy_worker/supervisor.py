@@ -1,0 +1,446 @@
+"""The worker's supervisor: registers, leases jobs, gives them to its slots, hands in what came of them.
+
+Rules:
+- A lease is held from the moment it arrives until its result was answered; every heartbeat lists what is held, so that a
+  restarted coordinator adopts it again.
+- A result leaves the outbox only when the coordinator answered that it is durable; sending it twice is safe.
+- A slot that dies takes its own job with it and nothing else. What waits behind it is not blamed.
+- On SIGTERM nothing new is asked for, what waits is given back, what runs may finish within the grace time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+import structlog
+
+from evopolicy_common import codec, keys
+from evopolicy_common.errors import EvopolicyError, RefusedError, SlotDiedError, TransportError
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.worker import (
+    Fingerprint,
+    HandIn,
+    HandInReply,
+    HeartbeatReply,
+    HeldLease,
+    JobResult,
+    Lease,
+    LeaseRequest,
+    Leases,
+    Refused,
+    Register,
+    Registered,
+    ResultKind,
+    WorkerReply,
+)
+from evopolicy_common.requests import Requester
+from evopolicy_common.transport import Link
+from evopolicy_worker.bundle_cache import BundleCache
+from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+LEASE_POLL_S = 10.0
+MAX_HAND_IN_BYTES = 4 << 20
+MAX_HAND_IN = 64
+MAX_OUTBOX = 256
+"""Results waiting to be handed in before the slots stop taking jobs: a coordinator that is away must not fill memory."""
+RESTART_PAUSE_S = 1.0
+LONGEST_RESTART_PAUSE_S = 30.0
+
+
+class SlotLike(Protocol):
+    """What the supervisor needs of a slot; `slot.Slot` is the one there is."""
+
+    async def start(self) -> None: ...
+
+    async def play(
+        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]: ...
+
+    async def cancel(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True):
+    """What a worker is started with."""
+
+    name: str
+    slots: int
+    tiers: tuple[Tier, ...]
+    environments: tuple[EnvironmentDescription, ...]
+    fingerprint: Fingerprint
+    host: str
+    scratch: Path
+    grace_s: float = 10.0
+    """How long running episodes may go on after SIGTERM."""
+
+
+class Supervisor:
+    """One worker's life: `run()` until `drain()`."""
+
+    def __init__(self, link: Link, options: Options, make_slot: Callable[[int, Tier], SlotLike]) -> None:
+        self._link = link
+        self._options = options
+        self._make_slot = make_slot
+        cluster = link.credentials.cluster
+        self._ask: Requester[WorkerReply] = Requester(
+            link, lambda verb: keys.worker_key(cluster, verb), codec.worker_replies
+        )
+        self._held = HeldLeases()
+        self._heartbeat = HeartbeatThread(link, cluster, options.name, self._held, self._on_heartbeat_reply)
+        self._bundles = BundleCache(options.scratch / "bundles", self._fetch_bundle)
+        self._queue: OrderedDict[str, Lease] = OrderedDict()
+        self._work_arrived = asyncio.Event()
+        self._capacity_freed = asyncio.Event()
+        self._outbox: list[JobResult] = []
+        self._outbox_filled = asyncio.Event()
+        self._outbox_emptied = asyncio.Event()
+        self._outbox_emptied.set()
+        self._running: dict[str, SlotLike] = {}
+        self._cancelled: set[str] = set()
+        self._session = ""
+        self._registering = asyncio.Lock()
+        self._draining = asyncio.Event()
+        self._warm_environments: OrderedDict[str, None] = OrderedDict()
+        self.jobs_done = 0
+
+    async def run(self) -> None:
+        """Works until drained. Raises RefusedError when the coordinator will not have this worker."""
+        await self._register()
+        self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
+        # The hand-in task outlives the others: what was played is handed in before the worker goes.
+        hand_in = asyncio.create_task(self._hand_in_loop())
+        try:
+            async with asyncio.TaskGroup() as group:
+                lease = group.create_task(self._lease_loop())
+                slots = [group.create_task(self._slot_loop(index)) for index in range(self._options.slots)]
+                group.create_task(self._stop_when_drained(lease, slots))
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._outbox_emptied.wait(), self._options.grace_s)
+        finally:
+            self._heartbeat.stop()
+            hand_in.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await hand_in
+
+    def drain(self) -> None:
+        """Asks for nothing more and ends `run` when what runs is done or the grace time is over."""
+        self._draining.set()
+        self._work_arrived.set()
+        self._capacity_freed.set()
+
+    @property
+    def draining(self) -> bool:
+        return self._draining.is_set()
+
+    async def _register(self) -> None:
+        async with self._registering:
+            options = self._options
+            message = Register(
+                worker=options.name,
+                token=self._link.credentials.token,
+                protocol=codec.WIRE_VERSION,
+                slots=options.slots,
+                tiers=options.tiers,
+                environments=options.environments,
+                fingerprint=options.fingerprint,
+                host=options.host,
+            )
+            reply = await self._ask.until_answered("register", message, Registered)
+            self._session = reply.session
+            self._heartbeat.start(reply.session, reply.heartbeat_s)
+            log.info(
+                "registered", worker=options.name, cluster=self._link.credentials.cluster, slots=options.slots
+            )
+
+    async def _register_again(self, session: str) -> None:
+        if session == self._session:
+            log.info("the coordinator does not know this session; registering again")
+            await self._register()
+
+    def _on_heartbeat_reply(self, reply: HeartbeatReply | Refused) -> None:
+        if isinstance(reply, Refused):
+            # The lease loop meets the same refusal and registers again.
+            return
+        for lease_id in reply.cancelled:
+            self._cancel(lease_id)
+        if reply.drain and not self._draining.is_set():
+            log.info("told to drain")
+            self.drain()
+
+    def _cancel(self, lease_id: str) -> None:
+        if lease_id in self._queue:
+            lease = self._queue.pop(lease_id)
+            self._put_result(lease, "returned")
+        elif lease_id in self._running and lease_id not in self._cancelled:
+            self._cancelled.add(lease_id)
+            slot = self._running[lease_id]
+            task = asyncio.create_task(slot.cancel())
+            task.add_done_callback(_log_failure)
+
+    # Leasing.
+
+    async def _lease_loop(self) -> None:
+        while not self._draining.is_set():
+            self._capacity_freed.clear()
+            wanted = 2 * self._options.slots - len(self._queue) - len(self._running)
+            if wanted <= 0 or len(self._outbox) >= MAX_OUTBOX:
+                await self._capacity_freed.wait()
+                continue
+            session = self._session
+            request = LeaseRequest(
+                worker=self._options.name,
+                session=session,
+                n=wanted,
+                wait_s=LEASE_POLL_S,
+                warm_bundles=self._bundles.warm[-8:],
+                warm_environments=tuple(self._warm_environments),
+            )
+            try:
+                reply = await self._ask.until_answered("lease", request, Leases, wait_s=LEASE_POLL_S)
+            except RefusedError as error:
+                if error.status != "unknown_worker":
+                    raise
+                await self._register_again(session)
+                continue
+            for lease in reply.leases:
+                self._queue[lease.lease_id] = lease
+                self._held.put(_held(lease, running=False))
+            self._work_arrived.set()
+
+    # Playing.
+
+    async def _slot_loop(self, index: int) -> None:
+        slot: SlotLike | None = None
+        tier: Tier | None = None
+        pause = RESTART_PAUSE_S
+        try:
+            while (lease := await self._next_lease()) is not None:
+                if slot is not None and tier != lease.job.tier:
+                    await slot.close()
+                    slot = None
+                if slot is None:
+                    slot, tier = await self._start_slot(index, lease), lease.job.tier
+                    if slot is None:
+                        await asyncio.sleep(pause)
+                        pause = min(pause * 2, LONGEST_RESTART_PAUSE_S)
+                        continue
+                    pause = RESTART_PAUSE_S
+                if not await self._play(slot, lease):
+                    await _close_slot(slot)
+                    slot = None
+        finally:
+            if slot is not None:
+                await _close_slot(slot)
+
+    async def _next_lease(self) -> Lease | None:
+        while True:
+            if self._queue and not self._draining.is_set():
+                _, lease = self._queue.popitem(last=False)
+                return lease
+            if self._draining.is_set():
+                return None
+            self._work_arrived.clear()
+            await self._work_arrived.wait()
+
+    async def _start_slot(self, index: int, lease: Lease) -> SlotLike | None:
+        """A slot for the lease's tier; None, with the lease handed back as failed, when it does not start."""
+        slot = self._make_slot(index, lease.job.tier)
+        try:
+            await slot.start()
+        except (EvopolicyError, OSError) as error:
+            log.error("slot does not start", slot=index, tier=lease.job.tier, error=str(error))
+            await _close_slot(slot)
+            self._put_result(lease, "failed", error=f"slot does not start: {error}")
+            return None
+        return slot
+
+    async def _play(self, slot: SlotLike, lease: Lease) -> bool:
+        """Plays one lease and puts its result into the outbox; False when the slot must be replaced."""
+        job = lease.job
+        self._running[lease.lease_id] = slot
+        self._held.put(_held(lease, running=True))
+        last_told = 0.0
+
+        def on_progress(episodes_done: int, steps: int) -> None:
+            nonlocal last_told
+            now = time.monotonic()
+            if now - last_told > 0.2:
+                last_told = now
+                self._held.put(_held(lease, running=True, episodes_done=episodes_done, steps=steps))
+
+        healthy = True
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                folder = (
+                    await stack.enter_async_context(self._bundles.use(job.bundle)) if job.bundle else None
+                )
+                self._capacity_freed.set()
+                outcomes = await slot.play(job, folder, on_progress)
+            self._warm_environments[job.env] = None
+            if lease.lease_id in self._cancelled:
+                self._put_result(lease, "returned")
+            else:
+                self._put_result(lease, "done", outcomes)
+                self.jobs_done += 1
+        except SlotDiedError as error:
+            healthy = False
+            kind: ResultKind = "returned" if lease.lease_id in self._cancelled else "slot_died"
+            log.warning("slot died", job=job.job_id, attempt=lease.attempt, error=str(error))
+            self._put_result(lease, kind, error=str(error))
+        except (EvopolicyError, OSError) as error:
+            healthy = False
+            returned = lease.lease_id in self._cancelled
+            if not returned:
+                log.error("job failed here", job=job.job_id, attempt=lease.attempt, error=str(error))
+            self._put_result(lease, "returned" if returned else "failed", error=str(error))
+        except asyncio.CancelledError:
+            self._put_result(lease, "returned")
+            raise
+        finally:
+            self._running.pop(lease.lease_id, None)
+            self._cancelled.discard(lease.lease_id)
+            self._capacity_freed.set()
+        return healthy
+
+    async def _fetch_bundle(self, digest: str) -> bytes:
+        return await self._ask.download(self._options.name, self._session, digest)
+
+    # Handing in.
+
+    def _put_result(
+        self, lease: Lease, kind: ResultKind, episodes: tuple[EpisodeOutcome, ...] = (), error: str = ""
+    ) -> None:
+        self._outbox.append(
+            JobResult(
+                lease_id=lease.lease_id,
+                job_id=lease.job.job_id,
+                attempt=lease.attempt,
+                kind=kind,
+                episodes=episodes,
+                error=error[:2000],
+            )
+        )
+        self._outbox_filled.set()
+        self._outbox_emptied.clear()
+
+    async def _hand_in_loop(self) -> None:
+        while True:
+            while not self._outbox:
+                self._outbox_emptied.set()
+                self._outbox_filled.clear()
+                await self._outbox_filled.wait()
+            batch: list[JobResult] = []
+            size = 0
+            for index in range(min(MAX_HAND_IN, len(self._outbox))):
+                ready = self._outbox[index] = await self._upload_large(self._outbox[index])
+                weight = _weight(ready)
+                if batch and size + weight > MAX_HAND_IN_BYTES:
+                    break
+                batch.append(ready)
+                size += weight
+            session = self._session
+            message = HandIn(worker=self._options.name, session=session, results=tuple(batch))
+            try:
+                await self._ask.until_answered("done", message, HandInReply)
+            except RefusedError as error:
+                if error.status == "unknown_worker":
+                    await self._register_again(session)
+                else:
+                    log.error("results not taken; trying again", status=error.status, why=error.message)
+                    await asyncio.sleep(RESTART_PAUSE_S)
+                continue
+            del self._outbox[: len(batch)]
+            for result in batch:
+                self._held.drop(result.lease_id)
+            self._capacity_freed.set()
+
+    async def _upload_large(self, result: JobResult) -> JobResult:
+        episodes = []
+        for outcome in result.episodes:
+            episodes.append(
+                msgspec.structs.replace(
+                    outcome,
+                    trajectory=await self._by_digest(outcome.trajectory),
+                    video=await self._by_digest(outcome.video),
+                )
+            )
+        return msgspec.structs.replace(result, episodes=tuple(episodes))
+
+    async def _by_digest(self, blob: BlobRef | None) -> BlobRef | None:
+        if blob is None or blob.inline is None or blob.size <= codec.INLINE_BYTES:
+            return blob
+        while True:
+            session = self._session
+            try:
+                await self._ask.upload(self._options.name, session, blob.digest, blob.inline)
+                return msgspec.structs.replace(blob, inline=None)
+            except RefusedError as error:
+                if error.status == "unknown_worker":
+                    await self._register_again(session)
+                    continue
+                log.error("blob not taken; trying again", status=error.status, why=error.message)
+                await asyncio.sleep(RESTART_PAUSE_S)
+
+    # Ending.
+
+    async def _stop_when_drained(self, lease: asyncio.Task[None], slots: list[asyncio.Task[None]]) -> None:
+        await self._draining.wait()
+        lease.cancel()
+        while self._queue:
+            _, waiting = self._queue.popitem(last=False)
+            self._put_result(waiting, "returned")
+        _, late = await asyncio.wait(slots, timeout=self._options.grace_s)
+        if late:
+            log.warning("giving running episodes back", slots=len(late))
+            for lease_id in list(self._running):
+                self._cancel(lease_id)
+            _, stuck = await asyncio.wait(late, timeout=2.0)
+            for task in stuck:
+                task.cancel()
+
+
+def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:
+    return HeldLease(
+        lease_id=lease.lease_id,
+        job_id=lease.job.job_id,
+        attempt=lease.attempt,
+        running=running,
+        episodes_done=episodes_done,
+        steps=steps,
+    )
+
+
+def _weight(result: JobResult) -> int:
+    """Bytes of the result's bulky parts."""
+    return 1000 + sum(
+        len(outcome.stdout)
+        + len(outcome.stderr)
+        + (len(outcome.trajectory.inline or b"") if outcome.trajectory else 0)
+        + (len(outcome.video.inline or b"") if outcome.video else 0)
+        for outcome in result.episodes
+    )
+
+
+def _log_failure(task: asyncio.Task[None]) -> None:
+    if (
+        not task.cancelled()
+        and (error := task.exception()) is not None
+        and not isinstance(error, TransportError)
+    ):
+        log.error("cancelling a job failed", error=str(error))
+
+
+async def _close_slot(slot: SlotLike) -> None:
+    with contextlib.suppress(EvopolicyError, OSError):
+        await slot.close()
