@@ -1,0 +1,159 @@
+"""`evolve`: the reference agent. Improves a parametrised policy under the run's budget, with no language model.
+
+It knows what every agent may know: `/info`, `/task`, `/submit` and the feedback files. Run as
+`python -m evopolicy_gateway.agents.evolve` in the workspace, with the `EVOPOLICYGYM_*` URLs set.
+
+One submit plays a whole population, a candidate an episode, since the policy is told the episode's index. The last
+submits hold one candidate each: those are the checkpoints meant for the hidden validation, which plays every episode
+of a checkpoint, whatever its index.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.families import families_for, pusher_family
+from evopolicy_gateway.agents.feedback import episode_folders, novelty, read_steps
+from evopolicy_gateway.agents.plant import find_pusher_settings
+from evopolicy_gateway.agents.search import Candidate, Search, make_plan
+from evopolicy_gateway.agents.staging import stage_candidates, stage_code
+
+MAX_ROWS_READ = 1000
+"""Rows of one trajectory that the agent reads at most."""
+MAX_TRAJECTORIES_READ = 24
+MAX_REFUSALS = 3
+
+
+class Agent:
+    """One run of the agent in one workspace."""
+
+    def __init__(self, client: Client, workspace: Path, seed: int = 0) -> None:
+        self._client = client
+        self._workspace = workspace
+        self._system = workspace / "system"
+        info = client.info()
+        meta = info["env_meta"]
+        self._env = str(meta["env"])
+        self._spaces: tuple[dict[str, Any], dict[str, Any]] = meta["obs_space"], meta["action_space"]
+        self._n_cases = int(meta["n_env_instances"])
+        self._budget = int(info["state"]["remaining_budget"])
+        self._bounds = int(info["min_episodes_per_submit"]), int(info["max_episodes_per_submit"])
+        self._search = Search(families_for(*self._spaces), np.random.default_rng(seed))
+        self._next_case = 0
+        self._n_refusals = 0
+
+    def run(self) -> None:
+        """Spend the budget. ProtocolError when the gateway stays away or keeps refusing."""
+        self._system.mkdir(exist_ok=True)
+        stage_code(self._system)
+        plan = make_plan(max(self._budget, 1), *self._bounds)
+        print(f"{self._env}: {self._budget} episodes, {plan}", flush=True)
+        if plan.opening:
+            self._play_population("opening", self._search.opening(plan.opening))
+        for number, size in enumerate(plan.rounds, start=1):
+            if self._budget < size + plan.episodes_per_final:
+                break
+            self._play_population(f"round {number}", self._search.round(size))
+        self._play_finals(plan.finals, plan.episodes_per_final)
+
+    def _play_finals(self, n: int, n_episodes: int) -> None:
+        """Single candidates on the same fresh cases, until nothing is left that a submit may spend."""
+        finalists = self._search.finalists(n)
+        first_case = self._next_case
+        for number, finalist in enumerate(finalists, start=1):
+            if self._budget < max(n_episodes, self._bounds[0]):
+                break
+            spend = n_episodes
+            if number == len(finalists) or self._budget - spend < max(n_episodes, self._bounds[0]):
+                spend = min(self._budget, self._bounds[1])
+            self._next_case = first_case
+            self._play_population(f"final {number}", [finalist], n_episodes=spend)
+
+    def _play_population(self, title: str, candidates: list[Candidate], n_episodes: int | None = None) -> None:
+        """One submit in which the candidates take turns: each of them on the same case, then on the next one."""
+        total = max(n_episodes or len(candidates), self._bounds[0])
+        total = min(total, self._bounds[1], self._budget)
+        if total < self._bounds[0] or not candidates:
+            return
+        schedule = [i % len(candidates) for i in range(total)]
+        turns = [i // len(candidates) for i in range(total)]
+        cases = [(self._next_case + turn) % self._n_cases for turn in turns]
+        self._next_case += turns[-1] + 1
+        stage_candidates(self._system, candidates, schedule if len(candidates) > 1 else [0])
+        verdict = self._client.submit(cases)
+        if isinstance(verdict, Refusal):
+            self._n_refusals += 1
+            print(f"{title}: refused, {verdict.status}: {verdict.message}", flush=True)
+            if self._n_refusals >= MAX_REFUSALS:
+                raise ProtocolError(f"refused {self._n_refusals} times, last: {verdict.message}")
+            self._budget = int(self._client.info()["state"]["remaining_budget"])
+            return
+        self._budget = int(verdict.summary["remaining_budget"])
+        self._learn(verdict, candidates, schedule, cases)
+        self._report(title, verdict, candidates)
+
+    def _learn(self, verdict: Verdict, candidates: list[Candidate], schedule: list[int], cases: list[int]) -> None:
+        returns = verdict.summary.get("returns")
+        if verdict.status != "ok" or not returns:
+            return
+        failed = set(verdict.summary.get("errors") or ()) | set(verdict.summary.get("timeouts") or ())
+        for index, (turn, case, value) in enumerate(zip(schedule, cases, returns, strict=True)):
+            if index not in failed and value is not None and np.isfinite(value):
+                candidates[turn].returns.append((case, float(value)))
+        if len(candidates) > 1:
+            self._read_trajectories(verdict, candidates, schedule)
+
+    def _read_trajectories(self, verdict: Verdict, candidates: list[Candidate], schedule: list[int]) -> None:
+        """Novelty while no reward tells candidates apart; the plant, once, where the spaces suggest a pusher."""
+        summary = verdict.summary
+        folders = episode_folders(
+            self._workspace, verdict.submit_id, len(schedule), int(summary["first_global_episode"])
+        )
+        knows_pusher = any(c.family.kind == "pusher" for c in self._search.candidates)
+        wants_plant = not knows_pusher and "desired_goal" in self._spaces[0].get("spaces", {})
+        if not self._search.is_flat and not wants_plant:
+            return
+        episodes = [read_steps(folder, MAX_ROWS_READ) for folder in folders[:MAX_TRAJECTORIES_READ]]
+        for turn, steps in zip(schedule, episodes, strict=False):
+            candidates[turn].novelties.append(float(novelty(steps)))
+        if wants_plant:
+            settings = find_pusher_settings(*self._spaces, episodes)
+            if settings is not None:
+                self._search.add_family(pusher_family(settings, *self._spaces))
+
+    def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
+        """One line: what was played, how it went, what leads, what is left."""
+        line = f"{verdict.submit_id} {title}: {verdict.status}, {len(candidates)} candidates"
+        returns = verdict.summary.get("returns")
+        if verdict.status == "ok" and returns:
+            line += f", mean {np.mean(returns):.2f}, best {np.max(returns):.2f}"
+        else:
+            line += f", {verdict.summary.get('n_episodes')} episodes charged for nothing"
+        ranked = self._search.ranking()
+        if ranked:
+            leader = ranked[0]
+            values = [value for _, value in leader.returns]
+            line += f"; leader {leader.family.name} {np.mean(values):.2f} over {len(values)}"
+        print(f"{line}; {self._budget} episodes left", flush=True)
+
+
+def main() -> int:
+    """Run the agent in the current folder; 0 when the budget is spent, 1 when the gateway could not be used."""
+    try:
+        Agent(Client.from_environment(), Path.cwd()).run()
+    except KeyError as missing:
+        print(f"evolve: {missing} is not set; it is started by a gateway", file=sys.stderr)
+        return 1
+    except ProtocolError as error:
+        print(f"evolve: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

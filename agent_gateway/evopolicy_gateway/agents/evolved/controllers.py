@@ -1,0 +1,159 @@
+"""Parametrised controllers: each turns a flat vector of numbers into behaviour.
+
+A controller is built from a candidate: its `kind`, its `vector`, and `settings` found out from feedback. How many
+numbers a kind takes is `parameter_count`, the one place that both the search and the policy ask.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .pushing import Pusher
+from .spaces import ActionHead, Features, Schema, Vector, as_image
+
+OSCILLATOR_PERIOD_STEPS = 25.0
+"""Period of an oscillator whose tempo is 0; each unit of tempo halves it."""
+SALIENCY_FEATURES = 4
+"""Left-right and up-down balance and mean of what is salient, and one."""
+
+
+def parameter_count(kind: str, settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> int:
+    """Length of the vector that `kind` takes between these spaces. KeyError for an unknown kind."""
+    outputs = ActionHead(action_space).size
+    features = Features(obs_space).size
+    return {
+        "constant": outputs,
+        "linear": outputs * (features + 1),
+        "oscillator": 1 + 3 * outputs,
+        "explorer": outputs + 3,
+        "saliency": 3 + SALIENCY_FEATURES * outputs,
+        "pusher": Pusher.PARAMETERS + outputs,
+    }[kind]
+
+
+class Constant:
+    """The same outputs at every step."""
+
+    def __init__(self, head: ActionHead, vector: Vector) -> None:
+        self._action = head.action(vector)
+
+    def act(self, obs: Any) -> Any:
+        return self._action
+
+
+class Linear:
+    """Outputs = tanh(W · features + b); a large W makes it bang-bang."""
+
+    def __init__(self, head: ActionHead, features: Features, vector: Vector) -> None:
+        self._head, self._features = head, features
+        weights = vector.reshape(head.size, features.size + 1)
+        self._weights, self._bias = weights[:, :-1], weights[:, -1]
+
+    def act(self, obs: Any) -> Any:
+        return self._head.action(np.tanh(self._weights @ self._features.vector(obs) + self._bias))
+
+
+class Oscillator:
+    """Open loop: every output is a sine of one common period, with an amplitude, phase and offset of its own."""
+
+    def __init__(self, head: ActionHead, vector: Vector) -> None:
+        self._head = head
+        self._radians_per_step = 2 * np.pi / OSCILLATOR_PERIOD_STEPS * 2.0 ** np.clip(vector[0], -3, 3)
+        self._amplitude, self._phase, self._offset = vector[1:].reshape(3, head.size)
+        self._t = 0
+
+    def act(self, obs: Any) -> Any:
+        angle = self._radians_per_step * self._t
+        self._t += 1
+        return self._head.action(self._offset + self._amplitude * np.sin(angle + np.pi * self._phase))
+
+
+class Explorer:
+    """Random choices that prefer what this episode has not tried yet where it stands.
+
+    An output's score is its logit, less `curiosity` × log(1 + how often it was chosen after the same observation), plus
+    `persistence` when it was the last choice, plus Gumbel noise × `temperature`.
+    """
+
+    def __init__(self, head: ActionHead, vector: Vector, rng: np.random.Generator) -> None:
+        self._head, self._rng = head, rng
+        self._logits, (self._curiosity, self._persistence, temperature) = vector[:-3], vector[-3:]
+        self._temperature = abs(temperature)
+        self._counts: dict[bytes, Vector] = {}
+        self._last = np.zeros(head.size)
+
+    def act(self, obs: Any) -> Any:
+        tried = self._counts.setdefault(fingerprint(obs), np.zeros(self._head.size))
+        noise = self._rng.gumbel(size=self._head.size)
+        scores = self._logits - self._curiosity * np.log1p(tried)
+        scores = scores + self._persistence * self._last + self._temperature * noise
+        choice = int(np.argmax(scores))
+        tried[choice] += 1
+        self._last = np.eye(self._head.size)[choice]
+        return self._head.action(self._last if self._head.size else scores)
+
+
+class Saliency:
+    """Steers by where in a picture a colour lies: outputs are linear in that colour's balance and mean.
+
+    The first three numbers weigh the colour channels (one channel counts as three equal ones).
+    """
+
+    def __init__(self, head: ActionHead, schema: Schema, vector: Vector) -> None:
+        self._head, self._schema = head, schema
+        self._colour = vector[:3]
+        self._weights = vector[3:].reshape(head.size, SALIENCY_FEATURES)
+
+    def act(self, obs: Any) -> Any:
+        image = as_image(obs, self._schema)
+        channels = image[:, :, :3] if image.shape[2] >= 3 else np.repeat(image[:, :, :1], 3, axis=2)
+        salient = channels @ self._colour
+        height, width = salient.shape
+        across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
+        balance = salient - salient.mean()
+        features = np.array(
+            [4 * (balance * across).mean(), 4 * (balance * down[:, None]).mean(), salient.mean(), 1.0]
+        )
+        return self._head.action(np.tanh(self._weights @ features))
+
+
+def fingerprint(obs: Any) -> bytes:
+    """Bytes that are equal for equal observations, numbers compared to two significant decimals."""
+    if isinstance(obs, dict):
+        return b"".join(fingerprint(obs[key]) for key in sorted(obs))
+    if isinstance(obs, tuple):
+        return b"".join(fingerprint(part) for part in obs)
+    if isinstance(obs, str):
+        return obs.encode()
+    values = np.asarray(obs)
+    return values.tobytes() if values.dtype.kind in "iub" else np.round(values, 2).tobytes()
+
+
+Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher
+
+
+def build(
+    kind: str,
+    vector: Vector,
+    settings: dict[str, Any],
+    obs_space: Schema,
+    action_space: Schema,
+    rng: np.random.Generator,
+) -> Controller:
+    """A fresh controller for one episode. ValueError for an unknown kind."""
+    head = ActionHead(action_space)
+    if kind == "constant":
+        return Constant(head, vector)
+    if kind == "linear":
+        return Linear(head, Features(obs_space), vector)
+    if kind == "oscillator":
+        return Oscillator(head, vector)
+    if kind == "explorer":
+        return Explorer(head, vector, rng)
+    if kind == "saliency":
+        return Saliency(head, obs_space, vector)
+    if kind == "pusher":
+        return Pusher(head, vector, settings)
+    raise ValueError(f"no controller of kind {kind!r}")

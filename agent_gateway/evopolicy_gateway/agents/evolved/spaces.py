@@ -1,0 +1,194 @@
+"""From an observation to a feature vector, and from a vector of outputs to an action, for any pair of spaces.
+
+Features are a fixed function of the space alone, so that a weight means the same in every submit of a run. Outputs are
+in units where 0 is the action nearest to zero and ±1 are the bounds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Schema = dict[str, Any]
+Vector = NDArray[np.float64]
+
+FEATURE_LIMIT = 10.0
+"""Features are clipped here, so that one wild component cannot drown the others."""
+IMAGE_CELLS = 4
+"""A picture becomes this many by this many mean colours."""
+MAX_ONE_HOT = 64
+"""A Discrete with more values than this is one number in [-1, 1]."""
+
+
+def bounds(schema: Schema) -> tuple[Vector, Vector]:
+    """Lowest and highest value of every element of a Box, flat; infinite where there is none."""
+    size = math.prod(schema["shape"])
+    if "low" in schema:
+        low, high = _floats(schema["low"]), _floats(schema["high"])
+    else:
+        low, high = [float(schema["min"])], [float(schema["max"])]
+    return np.broadcast_to(low, size).astype(float), np.broadcast_to(high, size).astype(float)
+
+
+def _floats(value: Any) -> list[float]:
+    if isinstance(value, list):
+        return [number for item in value for number in _floats(item)]
+    return [float(value)]
+
+
+def goal_keys(schema: Schema) -> bool:
+    """True for the goal convention: a Dict with `observation`, `achieved_goal` and `desired_goal`."""
+    return schema["type"] == "Dict" and {"observation", "achieved_goal", "desired_goal"} <= set(schema["spaces"])
+
+
+class Features:
+    """An observation as a float64 vector of `size` values, each of the order of one where the space is bounded."""
+
+    def __init__(self, schema: Schema) -> None:
+        self.size, self._convert = _features(schema)
+
+    def vector(self, obs: Any) -> Vector:
+        """Features of `obs`, float64 of shape (size,); NaN becomes 0."""
+        return np.clip(np.nan_to_num(self._convert(obs)), -FEATURE_LIMIT, FEATURE_LIMIT)
+
+
+def _features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
+    kind = schema["type"]
+    if kind == "Box":
+        low, high = bounds(schema)
+        finite = np.isfinite(low) & np.isfinite(high) & (high > low)
+        centre = np.where(finite, (np.where(finite, low, 0.0) + np.where(finite, high, 0.0)) / 2, 0.0)
+        half = np.where(finite, (np.where(finite, high, 1.0) - np.where(finite, low, -1.0)) / 2, 1.0)
+        return low.size, lambda obs: (np.asarray(obs, dtype=float).reshape(-1) - centre) / half
+    if kind == "Image":
+        return _image_features(schema)
+    if kind == "Discrete":
+        n, start = schema["n"], schema.get("start", 0)
+        if n > MAX_ONE_HOT:
+            return 1, lambda obs: np.array([2.0 * (int(obs) - start) / (n - 1) - 1.0])
+        rows = np.eye(n)
+        return n, lambda obs: rows[min(max(int(obs) - start, 0), n - 1)]
+    if kind == "MultiDiscrete":
+        # `nvec` may itself be an array of several dimensions.
+        top = np.maximum(np.asarray(schema["nvec"], dtype=float).reshape(-1) - 1, 1.0)
+        first = np.broadcast_to(np.asarray(schema.get("start", 0), dtype=float).reshape(-1), top.shape)
+        return top.size, lambda obs: 2.0 * (np.asarray(obs, dtype=float).reshape(-1) - first) / top - 1.0
+    if kind == "MultiBinary":
+        size = int(np.prod(schema["n"]))
+        return size, lambda obs: 2.0 * np.asarray(obs, dtype=float).reshape(-1) - 1.0
+    if kind == "Text":
+        return 0, lambda obs: np.zeros(0)
+    if kind == "Tuple":
+        return _joined([(i, part) for i, part in enumerate(schema["spaces"])])
+    if goal_keys(schema):
+        others = [(k, v) for k, v in schema["spaces"].items() if k not in ("achieved_goal", "desired_goal")]
+        size, convert = _joined(others)
+        n_goal = math.prod(schema["spaces"]["desired_goal"]["shape"])
+        return size + n_goal, lambda obs: np.concatenate([goal_error(obs), convert(obs)])
+    return _joined(list(schema["spaces"].items()))
+
+
+def goal_error(obs: Any) -> Vector:
+    """What is still missing: desired minus achieved goal, flat."""
+    desired = np.asarray(obs["desired_goal"], dtype=float).reshape(-1)
+    missing: Vector = desired - np.asarray(obs["achieved_goal"], dtype=float).reshape(-1)
+    return missing
+
+
+def _joined(items: list[tuple[Any, Schema]]) -> tuple[int, Callable[[Any], Vector]]:
+    parts = [(key, *_features(part)) for key, part in items]
+    used = [(key, convert) for key, size, convert in parts if size]
+    if not used:
+        return 0, lambda obs: np.zeros(0)
+    return sum(size for _, size, _ in parts), lambda obs: np.concatenate([f(obs[key]) for key, f in used])
+
+
+def _image_features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
+    def convert(obs: Any) -> Vector:
+        image = as_image(obs, schema)
+        rows = np.array_split(image, min(IMAGE_CELLS, image.shape[0]), axis=0)
+        cells = [c for row in rows for c in np.array_split(row, min(IMAGE_CELLS, image.shape[1]), axis=1)]
+        return np.concatenate([cell.mean(axis=(0, 1)) for cell in cells])
+
+    return convert(np.zeros(schema["shape"])).size, convert
+
+
+def as_image(obs: Any, schema: Schema) -> NDArray[np.float64]:
+    """A picture as float64 of shape (height, width, channels), values in [-1, 1]."""
+    image = np.asarray(obs, dtype=float)
+    if image.ndim == 2:
+        image = image[:, :, None]
+    elif schema.get("layout") == "CHW":
+        image = np.moveaxis(image, 0, -1)
+    low, high = schema.get("value_range", (0, 255))
+    scaled: NDArray[np.float64] = 2.0 * (image - low) / (high - low) - 1.0
+    return scaled
+
+
+class ActionHead:
+    """Turns `size` outputs into an action of the space."""
+
+    def __init__(self, schema: Schema) -> None:
+        self.size, self._convert = _head(schema)
+
+    def action(self, outputs: Vector) -> Any:
+        """The action for `outputs`, float64 of shape (size,)."""
+        return self._convert(outputs)
+
+
+def _head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
+    kind = schema["type"]
+    if kind == "Box":
+        return _box_head(schema)
+    if kind == "Discrete":
+        start = schema.get("start", 0)
+        return schema["n"], lambda outputs: int(np.argmax(outputs)) + start
+    if kind == "MultiDiscrete":
+        shape = np.shape(schema["nvec"])
+        counts = [int(n) for n in np.asarray(schema["nvec"]).reshape(-1)]
+        first = np.broadcast_to(np.asarray(schema.get("start", 0)), shape)
+        cuts = np.cumsum(counts)[:-1]
+
+        def choose(outputs: Vector) -> Any:
+            best = [int(np.argmax(part)) for part in np.split(outputs, cuts)]
+            return np.array(best, dtype=np.int64).reshape(shape) + first
+
+        return sum(counts), choose
+    if kind == "MultiBinary":
+        shape = tuple(np.atleast_1d(schema["n"]))
+        return int(np.prod(shape)), lambda outputs: (outputs > 0).astype(np.int8).reshape(shape)
+    if kind == "Text":
+        return 0, lambda outputs: " " * schema["min_length"]
+    named = kind == "Dict"
+    items = list(schema["spaces"].items()) if named else list(enumerate(schema["spaces"]))
+    heads = [(key, *_head(part)) for key, part in items]
+    cuts = np.cumsum([size for _, size, _ in heads])[:-1]
+
+    def compose(outputs: Vector) -> Any:
+        pieces = np.split(outputs, cuts)
+        made = [(key, convert(piece)) for (key, _, convert), piece in zip(heads, pieces, strict=True)]
+        return dict(made) if named else tuple(value for _, value in made)
+
+    return sum(size for _, size, _ in heads), compose
+
+
+def _box_head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
+    low, high = bounds(schema)
+    neutral = np.clip(0.0, low, high)
+    up = np.where(np.isfinite(high), high - neutral, 1.0)
+    down = np.where(np.isfinite(low), neutral - low, 1.0)
+    dtype = np.dtype(schema["dtype"])
+    shape = tuple(schema["shape"])
+
+    def scale(outputs: Vector) -> Any:
+        bounded = np.clip(outputs, -1.0, 1.0)
+        values = neutral + np.where(bounded > 0, bounded * up, bounded * down)
+        if dtype.kind in "iu":
+            values = np.rint(values)
+        return np.clip(values, low, high).astype(dtype).reshape(shape)
+
+    return low.size, scale

@@ -1,0 +1,98 @@
+"""Finds out from trajectories how actions move what is observed: the plant that a pusher needs to know.
+
+An effector's coordinate is a component of `observation` whose step-to-step change follows one output, and whose values
+lie where the achieved goal's do on that axis.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_gateway.agents.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.feedback import Step
+
+MIN_STEPS = 40
+MIN_CORRELATION = 0.5
+REACTION_STEPS = 2
+"""An action's effect is looked for in the displacement over this many steps."""
+
+
+def find_pusher_settings(
+    obs_space: Schema, action_space: Schema, episodes: list[list[Step]]
+) -> dict[str, Any] | None:
+    """Settings for the `pusher` controller, or None where the spaces or the trajectories do not give any."""
+    if not goal_keys(obs_space) or action_space["type"] != "Box":
+        return None
+    n_axes = math.prod(obs_space["spaces"]["desired_goal"]["shape"])
+    if not 2 <= n_axes <= 3 or math.prod(action_space["shape"]) < n_axes:
+        return None
+    long_enough = [steps for steps in episodes if len(steps) > REACTION_STEPS + 1]
+    if sum(map(len, long_enough)) < MIN_STEPS:
+        return None
+    observed, achieved, desired, displacement, actions = _stack(long_enough)
+    correlation = _correlations(displacement, actions)
+    axes = _match_axes(correlation, observed, achieved)
+    if axes is None:
+        return None
+    effector = [component for component, _ in axes]
+    outputs = [output for _, output in axes]
+    slopes = [_slope(displacement[:, c], actions[:, o]) / REACTION_STEPS for c, o in axes]
+    # Pass over along the axis where start and goal differ least: that is where the thing rests on something.
+    lift_axis = int(np.argmin(np.abs(desired - achieved).mean(axis=0)))
+    return {"effector": effector, "outputs": outputs, "slopes": slopes, "lift_axis": lift_axis}
+
+
+Rows = NDArray[np.float64]
+
+
+def _stack(episodes: list[list[Step]]) -> tuple[Rows, Rows, Rows, Rows, Rows]:
+    """Rows of observation, achieved and desired goal, displacement and mean action over the reaction time."""
+    parts: list[list[Rows]] = [[], [], [], [], []]
+    k = REACTION_STEPS
+    for steps in episodes:
+        seen = [np.array([np.ravel(s.obs[key]) for s in steps], dtype=float) for key in _KEYS]
+        acted = np.array([np.ravel(s.action) for s in steps], dtype=float)
+        for part, rows in zip(parts, [*(rows[:-k] for rows in seen), seen[0][k:] - seen[0][:-k]], strict=False):
+            part.append(rows)
+        parts[4].append(np.mean([acted[i : len(acted) - k + i] for i in range(k)], axis=0))
+    observed, achieved, desired, displacement, actions = (np.concatenate(part) for part in parts)
+    return observed, achieved, desired, displacement, actions
+
+
+_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def _correlations(displacement: Rows, actions: Rows) -> Rows:
+    """Absolute correlation of every component's displacement with every output, (components, outputs)."""
+    d = displacement - displacement.mean(axis=0)
+    a = actions - actions.mean(axis=0)
+    scale = np.outer(np.linalg.norm(d, axis=0), np.linalg.norm(a, axis=0))
+    correlation: Rows = np.abs(d.T @ a) / np.maximum(scale, 1e-12)
+    return correlation
+
+
+def _match_axes(correlation: Rows, observed: Rows, achieved: Rows) -> list[tuple[int, int]] | None:
+    """Per goal axis the observation component and output that move along it; None when an axis has none."""
+    spread = float(np.max(achieved.max(axis=0) - achieved.min(axis=0))) or 1.0
+    axes: list[tuple[int, int]] = []
+    for axis in range(achieved.shape[1]):
+        far = np.abs(observed.mean(axis=0) - achieved[:, axis].mean())
+        # What merely repeats the achieved goal is the thing, not the effector.
+        same = np.abs(observed - achieved[:, axis : axis + 1]).mean(axis=0) < 1e-9
+        taken = [component for component, _ in axes]
+        able = (correlation.max(axis=1) > MIN_CORRELATION) & (far < 2 * spread) & ~same
+        able[taken] = False
+        if not able.any():
+            return None
+        component = int(np.argmin(np.where(able, far, np.inf)))
+        axes.append((component, int(np.argmax(correlation[component]))))
+    return axes if len({output for _, output in axes}) == len(axes) else None
+
+
+def _slope(displacement: Rows, action: Rows) -> float:
+    centred = action - action.mean()
+    return float(centred @ displacement / max(float(centred @ centred), 1e-12)) or 1e-6
