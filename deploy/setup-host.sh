@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Installs the system packages that evopolicy needs: bubblewrap, the policies' sandbox.
+# As root on Debian or Ubuntu it installs them; otherwise it says exactly what to install and goes on.
+set -euo pipefail
+
+missing=()
+command -v bwrap >/dev/null 2>&1 || missing+=(bubblewrap)
+if [ "${1:-}" = "--tests" ]; then
+  command -v ip >/dev/null 2>&1 || missing+=(iproute2)
+fi
+[ ${#missing[@]} -eq 0 ] && exit 0
+
+if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null 2>&1; then
+  echo "installing ${missing[*]} with apt-get"
+  apt-get install -y -q --no-install-recommends "${missing[@]}" >/dev/null 2>&1 || {
+    apt-get update -q >/dev/null
+    apt-get install -y -q --no-install-recommends "${missing[@]}" >/dev/null
+  }
+  exit 0
+fi
+
+case "$(uname -s)" in
+  Linux)
+    echo "note: ${missing[*]} is missing. Policies will not run in the default sandbox until it is installed:"
+    echo "    Debian, Ubuntu:  sudo apt-get install ${missing[*]}"
+    echo "    Fedora:          sudo dnf install ${missing[*]}"
+    echo "    Arch:            sudo pacman -S ${missing[*]}" ;;
+  *)
+    echo "note: workers run on Linux (or WSL2) only; on this system the coordinator, the gateway and reports work." ;;
+esac
