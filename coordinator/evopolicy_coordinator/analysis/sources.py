@@ -1,0 +1,146 @@
+"""The policy source bundle: `policy.py` and the local modules that it can reach by imports.
+
+This is the boundary that the paper's code diagnostics use (mechanism section, Table "Realized computational
+structure"): modules that nothing imports, data files and learned weights are outside it. Files are read as bytes and
+never imported or executed; whatever cannot be parsed is kept as opaque bytes.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+MAX_FILE_BYTES = 1 << 20
+"""Python files above this are not parsed: they are data in disguise, and would stall a report."""
+
+MAX_FILES = 400
+
+
+def read_python_files(system_dir: Path) -> dict[str, bytes]:
+    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks are not followed.
+
+    At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`; OSError when the folder cannot be read.
+    """
+    found: dict[str, bytes] = {}
+    if not system_dir.is_dir():
+        raise FileNotFoundError(f"no folder {system_dir}")
+    for root, folders, names in os.walk(system_dir):
+        folders[:] = sorted(name for name in folders if name != "__pycache__" and not name.startswith("."))
+        for name in sorted(names):
+            path = Path(root, name)
+            if not name.endswith(".py") or path.is_symlink() or path.stat().st_size > MAX_FILE_BYTES:
+                continue
+            found[path.relative_to(system_dir).as_posix()] = path.read_bytes()
+            if len(found) >= MAX_FILES:
+                return found
+    return dict(sorted(found.items()))
+
+
+def parse(source: bytes) -> ast.Module | None:
+    """The module's tree, or None when this Python cannot parse it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
+
+
+class Module:
+    """One reachable module: its path, bytes, tree (None when unparseable) and the local modules it names."""
+
+    __slots__ = ("locals", "name", "path", "source", "tree")
+
+    def __init__(self, name: str, path: str, source: bytes, tree: ast.Module | None) -> None:
+        self.name = name
+        self.path = path
+        self.source = source
+        self.tree = tree
+        self.locals: set[str] = set()
+        """Dotted names of the local modules that its imports reach."""
+
+
+def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
+    """Modules reachable from `policy.py` by any import statement, also inside functions, by dotted name.
+
+    `import_module("x")` and `__import__("x")` with a literal count. A package brings its `__init__`. Empty when there
+    is no `policy.py`.
+    """
+    by_name = {_module_name(path): path for path in files}
+    modules: dict[str, Module] = {}
+    queue = ["policy"]
+    while queue:
+        name = queue.pop()
+        path = by_name.get(name)
+        if path is None or name in modules:
+            continue
+        module = modules[name] = Module(name, path, files[path], parse(files[path]))
+        if module.tree is None:
+            continue
+        for target in _imported(module.tree, name, path.endswith("__init__.py")):
+            for part in _prefixes(target):
+                if part in by_name:
+                    module.locals.add(part)
+                    queue.append(part)
+    return dict(sorted(modules.items()))
+
+
+def source_digest(modules: Mapping[str, Module]) -> str:
+    """SHA-256 over the paths and bytes of the reachable modules: equal means a byte-identical source bundle."""
+    digest = hashlib.sha256()
+    for module in modules.values():
+        for part in (module.path.encode(), module.source):
+            digest.update(len(part).to_bytes(8, "big"))
+            digest.update(part)
+    return digest.hexdigest()
+
+
+def _module_name(path: str) -> str:
+    parts = path.removesuffix(".py").split("/")
+    if parts[-1] == "__init__" and len(parts) > 1:
+        parts.pop()
+    return ".".join(parts)
+
+
+def _prefixes(dotted: str) -> list[str]:
+    parts = dotted.split(".")
+    return [".".join(parts[: i + 1]) for i in range(len(parts))]
+
+
+def _imported(tree: ast.Module, name: str, is_package: bool) -> set[str]:
+    targets: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            targets.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = absolute_import(node, name, is_package)
+            if base:
+                targets.add(base)
+            targets.update(f"{base}.{alias.name}" if base else alias.name for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args:
+            first, called = node.args[0], node.func
+            label = (
+                called.attr
+                if isinstance(called, ast.Attribute)
+                else called.id
+                if isinstance(called, ast.Name)
+                else ""
+            )
+            literal = first.value if isinstance(first, ast.Constant) else None
+            if label in ("import_module", "__import__") and isinstance(literal, str):
+                targets.add(literal)
+    return targets
+
+
+def absolute_import(node: ast.ImportFrom, name: str, is_package: bool) -> str:
+    """The dotted module that a `from … import` in module `name` means; empty for the top level itself."""
+    if not node.level:
+        return node.module or ""
+    package = name.split(".") if is_package else name.split(".")[:-1]
+    up = node.level - 1
+    base = package[: len(package) - up] if up <= len(package) else []
+    return ".".join([*base, *([node.module] if node.module else [])])
