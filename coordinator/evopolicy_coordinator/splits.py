@@ -227,6 +227,11 @@ class SplitSource:
         self._data = data
         self._secret = secret
 
+    @property
+    def from_files(self) -> bool:
+        """Whether splits are read from files; else they are derived."""
+        return self._data is not None
+
     def splits(self, suite: str, env: str, counts: dict[Split, int]) -> EnvironmentSplits:
         """The splits of `env`; derived ones have exactly `counts`, those from files are cut to `counts` where set.
 

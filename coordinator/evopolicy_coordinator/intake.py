@@ -1,0 +1,393 @@
+"""From bytes on a key to an event for the core, or to a refusal: decoding and the check of every token.
+
+Rules that this module owns:
+- A message is served only on the very key that its kind belongs on (a gateway's only under its own run), so that what
+  Zenoh's access control grants is what is granted.
+- Tokens are compared in constant time. A wrong capability and an unknown run are answered alike.
+- Whatever is refused here has changed nothing.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import msgspec
+
+from evopolicy_common import catalogue, codec, keys
+from evopolicy_common.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.errors import ConfigError, RefusedError
+from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.events import AnyEvent
+from evopolicy_coordinator.splits import SplitSource
+from evopolicy_coordinator.state import Identity
+from evopolicy_coordinator.store import stored_blobs
+
+_MAX_WAIT_S = 60.0
+_MAX_NAME = 200
+
+_VERBS: dict[type[Message], str] = {
+    worker.Register: "register",
+    worker.LeaseRequest: "lease",
+    worker.Heartbeat: "beat",
+    worker.HandIn: "done",
+    BlobPut: "blob",
+    BlobGet: "blob",
+    gateway.OpenRun: "open",
+    gateway.StateRequest: "state",
+    gateway.Submit: "submit",
+    gateway.ResultsRequest: "results",
+    gateway.CloseRun: "close",
+}
+
+
+class Rights(Protocol):
+    """What the core knows of who may do what."""
+
+    def capability(self, run: str) -> str | None:
+        """The token of a run's gateway; None for an unknown run."""
+        ...
+
+
+class Parsed(msgspec.Struct, frozen=True):
+    """A request whose speaker is known and allowed to ask it."""
+
+    room: str
+    """`work`, `gw`, `ops`."""
+    asker: str
+    """The worker's or run's name; `operator`."""
+    message: Message
+
+
+class Intake:
+    """Reads requests. Holds no state of its own."""
+
+    def __init__(
+        self,
+        identity: Identity,
+        blobs: BlobStore,
+        source: SplitSource,
+        *,
+        allowed_imports: tuple[str, ...],
+        denied_imports: tuple[str, ...],
+    ) -> None:
+        self._identity = identity
+        self._blobs = blobs
+        self._source = source
+        self._allowed_imports = allowed_imports
+        self._denied_imports = denied_imports
+        self._prefix = keys.worker_key(identity.cluster, "")[: -len("work/")]
+
+    def parse(self, key: str, payload: bytes, rights: Rights) -> Parsed:
+        """The request in `payload`; RefusedError for a wrong token or key, ProtocolError for what is no message."""
+        room, _, tail = key.removeprefix(self._prefix).partition("/")
+        if room == "work":
+            return self._parse_worker(tail, payload)
+        if room == "gw":
+            return self._parse_gateway(tail, payload, rights)
+        if room == "ops":
+            message = codec.decode(codec.operator_requests, payload)
+            _check_token(self._identity.operator_token, message.token)
+            return Parsed("ops", "operator", message)
+        raise RefusedError("wrong_key", f"nothing is asked on {key}")
+
+    def _parse_worker(self, tail: str, payload: bytes) -> Parsed:
+        message = codec.decode(codec.worker_requests, payload)
+        _check_key(tail, _VERBS[type(message)])
+        if isinstance(message, worker.Register):
+            _check_token(self._identity.worker_token, message.token)
+            _check_registration(message)
+        # Everyone else names a session, which the core knows or refuses.
+        name = message.sender if isinstance(message, BlobPut | BlobGet) else message.worker
+        return Parsed("work", name, message)
+
+    def _parse_gateway(self, tail: str, payload: bytes, rights: Rights) -> Parsed:
+        message = codec.decode(codec.gateway_requests, payload)
+        run = message.sender if isinstance(message, BlobPut | BlobGet) else message.run
+        _check_key(tail, f"{run}/{_VERBS[type(message)]}")
+        capability = rights.capability(run)
+        _check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
+        return Parsed("gw", run, message)
+
+    def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
+        """The event that the request is for the core; RefusedError when it cannot be served as it is.
+
+        Not for blob and status requests. Reads files for `CreateRun` and `Evaluate`, which therefore belong on a thread.
+        """
+        make: Callable[[Any, int, str], AnyEvent] = _EVENTS[type(parsed.message)]
+        return make(self, parsed.message, request, stimulus_id)  # type: ignore[call-arg, arg-type]
+
+    # Workers.
+
+    def registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
+        return events.WorkerRegistered(
+            stimulus_id=stimulus,
+            request=request,
+            worker=m.worker,
+            session=secrets.token_urlsafe(16),
+            slots=m.slots,
+            tiers=m.tiers,
+            environments=m.environments,
+            fingerprint=m.fingerprint,
+            host=m.host,
+        )
+
+    def lease_requested(self, m: worker.LeaseRequest, request: int, stimulus: str) -> AnyEvent:
+        return events.LeaseRequested(
+            stimulus_id=stimulus,
+            request=request,
+            worker=m.worker,
+            session=m.session,
+            n=m.n,
+            wait_s=_wait(m.wait_s),
+            warm_bundles=m.warm_bundles,
+            warm_environments=m.warm_environments,
+        )
+
+    def heartbeat_received(self, m: worker.Heartbeat, request: int, stimulus: str) -> AnyEvent:
+        return events.HeartbeatReceived(
+            stimulus_id=stimulus,
+            request=request,
+            worker=m.worker,
+            session=m.session,
+            held=m.held,
+            wait_s=_wait(m.wait_s),
+        )
+
+    def results_handed_in(self, m: worker.HandIn, request: int, stimulus: str) -> AnyEvent:
+        for result in m.results:
+            for outcome in result.episodes:
+                for ref in (outcome.trajectory, outcome.video):
+                    _check_inline(ref)
+                for ref in stored_blobs(outcome):
+                    if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
+                        raise RefusedError("missing_blob", f"blob {ref.digest[:64]!r} is not stored here")
+        return events.ResultsHandedIn(
+            stimulus_id=stimulus, request=request, worker=m.worker, session=m.session, results=m.results
+        )
+
+    # Gateways.
+
+    def run_opened(self, m: gateway.OpenRun, request: int, stimulus: str) -> AnyEvent:
+        return events.RunOpened(stimulus_id=stimulus, request=request, run=m.run)
+
+    def state_requested(self, m: gateway.StateRequest, request: int, stimulus: str) -> AnyEvent:
+        return events.StateRequested(stimulus_id=stimulus, request=request, run=m.run)
+
+    def submit_requested(self, m: gateway.Submit, request: int, stimulus: str) -> AnyEvent:
+        _check_idempotency_key(m.key)
+        self._check_bundle(m.bundle)
+        if (m.bundle is None) == (m.bundle_error is None):
+            raise RefusedError("bad_message", "a submit has either a bundle or a bundle_error")
+        return events.SubmitRequested(
+            stimulus_id=stimulus,
+            request=request,
+            run=m.run,
+            key=m.key,
+            env_instances=m.env_instances,
+            bundle=m.bundle,
+            bundle_error=m.bundle_error,
+        )
+
+    def results_requested(self, m: gateway.ResultsRequest, request: int, stimulus: str) -> AnyEvent:
+        return events.ResultsRequested(
+            stimulus_id=stimulus,
+            request=request,
+            run=m.run,
+            submit_index=m.submit_index,
+            cursor=max(0, m.cursor),
+            wait_s=_wait(m.wait_s),
+        )
+
+    def run_closed(self, m: gateway.CloseRun, request: int, stimulus: str) -> AnyEvent:
+        return events.RunClosed(
+            stimulus_id=stimulus, request=request, run=m.run, reason=m.reason, agent=m.agent
+        )
+
+    # Operators.
+
+    def run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
+        _check_idempotency_key(m.key)
+        wanted = m.settings
+        try:
+            suite = catalogue.suite_of(wanted.env)
+            cases = self._source.splits(
+                suite.name, wanted.env, self._counts(suite, wanted.n_validation, wanted.n_heldout)
+            )
+        except ConfigError as error:
+            raise RefusedError("invalid_settings", str(error)) from error
+        budget = suite.budget if wanted.budget is None else wanted.budget
+        least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
+        most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
+        if not 1 <= least <= most:
+            raise RefusedError(
+                "invalid_settings",
+                f"budget {budget} and {least} to {most} episodes a submit do not go together; all are at least 1",
+            )
+        return events.RunCreated(
+            stimulus_id=stimulus,
+            request=request,
+            run=f"r-{secrets.token_hex(8)}",
+            key=m.key,
+            capability=secrets.token_urlsafe(32),
+            secret=secrets.token_bytes(32),
+            settings=wanted,
+            budget=budget,
+            min_episodes_per_submit=least,
+            max_episodes_per_submit=most,
+            train=cases.train,
+            validation=cases.validation,
+            heldout=cases.heldout,
+            split_hashes=cases.hashes(),
+            split_secret=cases.secret,
+            allowed_imports=self._allowed_imports,
+            denied_imports=self._denied_imports,
+        )
+
+    def evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
+        _check_idempotency_key(m.key)
+        self._check_bundle(m.bundle)
+        try:
+            suite = catalogue.suite_of(m.env)
+            cases = self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
+        except ConfigError as error:
+            raise RefusedError("invalid_settings", str(error)) from error
+        ids = tuple(range(len(cases))) if m.cases is None else m.cases
+        wrong = next((case_id for case_id in ids if not 0 <= case_id < len(cases)), None)
+        if wrong is not None or not ids:
+            raise RefusedError(
+                "invalid_env_instance",
+                f"case {wrong} of {m.env}: there are 0 to {len(cases) - 1}"
+                if ids
+                else "no cases are asked for",
+            )
+        return events.EvaluationRequested(
+            stimulus_id=stimulus,
+            request=request,
+            evaluation=f"e-{secrets.token_hex(8)}",
+            key=m.key,
+            env=m.env,
+            bundle=m.bundle,
+            split=m.split,
+            case_ids=ids,
+            cases=tuple(cases[case_id] for case_id in ids),
+            secret=secrets.token_bytes(32),
+            record=m.record,
+            tier=m.sandbox_tier,
+            limits=m.limits,
+        )
+
+    def run_waited(self, m: operator.WaitRun, request: int, stimulus: str) -> AnyEvent:
+        return events.RunWaited(stimulus_id=stimulus, request=request, run=m.run, wait_s=_wait(m.wait_s))
+
+    def evaluation_polled(self, m: operator.EvaluationPoll, request: int, stimulus: str) -> AnyEvent:
+        return events.EvaluationPolled(
+            stimulus_id=stimulus,
+            request=request,
+            evaluation=m.evaluation,
+            cursor=max(0, m.cursor),
+            wait_s=_wait(m.wait_s),
+        )
+
+    def run_cancelled(self, m: operator.CancelRun, request: int, stimulus: str) -> AnyEvent:
+        return events.RunCancelled(stimulus_id=stimulus, request=request, run=m.run)
+
+    def worker_state_set(self, m: operator.SetWorker, request: int, stimulus: str) -> AnyEvent:
+        return events.WorkerStateSet(stimulus_id=stimulus, request=request, worker=m.worker, state=m.state)
+
+    def _counts(
+        self, suite: catalogue.Suite, n_validation: int | None, n_heldout: int | None
+    ) -> dict[Split, int]:
+        """How many cases of each split a run has: of files all, unless it asks for fewer."""
+        if min(_or(n_validation, 1), _or(n_heldout, 1)) < 1:
+            raise ConfigError("a run needs at least one validation and one held-out case")
+        asked: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
+        usual: dict[Split, int] = {
+            "train": suite.n_train,
+            "validation": suite.n_validation,
+            "heldout": suite.n_heldout,
+        }
+        if self._source.from_files:
+            return {split: n for split, n in asked.items() if n is not None}
+        return {split: _or(asked[split], n) for split, n in usual.items()}
+
+    def _check_bundle(self, digest: str | None) -> None:
+        if digest is not None and not (is_digest(digest) and self._blobs.has(digest)):
+            raise RefusedError(
+                "missing_bundle", f"bundle {digest[:64]!r} is not stored here; upload it first"
+            )
+
+
+_EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
+    worker.Register: Intake.registered,
+    worker.LeaseRequest: Intake.lease_requested,
+    worker.Heartbeat: Intake.heartbeat_received,
+    worker.HandIn: Intake.results_handed_in,
+    gateway.OpenRun: Intake.run_opened,
+    gateway.StateRequest: Intake.state_requested,
+    gateway.Submit: Intake.submit_requested,
+    gateway.ResultsRequest: Intake.results_requested,
+    gateway.CloseRun: Intake.run_closed,
+    operator.CreateRun: Intake.run_created,
+    operator.Evaluate: Intake.evaluation_requested,
+    operator.WaitRun: Intake.run_waited,
+    operator.EvaluationPoll: Intake.evaluation_polled,
+    operator.CancelRun: Intake.run_cancelled,
+    operator.SetWorker: Intake.worker_state_set,
+}
+
+
+def _or(value: int | None, otherwise: int) -> int:
+    return otherwise if value is None else value
+
+
+def _wait(seconds: float) -> float:
+    """A long poll's wait, made finite: NaN decodes."""
+    return min(seconds, _MAX_WAIT_S) if seconds > 0 else 0.0
+
+
+def _check_token(expected: str, given: str) -> None:
+    if not hmac.compare_digest(expected.encode(), given.encode()):
+        raise RefusedError(
+            "bad_token", "wrong token, or one of something that is not here; see the credentials file"
+        )
+
+
+def _check_key(tail: str, expected: str) -> None:
+    if tail != expected:
+        raise RefusedError("wrong_key", f"this message belongs on {expected!r}, not on {tail!r}")
+
+
+def _check_idempotency_key(key: str) -> None:
+    if not 1 <= len(key) <= _MAX_NAME:
+        raise RefusedError(
+            "bad_message", f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
+        )
+
+
+def _check_registration(message: worker.Register) -> None:
+    if message.protocol != codec.WIRE_VERSION:
+        raise RefusedError(
+            "wrong_protocol",
+            f"worker speaks wire version {message.protocol}, the coordinator {codec.WIRE_VERSION}: install the same"
+            " version of evopolicy on both",
+        )
+    if not keys.valid_name(message.worker):
+        raise RefusedError(
+            "bad_name", f"worker name {message.worker[:80]!r}: letters, digits, '.', '_', '-', at most 63"
+        )
+    if not 1 <= message.slots <= 4096:
+        raise RefusedError("bad_message", f"{message.slots} slots: a worker has 1 to 4096")
+
+
+def _check_inline(ref: BlobRef | None) -> None:
+    if ref is None or ref.inline is None:
+        return
+    if len(ref.inline) != ref.size or digest_of(ref.inline) != ref.digest:
+        raise RefusedError("bad_blob", f"inline bytes are not blob {ref.digest[:64]!r} of {ref.size} bytes")

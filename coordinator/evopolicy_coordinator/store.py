@@ -1,0 +1,359 @@
+"""The database: every row that the core persists, and nothing else.
+
+Rules that this module owns:
+- WAL with synchronous=FULL: when `write` returns, its rows survive a power cut; when it raises, none of them are there.
+- One connection writes (`Store`, from one thread); any number read (`Reader`, a connection a thread).
+- A row is its msgpack bytes plus the columns it is found by. The schema's version is in `user_version`; an older file
+  is migrated when opened, a newer one is refused.
+- What a gateway may fetch by digest is written down with the outcome that names it (`train_blobs`), in the same
+  transaction.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_coordinator.core import records
+from evopolicy_coordinator.core.records import (
+    EvaluationRow,
+    FinishedRow,
+    OutcomeHead,
+    OutcomeRow,
+    Row,
+    RunRow,
+    RunStateRow,
+    Snapshot,
+    StrikeRow,
+    SubmitRow,
+    WorkerRow,
+)
+
+T = TypeVar("T")
+
+_MIGRATIONS: tuple[str, ...] = (
+    """
+    CREATE TABLE meta (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
+    INSERT INTO meta VALUES ('incarnation', 0);
+    CREATE TABLE runs (run TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, data BLOB NOT NULL);
+    CREATE TABLE run_states (run TEXT PRIMARY KEY, phase TEXT NOT NULL, data BLOB NOT NULL);
+    CREATE TABLE submits (
+        run TEXT NOT NULL, submit_index INTEGER NOT NULL, key TEXT NOT NULL, data BLOB NOT NULL,
+        PRIMARY KEY (run, submit_index), UNIQUE (run, key)
+    );
+    CREATE TABLE outcomes (
+        grp TEXT NOT NULL, idx INTEGER NOT NULL, seq INTEGER NOT NULL, head BLOB NOT NULL, data BLOB NOT NULL,
+        PRIMARY KEY (grp, idx)
+    );
+    CREATE UNIQUE INDEX outcomes_by_arrival ON outcomes (grp, seq);
+    CREATE TABLE train_blobs (run TEXT NOT NULL, digest TEXT NOT NULL, PRIMARY KEY (run, digest)) WITHOUT ROWID;
+    CREATE TABLE strikes (
+        grp TEXT NOT NULL, lease_id TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, lease_id)
+    );
+    CREATE TABLE evaluations (
+        evaluation TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, finished INTEGER NOT NULL, data BLOB NOT NULL
+    );
+    CREATE TABLE finished (run TEXT PRIMARY KEY, data BLOB NOT NULL);
+    CREATE TABLE workers (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
+    """,
+)
+SCHEMA_VERSION = len(_MIGRATIONS)
+
+_encode = msgspec.msgpack.Encoder().encode
+_outcomes = msgspec.msgpack.Decoder(OutcomeRow)
+_heads = msgspec.msgpack.Decoder(OutcomeHead)
+_submits = msgspec.msgpack.Decoder(SubmitRow)
+_finished = msgspec.msgpack.Decoder(FinishedRow)
+
+
+class Store:
+    """The writing connection. Not to be shared by threads at the same time."""
+
+    def __init__(self, path: Path) -> None:
+        """Opens or makes the database, migrating an older one.
+
+        ConfigError when the file is of a newer version or no database, StorageError when the disk refuses.
+        """
+        self._path = path
+        self._db = _connect(path)
+        try:
+            _guard(path, self._prepare)
+        except BaseException:
+            self._db.close()
+            raise
+
+    def _prepare(self) -> None:
+        self._db.execute("PRAGMA journal_mode=WAL")
+        self._db.execute("PRAGMA synchronous=FULL")
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if version > SCHEMA_VERSION:
+            raise ConfigError(
+                f"{self._path} is of schema version {version}, this program knows {SCHEMA_VERSION}: use the newer program"
+            )
+        for number in range(version, SCHEMA_VERSION):
+            script = f"BEGIN IMMEDIATE; {_MIGRATIONS[number]} PRAGMA user_version={number + 1}; COMMIT;"
+            self._db.executescript(script)
+
+    def write(self, rows: Iterable[Row]) -> None:
+        """Writes all rows in one durable transaction; StorageError when it could not, and then none of them."""
+        _guard(self._path, lambda: self._write(rows))
+
+    def _write(self, rows: Iterable[Row]) -> None:
+        db = self._db
+        try:
+            db.execute("BEGIN IMMEDIATE")
+            for row in rows:
+                _WRITERS[type(row)](db, row)
+            db.execute("COMMIT")
+        except BaseException:
+            if db.in_transaction:
+                db.execute("ROLLBACK")
+            raise
+
+    def load(self) -> Snapshot:
+        """Counts one more incarnation, durably, and reads what a core starts from."""
+        return _guard(self._path, self._load)
+
+    def _load(self) -> Snapshot:
+        db = self._db
+        try:
+            db.execute("BEGIN IMMEDIATE")
+            db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
+            db.execute("COMMIT")
+        except BaseException:
+            if db.in_transaction:
+                db.execute("ROLLBACK")
+            raise
+        db.execute("BEGIN")
+        try:
+            return self._snapshot()
+        finally:
+            db.execute("ROLLBACK")
+
+    def _snapshot(self) -> Snapshot:
+        db = self._db
+        incarnation = db.execute("SELECT value FROM meta WHERE name = 'incarnation'").fetchone()[0]
+        live_runs = "SELECT run FROM run_states WHERE phase != 'finished'"
+        submits = _rows(db, SubmitRow, f"SELECT data FROM submits WHERE run IN ({live_runs})")
+        evaluations = _rows(db, EvaluationRow, "SELECT data FROM evaluations")
+        groups = [
+            group
+            for submit in submits
+            for group in (
+                records.train_group(submit.run, submit.submit_index),
+                records.validation_group(submit.run, submit.submit_index),
+                records.heldout_group(submit.run, submit.submit_index),
+            )
+        ]
+        groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
+        groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
+        outcomes: list[OutcomeHead] = []
+        strikes: list[StrikeRow] = []
+        for group in groups:
+            heads = db.execute("SELECT head FROM outcomes WHERE grp = ? ORDER BY seq", (group,))
+            outcomes.extend(_heads.decode(head) for (head,) in heads)
+            strikes.extend(_rows(db, StrikeRow, "SELECT data FROM strikes WHERE grp = ?", (group,)))
+        return Snapshot(
+            incarnation=incarnation,
+            runs=_rows(db, RunRow, "SELECT data FROM runs"),
+            states=_rows(db, RunStateRow, "SELECT data FROM run_states"),
+            submits=submits,
+            outcomes=tuple(outcomes),
+            strikes=tuple(strikes),
+            evaluations=evaluations,
+            workers=_rows(db, WorkerRow, "SELECT data FROM workers"),
+        )
+
+    def close(self) -> None:
+        """Folds the write-ahead log into the database where it can, and closes."""
+        try:
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.Error:
+            # All is durable in the log; the next start folds it in.
+            pass
+        self._db.close()
+
+
+class OutcomePage(msgspec.Struct, frozen=True):
+    """Some outcomes of a group, in order of arrival."""
+
+    rows: tuple[OutcomeRow, ...]
+    cursor: int
+    """One past the last row's `seq`; what was asked from where there is none."""
+
+
+class Reader:
+    """A reading connection, for one thread; sees what is durable."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._db = _connect(path, read_only=True)
+
+    def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> OutcomePage:
+        """Outcomes with cursor ≤ seq < upto, from the first on, up to `max_bytes` of rows but at least one."""
+
+        def read() -> OutcomePage:
+            rows: list[OutcomeRow] = []
+            total = 0
+            found = self._db.execute(
+                "SELECT data FROM outcomes WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq",
+                (group, cursor, upto),
+            )
+            for (data,) in found:
+                total += len(data)
+                if rows and total > max_bytes:
+                    break
+                rows.append(_outcomes.decode(data))
+            return OutcomePage(tuple(rows), rows[-1].seq + 1 if rows else cursor)
+
+        return _guard(self._path, read)
+
+    def submit(self, run: str, submit_index: int) -> SubmitRow | None:
+        """The submit's row as it is now; None when there is none."""
+        return self._one(
+            _submits, "SELECT data FROM submits WHERE run = ? AND submit_index = ?", (run, submit_index)
+        )
+
+    def finished(self, run: str) -> RunFinished | None:
+        """What came of a run; None while it is not finished."""
+        row = self._one(_finished, "SELECT data FROM finished WHERE run = ?", (run,))
+        return None if row is None else row.result
+
+    def names_blob(self, run: str, digest: str) -> bool:
+        """Whether the train feedback of `run` names the blob."""
+
+        def read() -> bool:
+            query = "SELECT 1 FROM train_blobs WHERE run = ? AND digest = ?"
+            return self._db.execute(query, (run, digest)).fetchone() is not None
+
+        return _guard(self._path, read)
+
+    def _one(self, decoder: msgspec.msgpack.Decoder[T], query: str, args: tuple[Any, ...]) -> T | None:
+        def read() -> T | None:
+            found = self._db.execute(query, args).fetchone()
+            return None if found is None else decoder.decode(found[0])
+
+        return _guard(self._path, read)
+
+    def close(self) -> None:
+        self._db.close()
+
+
+def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+    try:
+        db = sqlite3.connect(
+            f"{path.absolute().as_uri()}?mode={'ro' if read_only else 'rwc'}",
+            uri=True,
+            timeout=10.0,
+            isolation_level=None,
+            # A connection is used by one thread at a time, but may be opened by another.
+            check_same_thread=False,
+        )
+    except sqlite3.Error as error:
+        raise StorageError(f"cannot open {path}: {error}") from error
+    if not read_only:
+        path.chmod(0o600)
+    return db
+
+
+def _guard(path: Path, work: Callable[[], T]) -> T:
+    """`work()`, with SQLite's errors told as ours."""
+    try:
+        return work()
+    except sqlite3.OperationalError as error:
+        raise StorageError(f"{path}: {error}") from error
+    except sqlite3.IntegrityError as error:
+        raise StorageError(f"{path} refuses a row that contradicts another: {error}") from error
+    except sqlite3.DatabaseError as error:
+        raise StorageError(f"{path} cannot be used: {error}; restore it from a backup") from error
+    except msgspec.DecodeError as error:
+        raise StorageError(f"{path} holds a row that cannot be read: {error}") from error
+
+
+def _rows(db: sqlite3.Connection, kind: type[T], query: str, args: tuple[Any, ...] = ()) -> tuple[T, ...]:
+    decoder = msgspec.msgpack.Decoder(kind)
+    return tuple(decoder.decode(data) for (data,) in db.execute(query, args))
+
+
+def _upsert(table: str, columns: str, key: str) -> str:
+    """An insert that replaces the row of the same key, and fails where another unique column clashes."""
+    names = columns.split(", ")
+    changed = ", ".join(f"{name} = excluded.{name}" for name in names if name not in key.split(", "))
+    marks = ", ".join("?" for _ in names)
+    return f"INSERT INTO {table} ({columns}) VALUES ({marks}) ON CONFLICT ({key}) DO UPDATE SET {changed}"
+
+
+_RUN = _upsert("runs", "run, key, data", "run")
+_RUN_STATE = _upsert("run_states", "run, phase, data", "run")
+_SUBMIT = _upsert("submits", "run, submit_index, key, data", "run, submit_index")
+_OUTCOME = _upsert("outcomes", "grp, idx, seq, head, data", "grp, idx")
+_STRIKE = _upsert("strikes", "grp, lease_id, data", "grp, lease_id")
+_EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
+_FINISHED = _upsert("finished", "run, data", "run")
+_WORKER = _upsert("workers", "worker, data", "worker")
+
+
+def _write_run(db: sqlite3.Connection, row: RunRow) -> None:
+    db.execute(_RUN, (row.run, row.key, _encode(row)))
+
+
+def _write_run_state(db: sqlite3.Connection, row: RunStateRow) -> None:
+    db.execute(_RUN_STATE, (row.run, row.phase, _encode(row)))
+
+
+def _write_submit(db: sqlite3.Connection, row: SubmitRow) -> None:
+    db.execute(_SUBMIT, (row.run, row.submit_index, row.key, _encode(row)))
+
+
+def _write_outcome(db: sqlite3.Connection, row: OutcomeRow) -> None:
+    db.execute(_OUTCOME, (row.group, row.index, row.seq, _encode(records.head_of(row)), _encode(row)))
+    run = train_run(row.group)
+    if run is not None:
+        for ref in stored_blobs(row.outcome):
+            db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
+
+
+def _write_strike(db: sqlite3.Connection, row: StrikeRow) -> None:
+    db.execute(_STRIKE, (row.group, row.lease_id, _encode(row)))
+
+
+def _write_evaluation(db: sqlite3.Connection, row: EvaluationRow) -> None:
+    db.execute(_EVALUATION, (row.evaluation, row.key, int(row.finished), _encode(row)))
+
+
+def _write_finished(db: sqlite3.Connection, row: FinishedRow) -> None:
+    db.execute(_FINISHED, (row.run, _encode(row)))
+
+
+def _write_worker(db: sqlite3.Connection, row: WorkerRow) -> None:
+    db.execute(_WORKER, (row.worker, _encode(row)))
+
+
+_WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
+    RunRow: _write_run,
+    RunStateRow: _write_run_state,
+    SubmitRow: _write_submit,
+    OutcomeRow: _write_outcome,
+    StrikeRow: _write_strike,
+    EvaluationRow: _write_evaluation,
+    FinishedRow: _write_finished,
+    WorkerRow: _write_worker,
+}
+
+
+def train_run(group: str) -> str | None:
+    """The run whose train episodes `group` holds; None for every other group."""
+    head, _, kind = group.rpartition("/")
+    return head.rpartition("/")[0] if kind == "train" else None
+
+
+def stored_blobs(outcome: EpisodeOutcome) -> tuple[BlobRef, ...]:
+    """The blobs that the outcome names without carrying them."""
+    return tuple(ref for ref in (outcome.trajectory, outcome.video) if ref is not None and ref.inline is None)
