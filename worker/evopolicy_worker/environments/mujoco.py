@@ -1,8 +1,16 @@
-"""Gymnasium's MuJoCo environments."""
+"""Gymnasium's MuJoCo environments, and what every family that draws with MuJoCo needs."""
 
 from __future__ import annotations
 
+import ctypes.util
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+
+if TYPE_CHECKING:
+    import gymnasium
 
 
 class MujocoFamily(GymnasiumFamily):
@@ -14,6 +22,15 @@ class MujocoFamily(GymnasiumFamily):
         "Ant-v5": ("reward_forward", "reward_ctrl", "reward_contact", "reward_survive"),
         "Pusher-v5": ("reward_dist", "reward_ctrl", "reward_near"),
     }
+
+    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+        """As others; WorkerError where a picture is asked for and the host has no EGL to draw it."""
+        if render and ctypes.util.find_library("EGL") is None:
+            raise WorkerError(
+                f"{entry.id} renders with EGL, which is not installed: apt-get install libegl1 libegl-mesa0 "
+                "libgl1-mesa-dri"
+            )
+        return super().make(entry, render=render)
 
 
 FAMILY = MujocoFamily()

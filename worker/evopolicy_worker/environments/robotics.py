@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.mujoco import MujocoFamily
 
 if TYPE_CHECKING:
     import gymnasium
 
 
-class RoboticsFamily(GymnasiumFamily):
+class RoboticsFamily(MujocoFamily):
     distributions = ("gymnasium-robotics", "mujoco")
     modules = ("gymnasium", "mujoco", "gymnasium_robotics")
+    components = {}
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture; the callback that moves the target's marker also runs the forward dynamics, so both are put back.

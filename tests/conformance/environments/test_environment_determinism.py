@@ -1,0 +1,134 @@
+"""The same case and the same actions give the same episode, bit for bit, wherever and after whatever it is played."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from environment_checks import SEED, STEPS, play
+
+from evopolicy_common.catalogue import entry
+from evopolicy_common.messages.environment import Case
+from evopolicy_worker.environments import Environment, make, offered, process_environment
+from evopolicy_worker.environments.box2d import Box2DFamily
+
+IDS = offered()
+Warm = Callable[[str], Environment]
+
+
+def fresh_episode(env_id: str) -> list[str]:
+    environment = make(env_id)
+    try:
+        return play(environment)
+    finally:
+        environment.close()
+
+
+@pytest.fixture(scope="session")
+def elsewhere() -> dict[str, list[str]]:
+    """Episodes of all ids, played in one other process, each after those of all ids behind it in the catalogue."""
+    result = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("environment_checks.py")), "play"],
+        env={"PATH": os.environ["PATH"], **process_environment()},
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    played: dict[str, list[str]] = json.loads(result.stdout)
+    return played
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_reused_environment_plays_the_same_episode_as_a_fresh_one(env_id: str, warm: Warm) -> None:
+    fresh = fresh_episode(env_id)
+    environment = warm(env_id)
+    for earlier in (3, 4):
+        play(environment, seed=earlier)
+    assert play(environment) == fresh
+    assert play(environment) == fresh
+    play(environment, seed=5, steps=3)  # abandoned in the middle
+    assert play(environment) == fresh
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_another_process_plays_the_same_episode(env_id: str, elsewhere: dict[str, list[str]]) -> None:
+    assert fresh_episode(env_id) == elsewhere[env_id]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_other_seeds_give_other_episodes(env_id: str, warm: Warm) -> None:
+    first = {play(warm(env_id), seed=seed, steps=2)[0] for seed in range(4)}
+    assert len(first) > 1 or len({tuple(play(warm(env_id), seed=seed, steps=20)) for seed in range(4)}) > 1
+
+
+def test_the_check_notices_a_walker_that_is_not_rebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    fresh = fresh_episode("gym/bipedal")
+    monkeypatch.setattr(Box2DFamily, "rebuilds", lambda self, entry: False)
+    environment = make("gym/bipedal")
+    for earlier in range(5):
+        play(environment, seed=earlier)
+    assert play(environment) != fresh
+    environment.close()
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in IDS if not env_id.startswith("toy/")])
+def test_the_adapter_plays_as_the_bare_environment_does(env_id: str, warm: Warm) -> None:
+    import gymnasium
+
+    environment = warm(env_id)
+    environment.reset(Case(seed=SEED))  # imports and registers what the bare one needs
+    with pytest.warns(DeprecationWarning) if "roundabout" in env_id else nullcontext():
+        bare = gymnasium.make(str(entry(env_id).gymnasium_id), disable_env_checker=True)
+    rng = np.random.default_rng(SEED)
+    _assert_same(environment.reset(Case(seed=SEED)), bare.reset(seed=SEED)[0])
+    for _ in range(STEPS.get(env_id, 80)):
+        action = environment.action_codec.sample(rng)
+        obs, reward, terminated, truncated, _ = bare.step(action)
+        step = environment.step(action)
+        _assert_same(step.obs, obs)
+        assert (step.reward, step.terminated, step.truncated) == (float(reward), terminated, truncated)
+        if terminated or truncated:
+            break
+    bare.close()
+
+
+def _assert_same(ours: object, bare: object) -> None:
+    if isinstance(ours, dict):
+        assert isinstance(bare, dict)
+        assert ours.keys() == bare.keys()
+        for key, value in ours.items():
+            _assert_same(value, bare[key])
+    elif isinstance(ours, np.ndarray):
+        assert np.array_equal(ours, np.asarray(bare), equal_nan=True)
+    else:
+        assert ours == bare
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_observations_are_not_written_again_by_later_steps(env_id: str, warm: Warm) -> None:
+    environment = warm(env_id)
+    rng = np.random.default_rng(1)
+    kept, copies = [environment.reset(Case(seed=1))], []
+    copies.append(_copy(kept[0]))
+    for _ in range(3):
+        kept.append(environment.step(environment.action_codec.sample(rng)).obs)
+        copies.append(_copy(kept[-1]))
+    environment.reset(Case(seed=2))
+    for obs, copy in zip(kept, copies, strict=True):
+        _assert_same(obs, copy)
+
+
+def _copy(obs: object) -> object:
+    if isinstance(obs, dict):
+        return {key: _copy(value) for key, value in obs.items()}
+    return obs.copy() if isinstance(obs, np.ndarray) else obs

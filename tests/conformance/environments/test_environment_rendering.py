@@ -1,0 +1,67 @@
+"""Every environment renders without a display, and rendering changes nothing of the episode."""
+
+from __future__ import annotations
+
+import ctypes.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from environment_checks import FRAMES, play
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_worker.environments import make, offered, process_environment
+
+DRAWS_WITH_EGL = [env_id for env_id in offered() if env_id.endswith("5") or "Fetch" in env_id]
+DRAWABLE = [env_id for env_id in offered() if env_id not in DRAWS_WITH_EGL or ctypes.util.find_library("EGL")]
+
+
+@pytest.fixture(scope="session")
+def rendered() -> dict[str, list[str]]:
+    """Episodes of all ids with a frame per step. In a process of its own: the driver is chosen at its start."""
+    result = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("environment_checks.py")), "render", *DRAWABLE],
+        env={"PATH": os.environ["PATH"], **process_environment(render=True)},
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    played: dict[str, list[str]] = json.loads(result.stdout)
+    return played
+
+
+@pytest.mark.parametrize("env_id", DRAWABLE)
+def test_rendering_changes_nothing_of_the_episode(env_id: str, rendered: dict[str, list[str]]) -> None:
+    environment = make(env_id)
+    assert play(environment, steps=FRAMES) == rendered[env_id]
+    environment.close()
+
+
+@pytest.mark.parametrize("env_id", DRAWABLE)
+def test_a_frame_is_a_picture(env_id: str, rendered: dict[str, list[str]]) -> None:
+    height, width, channels, darkest, brightest = json.loads(rendered[f"{env_id} frame"][0])
+    assert min(height, width) >= 32
+    assert channels == 3
+    assert brightest - darkest > 50, "nothing is drawn"
+
+
+@pytest.mark.parametrize("env_id", DRAWS_WITH_EGL)
+def test_without_egl_a_rendering_environment_says_what_to_install(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    with pytest.raises(WorkerError, match="libegl1"):
+        make(env_id, render=True)
+
+
+@pytest.mark.parametrize("env_id", ["gym/acrobot", "toy/line", "gymnasium/FetchPush-v4"])
+def test_an_environment_not_made_to_render_refuses_to(env_id: str) -> None:
+    environment = make(env_id)
+    with pytest.raises(WorkerError, match="render=True"):
+        environment.render()
+    environment.close()
