@@ -18,7 +18,7 @@ import msgspec
 
 from evopolicy_common import catalogue, codec, keys
 from evopolicy_common.blobs import BlobStore, digest_of, is_digest
-from evopolicy_common.errors import ConfigError, RefusedError
+from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef
@@ -114,6 +114,17 @@ class Intake:
         capability = rights.capability(run)
         _check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
         return Parsed("gw", run, message)
+
+    def asks_for_change(self, key: str, payload: bytes) -> bool:
+        """Whether the request would make something new (a run, a submit, an evaluation); its token is not looked at."""
+        room = key.removeprefix(self._prefix).partition("/")[0]
+        try:
+            if room == "gw":
+                return isinstance(codec.decode(codec.gateway_requests, payload), gateway.Submit)
+            wanted = operator.CreateRun | operator.Evaluate
+            return room == "ops" and isinstance(codec.decode(codec.operator_requests, payload), wanted)
+        except ProtocolError:
+            return False
 
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
         """The event that the request is for the core; RefusedError when it cannot be served as it is.

@@ -351,7 +351,7 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
 def train_run(group: str) -> str | None:
     """The run whose train episodes `group` holds; None for every other group."""
     head, _, kind = group.rpartition("/")
-    return head.rpartition("/")[0] if kind == "train" else None
+    return (head.rpartition("/")[0] or None) if kind == "train" else None
 
 
 def stored_blobs(outcome: EpisodeOutcome) -> tuple[BlobRef, ...]:

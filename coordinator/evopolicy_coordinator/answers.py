@@ -1,0 +1,157 @@
+"""Answers that are read from the store or the blob folder, on threads of their own, and sent from there.
+
+Rules that this module owns:
+- A gateway's page is made of the train outcomes of its own run and of nothing else; what an `EpisodeOutcome` holds
+  beyond `EpisodeFeedback` (wall times, CPU) does not travel.
+- A page never grows past `MAX_PAGE_BYTES` (unless one episode does), so no reply holds up its lane for long.
+- The chunks of one blob are written by one thread, in order.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from zlib import crc32
+
+import structlog
+
+from evopolicy_common import codec
+from evopolicy_common.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.errors import StorageError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
+from evopolicy_common.messages.operator import EvaluationPage, RunProgress
+from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_coordinator.core import records
+from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.store import Reader
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+MAX_PAGE_BYTES = 256 << 10
+_READERS = 2
+_BLOB_LANES = 4
+_NO_BYTES = BlobRef(digest=digest_of(b""), size=0, inline=b"")
+
+Answer = Callable[[Message | None], None]
+"""Sends the answer, from any thread; None ends the query without one, so that it is asked again."""
+
+
+class Answers:
+    """Reads pages and blobs. Every method returns at once; the answer is given later, from a thread."""
+
+    def __init__(self, database: Path, blobs: BlobStore) -> None:
+        self._database = database
+        self._blobs = blobs
+        self._local = threading.local()
+        self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
+        self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
+
+    def page(self, effect: ReadResults | ReadEvaluation | ReadFinished, answer: Answer) -> None:
+        """Answers a read that the core asked for."""
+        self._pages.submit(self._answer, lambda: self._page(effect), answer)
+
+    def put(self, sender: str, message: BlobPut, max_bytes: int, answer: Answer) -> None:
+        """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check."""
+        self._lane(message.digest).submit(self._answer, lambda: self._put(sender, message, max_bytes), answer)
+
+    def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
+        """Sends one chunk of a blob; with `run`, only of one that this run's train feedback names."""
+        self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
+
+    def close(self) -> None:
+        for pool in (self._pages, *self._lanes):
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _lane(self, digest: str) -> ThreadPoolExecutor:
+        return self._lanes[crc32(digest.encode()) % _BLOB_LANES]
+
+    def _answer(self, work: Callable[[], Message], answer: Answer) -> None:
+        try:
+            answer(work())
+        except StorageError as error:
+            # Ours to mend: whoever asked asks again.
+            log.error("cannot answer from the store", error=str(error))
+            answer(None)
+        except Exception:
+            log.exception("cannot answer")
+            answer(None)
+
+    @property
+    def _reader(self) -> Reader:
+        if not hasattr(self._local, "reader"):
+            self._local.reader = Reader(self._database)
+        reader: Reader = self._local.reader
+        return reader
+
+    def _page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Message:
+        if isinstance(effect, ReadResults):
+            return self._results(effect)
+        if isinstance(effect, ReadEvaluation):
+            return self._evaluation(effect)
+        finished = self._reader.finished(effect.run)
+        if finished is None:
+            return Refused(status="unknown_run", message=f"run {effect.run!r} has no outcome")
+        done = len(finished.heldout_returns)
+        return RunProgress(phase="finished", done=done, total=done, finished=finished)
+
+    def _results(self, effect: ReadResults) -> Message:
+        row = self._reader.submit(effect.run, effect.submit_index)
+        if row is None:
+            return Refused(status="unknown_submit", message=f"this run has no submit {effect.submit_index}")
+        upto = row.released if effect.upto is None else effect.upto
+        group = records.train_group(effect.run, effect.submit_index)
+        page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
+        return ResultsPage(
+            cursor=page.cursor,
+            episodes=tuple(feedback(found.outcome) for found in page.rows),
+            done=records.submit_done(row) if page.cursor >= upto else None,
+            waits_for=effect.waits_for,
+        )
+
+    def _evaluation(self, effect: ReadEvaluation) -> Message:
+        group = records.evaluation_group(effect.evaluation)
+        page = self._reader.outcomes(group, effect.cursor, effect.upto, MAX_PAGE_BYTES)
+        return EvaluationPage(
+            cursor=page.cursor,
+            total=effect.total,
+            outcomes=tuple(found.outcome for found in page.rows),
+            finished=effect.finished and page.cursor >= effect.upto,
+            waits_for=effect.waits_for,
+        )
+
+    def _put(self, sender: str, message: BlobPut, max_bytes: int) -> Message:
+        if not is_digest(message.digest):
+            return Refused(status="bad_blob", message=f"{message.digest[:80]!r} is no SHA-256 digest")
+        if not 0 <= message.size <= max_bytes:
+            return Refused(
+                status="bad_blob", message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
+            )
+        have = self._blobs.append_chunk(sender, message.digest, message.size, message.offset, message.data)
+        return BlobAck(have=have)
+
+    def _get(self, run: str | None, message: BlobGet) -> Message:
+        known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
+        if not known or not self._blobs.has(message.digest):
+            return Refused(status="unknown_blob", message=f"no blob {message.digest[:80]!r} here")
+        size = self._blobs.size(message.digest)
+        return BlobChunk(
+            size=size, data=self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
+        )
+
+
+def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
+    """What an agent may see of a train episode."""
+    return EpisodeFeedback(
+        index=outcome.index,
+        episode_return=outcome.episode_return,
+        length=outcome.length,
+        failure=outcome.failure,
+        reward_components=outcome.reward_components,
+        trajectory=outcome.trajectory or _NO_BYTES,
+        video=outcome.video,
+        stdout=outcome.stdout,
+        stderr=outcome.stderr,
+    )

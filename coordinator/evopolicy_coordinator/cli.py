@@ -1,0 +1,105 @@
+"""`evopolicy-coordinator`: the process that owns budgets, hidden cases, queue, checkpoints and results."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from evopolicy_common.blobs import write_atomically
+from evopolicy_common.cli import fail_on_our_errors, setup_logging
+from evopolicy_common.credentials import default_state_dir
+from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator import process
+from evopolicy_coordinator.process import Options, Ready
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: evopolicy-coordinator --listen tcp/0.0.0.0:7447 --state /var/lib/evopolicy")
+def serve(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Endpoint for other machines, such as tcp/0.0.0.0:7447 (port 0: a free one); may be repeated. "
+            "A unix socket in the state folder is always listened on."
+        ),
+    ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of everything that must survive [$EVOPOLICY_STATE or the user's state home]."
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of split files (see `evopolicy data`); default: splits from a secret in the state."
+        ),
+    ] = None,
+    cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
+    allow_package: Annotated[
+        list[str] | None,
+        typer.Option(help="Package that the workers let policies import beside numpy; may be repeated."),
+    ] = None,
+    ready_file: Annotated[
+        Path | None,
+        typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
+    ] = None,
+    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+) -> None:
+    """Coordinates a cluster: workers and gateways connect to it, with the credentials that it writes.
+
+    SIGTERM or Ctrl-C: makes everything durable and exits; started again on the same folder, it goes on where it was.
+    """
+    with fail_on_our_errors():
+        if log_level not in ("debug", "info", "warning", "error"):
+            raise ConfigError(f"--log-level {log_level!r}: say debug, info, warning or error")
+        setup_logging(log_level)
+        options = Options(
+            state=state or default_state_dir(),
+            data=data,
+            listen=tuple(listen or ()),
+            cluster=cluster,
+            allowed_packages=tuple(allow_package or ()),
+        )
+        try:
+            asyncio.run(_run(options, ready_file))
+        finally:
+            if ready_file is not None:
+                ready_file.unlink(missing_ok=True)
+
+
+async def _run(options: Options, ready_file: Path | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+    def on_ready(ready: Ready) -> None:
+        if ready_file is not None:
+            write_atomically(ready_file, msgspec.json.format(msgspec.json.encode(ready)) + b"\n", mode=0o600)
+        print(_ready_line(ready), flush=True)
+
+    await process.run(options, stop, on_ready)
+
+
+def _ready_line(ready: Ready) -> str:
+    where = " ".join(f"--connect {endpoint}" for endpoint in ready.endpoints[-1:])
+    return (
+        f"ready: cluster {ready.cluster}, state {ready.state}; workers join with:"
+        f" evopolicy-worker --env core16 {where} --credentials {ready.credentials['worker']}"
+    )
+
+
+def main() -> None:
+    """The console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

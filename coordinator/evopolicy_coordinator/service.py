@@ -1,0 +1,355 @@
+"""The coordinator's shell: queries in, effects out, around the pure core.
+
+Rules that this module owns:
+- The event loop never waits for a disk, a socket or a lock: the database has the writer's thread, pages and blobs have
+  theirs, answers are sent by the transport's.
+- Every batch of queries is one tick: all its events are handled, then its effects go to the outbox, so that one fsync
+  serves them all.
+- When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
+  the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
+  are asked again.
+- `now` is Unix time at the start, advanced by the monotonic clock: a wall clock that is set changes nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from zlib import crc32
+
+import msgspec
+import structlog
+
+from evopolicy_common import bundles, codec
+from evopolicy_common.blobs import BlobStore
+from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
+from evopolicy_common.messages import operator
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Message, Refused
+from evopolicy_common.transport import IncomingQuery
+from evopolicy_coordinator.answers import Answer, Answers
+from evopolicy_coordinator.core import Core
+from evopolicy_coordinator.core.effects import Effect, Log, ReadEvaluation, ReadFinished, ReadResults, Reply
+from evopolicy_coordinator.core.events import AnyEvent, LivenessLost
+from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.intake import Intake, Parsed
+from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.watchdog import LoopWatchdog
+from evopolicy_coordinator.writer import Outbox, Writer
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
+MAX_BLOB_BYTES = 1 << 30
+_FIRST_PAUSE_S = 0.2
+_LONGEST_PAUSE_S = 5.0
+_READS_FILES = (operator.CreateRun, operator.Evaluate)
+
+
+class _Pending(msgspec.Struct, frozen=True):
+    """A query that waits for its answer."""
+
+    query: IncomingQuery
+    asker: str
+
+
+class Service:
+    """One coordinator's life on an event loop: `start`, then `on_queries` for each batch, at last `stop`."""
+
+    def __init__(
+        self, store: Store, answers: Answers, blobs: BlobStore, intake: Intake, settings: CoreSettings
+    ) -> None:
+        """To be made on the event loop. The store is the service's from now on; `stop` does not close it."""
+        self._answers = answers
+        self._blobs = blobs
+        self._intake = intake
+        self._settings = settings
+        self._loop = asyncio.get_running_loop()
+        self._writer = Writer(store)
+        self._outbox: Outbox | None = None
+        self._core: Core | None = None
+        self._pending: dict[int, _Pending] = {}
+        self._n_requests = 0
+        self._incarnation = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._reload_pause_s = _FIRST_PAUSE_S
+        self._storage_error = ""
+        self._stopping = False
+        self._unix_offset = time.time() - self._loop.time()
+        self._watchdog: LoopWatchdog | None = None
+        self.n_events = 0
+
+    async def start(self) -> None:
+        """Loads the core from the store; StorageError when that cannot be read or counted up."""
+        await self._load()
+        self._watchdog = LoopWatchdog()
+
+    async def stop(self) -> None:
+        """Takes nothing more, makes durable what was handled, answers it, and ends every other query.
+
+        Stopping again does nothing.
+        """
+        if self._stopping:
+            return
+        self._stopping = True
+        self._cancel_timer()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        while self._outbox is not None and not self._outbox.idle:
+            # Comes back after everything that was submitted before it, and what that set going is next.
+            await self._writer.call(lambda store: None)
+        self._drop_pending()
+        await self._writer.close()
+        await asyncio.to_thread(self._answers.close)
+        if self._watchdog is not None:
+            self._watchdog.close()
+
+    def now(self) -> float:
+        """Unix time that never goes back, seconds."""
+        return self._unix_offset + self._loop.time()
+
+    # Queries in.
+
+    def on_queries(self, batch: list[IncomingQuery]) -> None:
+        """Handles one tick's queries."""
+        for query in batch:
+            self._receive(query)
+        self._flush()
+
+    def on_liveliness(self, key: str, alive: bool) -> None:
+        """A worker's token came or went."""
+        worker = key.rsplit("/", 2)[-2]
+        log.debug("liveliness", worker=worker, alive=alive)
+        if not alive and self._core is not None and not self._stopping:
+            self._handle(LivenessLost(stimulus_id=self._stimulus("liveness"), worker=worker))
+            self._flush()
+
+    def _receive(self, query: IncomingQuery) -> None:
+        core = self._core
+        if core is None or self._stopping:
+            self._turn_away(query)
+            return
+        try:
+            parsed = self._intake.parse(query.key, query.payload, core)
+            self._serve(core, query, parsed)
+        except RefusedError as error:
+            self._refuse(query, error)
+        except ProtocolError as error:
+            self._refuse(query, RefusedError("bad_message", str(error)))
+        except Exception:
+            # A bug of ours must not take the service down with it; the asker hears at once and may ask again.
+            log.exception("request failed", key=query.key)
+            query.drop()
+
+    def _serve(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        message = parsed.message
+        if isinstance(message, BlobPut):
+            self._serve_put(core, query, parsed, message)
+        elif isinstance(message, BlobGet):
+            self._serve_get(core, query, parsed, message)
+        elif isinstance(message, operator.StatusRequest):
+            query.reply(codec.encode(core.status(self.now())), _lane(parsed.asker))
+        elif isinstance(message, _READS_FILES):
+            self._spawn(self._serve_from_thread(query, parsed))
+        else:
+            request = self._admit(query, parsed)
+            try:
+                event = self._intake.event(parsed, request, self._stimulus_of(message))
+            except BaseException:
+                self._take(request)
+                raise
+            self._handle(event)
+
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
+        """For requests whose event is made from files."""
+        request = self._admit(query, parsed)
+        stimulus = self._stimulus_of(parsed.message)
+        try:
+            event = await asyncio.to_thread(self._intake.event, parsed, request, stimulus)
+        except RefusedError as error:
+            self._take(request)
+            self._refuse(query, error)
+            return
+        if request in self._pending:  # else the core was dropped meanwhile, and the query with it
+            self._handle(event)
+            self._flush()
+
+    def _admit(self, query: IncomingQuery, parsed: Parsed) -> int:
+        self._n_requests += 1
+        self._pending[self._n_requests] = _Pending(query, parsed.asker)
+        return self._n_requests
+
+    def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
+        if parsed.room == "work" and not core.knows_session(parsed.asker, message.token):
+            raise RefusedError(
+                "unknown_worker", f"worker {parsed.asker!r} has no such session; register again"
+            )
+        most = MAX_BLOB_BYTES if parsed.room == "work" else MAX_BUNDLE_BYTES
+        self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, _answer_to(query, parsed.asker))
+
+    def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
+        if parsed.room == "work":
+            if not core.knows_session(parsed.asker, message.token):
+                raise RefusedError(
+                    "unknown_worker", f"worker {parsed.asker!r} has no such session; register again"
+                )
+            if not core.holds_bundle(parsed.asker, message.digest):
+                raise RefusedError(
+                    "unknown_blob", f"worker {parsed.asker!r} holds no job of {message.digest[:64]!r}"
+                )
+        run = parsed.asker if parsed.room == "gw" else None
+        self._answers.get(run, message, _answer_to(query, parsed.asker))
+
+    def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
+        log.info("refused", key=query.key, status=error.status, why=error.message)
+        query.reply(codec.encode(Refused(status=error.status, message=error.message)))
+
+    def _turn_away(self, query: IncomingQuery) -> None:
+        """Without a core nothing can be served; who would change something is told why."""
+        if self._storage_error and self._intake.asks_for_change(query.key, query.payload):
+            why = f"the coordinator cannot write its store and takes nothing new: {self._storage_error}"
+            query.reply(codec.encode(Refused(status="unavailable", message=why)))
+        else:
+            query.drop()
+
+    def _stimulus_of(self, message: Message) -> str:
+        return self._stimulus(type(message).__name__.lower())
+
+    def _stimulus(self, what: str) -> str:
+        self.n_events += 1
+        return f"{what}-{self._incarnation}.{self.n_events}"
+
+    # The core.
+
+    def _handle(self, event: AnyEvent) -> None:
+        self._advance(lambda core: core.handle(event, self.now()))
+
+    def _advance(self, step: Callable[[Core], list[Effect]]) -> None:
+        core, outbox = self._core, self._outbox
+        if core is None or outbox is None:
+            return
+        try:
+            effects = step(core)
+        except Exception:
+            # A bug. What the core holds may be half changed, what is on disk is not.
+            log.exception("the core failed; loading it anew from the store")
+            self._drop_core()
+            return
+        outbox.put(effects)
+
+    def _flush(self) -> None:
+        if self._outbox is not None:
+            self._outbox.flush()
+        self._set_timer()
+
+    def _set_timer(self) -> None:
+        deadline = None if self._core is None or self._stopping else self._core.next_deadline()
+        if deadline is None:
+            self._cancel_timer()
+            return
+        at = deadline - self._unix_offset
+        if self._timer is not None:
+            if self._timer_at <= at:
+                # It fires early, finds nothing due, and is set anew: cheaper than setting it for each event.
+                return
+            self._timer.cancel()
+        self._timer_at = at
+        self._timer = self._loop.call_at(at, self._on_timer)
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        deadline = None if self._core is None else self._core.next_deadline()
+        if deadline is not None and self.now() >= deadline:
+            self._advance(lambda core: core.handle_deadline(self.now()))
+        self._flush()
+
+    async def _load(self) -> None:
+        snapshot = await self._writer.call(Store.load)
+        self._incarnation = snapshot.incarnation
+        self._core, effects = Core.load(self._settings, snapshot, self.now())
+        self._outbox = Outbox(self._writer, self._carry_out, self._on_storage_failure)
+        self._outbox.put(effects)
+        self._storage_error = ""
+        log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))
+        self._flush()
+
+    def _on_storage_failure(self, error: StorageError) -> None:
+        log.error("the store refused to write; nothing is taken until it does", error=str(error))
+        self._storage_error = str(error)
+        self._drop_core()
+
+    def _drop_core(self) -> None:
+        """Forgets all that is not on disk, and begins to load what is."""
+        if self._outbox is not None:
+            if self._outbox.commits:
+                self._reload_pause_s = _FIRST_PAUSE_S
+            self._outbox.discard()
+        self._core = None
+        self._outbox = None
+        self._cancel_timer()
+        self._drop_pending()
+        if not self._stopping:
+            self._spawn(self._reload())
+
+    async def _reload(self) -> None:
+        while True:
+            await asyncio.sleep(self._reload_pause_s)
+            self._reload_pause_s = min(_LONGEST_PAUSE_S, 2 * self._reload_pause_s)
+            try:
+                await self._load()
+            except StorageError as error:
+                log.error("the store still refuses", error=str(error))
+                self._storage_error = str(error)
+            else:
+                log.info("the store writes again")
+                return
+
+    # Effects out.
+
+    def _carry_out(self, effect: Effect) -> None:
+        if isinstance(effect, Reply):
+            pending = self._take(effect.request)
+            if pending is not None:
+                pending.query.reply(codec.encode(effect.message), _lane(pending.asker))
+        elif isinstance(effect, ReadResults | ReadEvaluation | ReadFinished):
+            pending = self._take(effect.request)
+            if pending is not None:
+                self._answers.page(effect, _answer_to(pending.query, pending.asker))
+        elif isinstance(effect, Log):
+            getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
+
+    def _take(self, request: int | str) -> _Pending | None:
+        return self._pending.pop(request, None) if isinstance(request, int) else None
+
+    def _drop_pending(self) -> None:
+        for pending in self._pending.values():
+            pending.query.drop()
+        self._pending.clear()
+
+
+def _lane(asker: str) -> int:
+    """Answers to one asker go in order."""
+    return crc32(asker.encode())
+
+
+def _answer_to(query: IncomingQuery, asker: str) -> Answer:
+    def answer(message: Message | None) -> None:
+        if message is None:
+            query.drop()
+        else:
+            query.reply(codec.encode(message), _lane(asker))
+
+    return answer

@@ -1,0 +1,75 @@
+"""Rows for tests, as a core would persist them."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_coordinator.core.records import OutcomeRow, RunRow, RunStateRow, SubmitRow
+
+SETTINGS = RunSettings(env="toy/line", entry="tester", model="none", exp_id="t")
+
+
+def run_row(run: str = "r-1", **changes: Any) -> RunRow:
+    values: dict[str, Any] = {
+        "run": run,
+        "key": f"key-{run}",
+        "capability": f"capability-{run}",
+        "secret": b"s" * 32,
+        "settings": SETTINGS,
+        "budget": 8,
+        "min_episodes_per_submit": 1,
+        "max_episodes_per_submit": 8,
+        "train": (Case(seed=1), Case(seed=2)),
+        "validation": (Case(seed=3),),
+        "heldout": (Case(seed=4),),
+        "split_hashes": {},
+        "split_secret": True,
+    }
+    return RunRow(**{**values, **changes})
+
+
+def state_row(run: str = "r-1", **changes: Any) -> RunStateRow:
+    return RunStateRow(run=run, **changes)
+
+
+def submit_row(run: str = "r-1", submit_index: int = 0, **changes: Any) -> SubmitRow:
+    values: dict[str, Any] = {
+        "run": run,
+        "submit_index": submit_index,
+        "key": f"submit-{submit_index}",
+        "env_instances": (0, 1),
+        "bundle": "b" * 64,
+        "first_global_episode": 0,
+        "remaining_budget": 6,
+        "accepted_at": 1000.0,
+    }
+    return SubmitRow(**{**values, **changes})
+
+
+def blob(data: bytes, *, inline: bool = True) -> BlobRef:
+    return BlobRef(digest=hashlib.sha256(data).hexdigest(), size=len(data), inline=data if inline else None)
+
+
+def outcome_row(group: str, index: int, seq: int, trajectory: BlobRef | None = None) -> OutcomeRow:
+    return OutcomeRow(
+        group=group,
+        index=index,
+        seq=seq,
+        outcome=EpisodeOutcome(
+            index=index,
+            episode_return=float(index),
+            length=3,
+            terminated=True,
+            truncated=False,
+            trajectory=trajectory or blob(b"trajectory %d" % index),
+        ),
+        job_id=f"{group}/{index}",
+        attempt=1,
+        worker="w",
+        fingerprint_class="c",
+        at=1001.0,
+    )

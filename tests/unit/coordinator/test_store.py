@@ -1,0 +1,207 @@
+"""The store: all of a write or nothing, everything back after reopening, and damage told instead of guessed around."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from store_rows import blob, outcome_row, run_row, state_row, submit_row
+
+from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator.core import records
+from evopolicy_coordinator.core.records import EvaluationRow, StrikeRow, WorkerRow, head_of
+from evopolicy_coordinator.store import SCHEMA_VERSION, Reader, Store, train_run
+
+TRAIN = records.train_group("r-1", 0)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "coordinator.sqlite"
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[Store]:
+    store = Store(path)
+    yield store
+    store.close()
+
+
+def evaluation_row(finished: bool) -> EvaluationRow:
+    return EvaluationRow(
+        evaluation=f"e-{finished}",
+        key=f"key-{finished}",
+        env="toy/line",
+        bundle=None,
+        split="train",
+        case_ids=(),
+        cases=(),
+        secret=b"",
+        record="full",
+        tier="none",
+        limits=ResourceLimits(),
+        created_at=0.0,
+        finished=finished,
+    )
+
+
+def test_everything_written_is_loaded_again_after_reopening(path: Path) -> None:
+    outcome = outcome_row(TRAIN, 1, 0)
+    strike = StrikeRow(group=TRAIN, lease_id="l", worker="w", error="died", at=1.0)
+    rows = [
+        run_row(),
+        state_row(),
+        submit_row(),
+        outcome,
+        strike,
+        evaluation_row(False),
+        WorkerRow(worker="w", state="draining"),
+    ]
+    store = Store(path)
+    store.write(rows)
+    store.close()
+    store = Store(path)
+    snapshot = store.load()
+    store.close()
+    assert snapshot.runs == (rows[0],)
+    assert snapshot.states == (rows[1],)
+    assert snapshot.submits == (rows[2],)
+    assert snapshot.outcomes == (head_of(outcome),)
+    assert snapshot.strikes == (strike,)
+    assert snapshot.evaluations == (rows[5],)
+    assert snapshot.workers == (rows[6],)
+
+
+def test_incarnation_counts_every_load(path: Path) -> None:
+    for expected in (1, 2, 3):
+        store = Store(path)
+        assert store.load().incarnation == expected
+        store.close()
+
+
+def test_row_is_replaced_under_its_key(store: Store) -> None:
+    store.write([run_row(), state_row(), submit_row()])
+    store.write([submit_row(released=2), state_row(phase="closed")])
+    snapshot = store.load()
+    assert [row.released for row in snapshot.submits] == [2]
+    assert [row.phase for row in snapshot.states] == ["closed"]
+
+
+def test_write_that_fails_leaves_nothing_behind(store: Store) -> None:
+    store.write([run_row()])
+    with pytest.raises(StorageError, match="contradicts"):
+        store.write([state_row(), run_row("r-2", key="key-r-1")])
+    snapshot = store.load()
+    assert [row.run for row in snapshot.runs] == ["r-1"]
+    assert snapshot.states == ()
+    store.write([state_row()])
+
+
+def test_full_disk_is_told_and_writing_goes_on_when_there_is_room(store: Store) -> None:
+    store.write([run_row(), state_row(), submit_row()])
+    pages = store._db.execute("PRAGMA page_count").fetchone()[0]
+    store._db.execute(f"PRAGMA max_page_count={pages + 2}")
+    big = outcome_row(TRAIN, 0, 0, trajectory=blob(b"x" * 100_000))
+    with pytest.raises(StorageError, match="full"):
+        store.write([big])
+    assert store.load().outcomes == ()
+    store._db.execute("PRAGMA max_page_count=1000000")
+    store.write([big])
+    assert len(store.load().outcomes) == 1
+
+
+def test_two_outcomes_cannot_have_one_place_in_the_order_of_arrival(store: Store) -> None:
+    store.write([outcome_row(TRAIN, 0, 0)])
+    with pytest.raises(StorageError, match="contradicts"):
+        store.write([outcome_row(TRAIN, 1, 0)])
+
+
+def test_outcomes_of_finished_runs_and_evaluations_are_not_loaded(store: Store) -> None:
+    group = records.evaluation_group("e-True")
+    open_group = records.evaluation_group("e-False")
+    store.write([run_row(), state_row(phase="finished"), submit_row(), outcome_row(TRAIN, 0, 0)])
+    store.write(
+        [evaluation_row(True), outcome_row(group, 0, 0), evaluation_row(False), outcome_row(open_group, 0, 0)]
+    )
+    snapshot = store.load()
+    assert snapshot.submits == ()
+    assert [head.group for head in snapshot.outcomes] == [open_group]
+    assert [row.run for row in snapshot.runs] == ["r-1"]
+
+
+def test_pages_hold_outcomes_in_order_of_arrival_as_many_as_fit(store: Store, path: Path) -> None:
+    rows = [
+        outcome_row(TRAIN, index, seq, blob(b"%d" % index * 1000)) for seq, index in enumerate((3, 0, 2, 1))
+    ]
+    store.write(reversed(rows))
+    reader = Reader(path)
+    assert reader.outcomes(TRAIN, 0, 3, 1 << 20).rows == tuple(rows[:3])
+    page = reader.outcomes(TRAIN, 1, 4, 3500)
+    assert page.rows == tuple(rows[1:3])
+    assert page.cursor == 3
+    assert reader.outcomes(TRAIN, 0, 4, 1).rows == (rows[0],)
+    empty = reader.outcomes(TRAIN, 4, 4, 1)
+    assert (empty.rows, empty.cursor) == ((), 4)
+    reader.close()
+
+
+def test_a_run_may_fetch_the_blobs_of_its_own_train_feedback_only(store: Store, path: Path) -> None:
+    stored, inline, hidden = (
+        blob(b"stored", inline=False),
+        blob(b"inline"),
+        blob(b"hidden", inline=False),
+    )
+    store.write(
+        [
+            outcome_row(TRAIN, 0, 0, stored),
+            outcome_row(TRAIN, 1, 1, inline),
+            outcome_row(records.validation_group("r-1", 0), 0, 0, hidden),
+        ]
+    )
+    reader = Reader(path)
+    assert reader.names_blob("r-1", stored.digest)
+    assert not reader.names_blob("r-1", hidden.digest)
+    assert not reader.names_blob("r-2", stored.digest)
+    reader.close()
+
+
+def test_only_train_groups_belong_to_a_gateway() -> None:
+    assert train_run(records.train_group("r-1", 12)) == "r-1"
+    for group in (
+        records.validation_group("r-1", 0),
+        records.heldout_group("r-1", 0),
+        records.random_group("r-1"),
+        records.evaluation_group("train"),
+    ):
+        assert train_run(group) is None
+
+
+def test_file_of_a_newer_version_is_refused(path: Path) -> None:
+    Store(path).close()
+    db = sqlite3.connect(path)
+    db.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
+    db.close()
+    with pytest.raises(ConfigError, match="newer"):
+        Store(path)
+
+
+def test_file_that_is_no_database_is_told(path: Path) -> None:
+    path.write_bytes(b"this is no database, whatever its name says" * 100)
+    with pytest.raises(StorageError, match="restore it from a backup"):
+        Store(path)
+
+
+def test_row_that_cannot_be_read_is_told(store: Store, path: Path) -> None:
+    store.write([run_row(), state_row(), submit_row()])
+    store._db.execute("UPDATE submits SET data = x'00'")
+    with pytest.raises(StorageError, match="cannot be read"):
+        store.load()
+
+
+def test_database_is_durable_and_private(store: Store, path: Path) -> None:
+    assert store._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
+    assert store._db.execute("PRAGMA synchronous").fetchone()[0] == 2
+    assert path.stat().st_mode & 0o077 == 0
