@@ -93,7 +93,9 @@ def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
         depth=walker.depth,
         state=len(walker.state),
         nodes=walker.nodes,
-        lines=sum(module.source.count(b"\n") + (not module.source.endswith(b"\n")) for module in modules.values()),
+        lines=sum(
+            module.source.count(b"\n") + (not module.source.endswith(b"\n")) for module in modules.values()
+        ),
         modules=len(modules),
     )
     return _hash([_canonical(walker), *sorted(opaque)]), features
@@ -169,7 +171,9 @@ class _Walker:
         for part in (*node.decorator_list, *node.bases, *node.keywords):
             self._node(part, unit, 0)
         for statement in node.body:
-            child = self._class_field(statement, scope) or self._statement_unit(statement, scope, self.method_defs)
+            child = self._class_field(statement, scope) or self._statement_unit(
+                statement, scope, self.method_defs
+            )
             if child is not None:
                 unit.children.append(child)
                 if not child.is_function:
@@ -278,7 +282,11 @@ class _Walker:
         if kind is ast.Attribute:
             self._attribute(node, unit, depth)  # type: ignore[arg-type]
             return
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd) and _is_number(node.operand):
+        if (
+            isinstance(node, ast.UnaryOp)
+            and isinstance(node.op, ast.USub | ast.UAdd)
+            and _is_number(node.operand)
+        ):
             self._add(unit, "#")
             return
         if isinstance(node, ast.JoinedStr):
@@ -402,7 +410,9 @@ def _own_name(name: str) -> str:
 
 def _is_docstring(node: ast.stmt) -> bool:
     return (
-        isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
     )
 
 
@@ -430,7 +440,9 @@ def _canonical(walker: _Walker) -> str:
     labels: dict[str, str] = {}
     own = [""] * len(every)
     for _ in range(_ROUNDS):
-        for i in range(len(every) - 1, -1, -1):  # a class comes before its children, and its label holds theirs
+        for i in range(
+            len(every) - 1, -1, -1
+        ):  # a class comes before its children, and its label holds theirs
             inner = sorted(own[place[id(child)]] for child in every[i].children)
             own[i] = _hash([*_numbered(resolved[i], labels, {}), *inner])
         by_name: dict[str, list[str]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from evopolicy_coordinator.analysis.sources import reachable_modules, source_digest
 from evopolicy_coordinator.analysis.topology import Features, describe
 
@@ -102,8 +103,12 @@ BYTES_ONLY = {
 
 STRUCTURE = {
     "a new branch": swap("        print(f", "        if error > 2:\n            error = 2\n        print(f"),
-    "a loop": swap("        print(f", "        for _ in range(3):\n            error *= 0.5\n        print(f"),
-    "new state": swap("self.last = 0.0\n\n    def reset", "self.last = 0.0\n        self.n = 0\n\n    def reset"),
+    "a loop": swap(
+        "        print(f", "        for _ in range(3):\n            error *= 0.5\n        print(f"
+    ),
+    "new state": swap(
+        "self.last = 0.0\n\n    def reset", "self.last = 0.0\n        self.n = 0\n\n    def reset"
+    ),
     "another library function": swap("np.sin", "np.tanh"),
     "another operator": swap("target - here", "target + here"),
     "another comparison": swap("delta > 1.0", "delta >= 1.0"),
@@ -145,7 +150,9 @@ def test_edit_of_structure_changes_the_topology(edit: str) -> None:
 
 def test_dead_module_is_not_part_of_the_bundle() -> None:
     alone = describe_files({"policy.py": BASE.encode()})
-    beside = describe_files({"policy.py": BASE.encode(), "scratch.py": b"x = [1, 2]\n", "notes/a.py": b"y = 1\n"})
+    beside = describe_files(
+        {"policy.py": BASE.encode(), "scratch.py": b"x = [1, 2]\n", "notes/a.py": b"y = 1\n"}
+    )
     assert alone == beside
 
 
@@ -165,10 +172,16 @@ def test_imports_are_followed_into_packages_and_functions() -> None:
 
 
 def test_swapping_a_file_between_equal_bodies_of_two_helpers_keeps_the_topology() -> None:
-    one = {"policy.py": b"import a, b\nX = a.f(1) + b.g(2)\n", "a.py": b"def f(x):\n    return x\n",
-           "b.py": b"def g(x):\n    return -x\n"}
-    two = {"policy.py": b"import a, b\nX = b.f(1) + a.g(2)\n", "b.py": b"def f(x):\n    return x\n",
-           "a.py": b"def g(x):\n    return -x\n"}
+    one = {
+        "policy.py": b"import a, b\nX = a.f(1) + b.g(2)\n",
+        "a.py": b"def f(x):\n    return x\n",
+        "b.py": b"def g(x):\n    return -x\n",
+    }
+    two = {
+        "policy.py": b"import a, b\nX = b.f(1) + a.g(2)\n",
+        "b.py": b"def f(x):\n    return x\n",
+        "a.py": b"def g(x):\n    return -x\n",
+    }
     assert describe_files(one)[1] == describe_files(two)[1]
 
 
@@ -186,7 +199,7 @@ def test_no_policy_gives_an_empty_bundle() -> None:
 
 
 def test_features_are_counted_as_documented() -> None:
-    source = b'''
+    source = b"""
 TABLE = [1 if x else 2 for x in (0, 1)]
 
 
@@ -225,7 +238,7 @@ class Policy:
 class Map:
     def __init__(this):
         this.x = 1
-'''
+"""
     _, _, features = describe_files({"policy.py": source})
     assert features.functions == 5
     assert features.branches == 5  # one conditional expression, if, elif, two cases

@@ -1,0 +1,90 @@
+"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, and how agents were confined.
+
+Budget, scope, observation form and jail must agree over all runs of a suite; splits (by hash), library fingerprint and
+environment version over the runs of one environment, since environments differ in them anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import msgspec
+
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_coordinator.analysis.records import Run
+from evopolicy_coordinator.analysis.scores import ordered_environments, suites_of
+
+
+class Mixture(msgspec.Struct, frozen=True, kw_only=True):
+    """One thing in which runs that are compared differ."""
+
+    what: str
+    """`episode budget`, `policy scope`, `train split`, …"""
+    where: str
+    """Suite or environment."""
+    values: dict[str, int]
+    """Each value as text, to the number of runs that have it."""
+
+    def __str__(self) -> str:
+        found = ", ".join(f"{value} ({n} run{'s' * (n != 1)})" for value, n in self.values.items())
+        return f"{self.what} on {self.where}: {found}"
+
+
+class MixedRunsError(EvopolicyError):
+    """Runs that are no fair comparison; `mixtures` tells in what."""
+
+    def __init__(self, mixtures: Sequence[Mixture]) -> None:
+        super().__init__(
+            "these runs are no one comparison:\n" + "\n".join(f"  {mixture}" for mixture in mixtures)
+        )
+        self.mixtures = tuple(mixtures)
+
+
+_BY_SUITE: dict[str, Callable[[Run], str]] = {
+    "episode budget": lambda run: str(run.budget),
+    "policy scope": lambda run: run.record.experiment_dimensions.policy_scope,
+    "observation form": lambda run: run.record.experiment_dimensions.observations,
+    "jail": lambda run: run.record.jail,
+}
+_BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
+    "train split": lambda run: run.record.versions.data_train_hash[:12],
+    "validation split": lambda run: run.record.versions.data_valid_hash[:12],
+    "held-out split": lambda run: run.record.versions.data_heldout_hash[:12],
+    "environment version": lambda run: run.record.versions.env,
+    "fingerprint": lambda run: " ".join(
+        f"{k}={v}" for k, v in sorted(run.record.versions.fingerprint.items())
+    ),
+}
+
+
+def mixtures(runs: Iterable[Run]) -> list[Mixture]:
+    """Everything in which runs of one suite or environment differ; empty for a fair comparison."""
+    by_env: dict[str, list[Run]] = {}
+    for run in runs:
+        by_env.setdefault(run.env, []).append(run)
+    out: list[Mixture] = []
+    for suite, envs in suites_of(by_env).items():
+        together = [run for env in envs for run in by_env[env]]
+        out += _differences(_BY_SUITE, suite, together)
+    for env in ordered_environments(by_env):
+        out += _differences(_BY_ENVIRONMENT, env, by_env[env])
+    return out
+
+
+def refuse_mixtures(runs: Iterable[Run]) -> None:
+    """MixedRunsError when the runs differ in what a comparison holds fixed."""
+    found = mixtures(runs)
+    if found:
+        raise MixedRunsError(found)
+
+
+def _differences(checks: dict[str, Callable[[Run], str]], where: str, runs: list[Run]) -> list[Mixture]:
+    found: list[Mixture] = []
+    for what, value_of in checks.items():
+        counts: dict[str, int] = {}
+        for run in runs:
+            value = value_of(run) or "none"
+            counts[value] = counts.get(value, 0) + 1
+        if len(counts) > 1:
+            found.append(Mixture(what=what, where=where, values=dict(sorted(counts.items()))))
+    return found

@@ -1,0 +1,115 @@
+"""Score evolution: the best hidden-validation score so far over the consumed budget (paper, "Post-hoc score trajectories").
+
+A step function of the episodes consumed: it holds from the end of the submit that reached it. Agents never see it.
+Scales are per environment: 0 is the random reference (held-out cases, the only ones it is played on; without it the lowest
+first score of any run), 1 the best validation score of any run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from evopolicy_coordinator.analysis.edits import classify
+from evopolicy_coordinator.analysis.records import Run
+from evopolicy_coordinator.analysis.scores import ordered_environments
+
+
+class Step(msgspec.Struct, frozen=True, kw_only=True):
+    """The curve after one score-bearing submit."""
+
+    index: int
+    consumed: int
+    """Budget consumed after it, episodes."""
+    val_mean: float
+    best: float
+    improved: bool
+    """It raised the best; the first always does."""
+
+
+class Evolution(msgspec.Struct, frozen=True, kw_only=True):
+    """One run's curve and what it says about efficiency."""
+
+    run: str
+    entry: str
+    env: str
+    budget: int
+    steps: tuple[Step, ...]
+    n_improvements: int
+    """Rises after the first score."""
+    area: float | None
+    """Mean over the budget of the curve on the environment's scale, clipped to [0, 1]; 0 before the first score.
+    None without a scale (nothing beats random)."""
+    to_50: int | None
+    """Episodes consumed when the curve first reaches half of the scale; None when it never does."""
+    to_80: int | None
+
+
+def curve(run: Run) -> tuple[Step, ...]:
+    """The run's steps, one for each score-bearing submit."""
+    return tuple(
+        Step(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
+        for t in classify(run.submits)
+    )
+
+
+def evolutions(runs: Iterable[Run]) -> list[Evolution]:
+    """Every run's curve, environments in catalogue order, then by entry and run."""
+    by_env: dict[str, list[tuple[Run, tuple[Step, ...]]]] = {}
+    for run in runs:
+        by_env.setdefault(run.env, []).append((run, curve(run)))
+    out: list[Evolution] = []
+    for env in ordered_environments(by_env):
+        group = sorted(by_env[env], key=lambda pair: (pair[0].entry.casefold(), pair[0].name))
+        base, top = scale(group)
+        for run, steps in group:
+            out.append(
+                Evolution(
+                    run=run.name,
+                    entry=run.entry,
+                    env=env,
+                    budget=run.budget,
+                    steps=steps,
+                    n_improvements=sum(step.improved for step in steps[1:]),
+                    area=area(steps, run.budget, base, top),
+                    to_50=episodes_to(steps, 0.5, base, top),
+                    to_80=episodes_to(steps, 0.8, base, top),
+                )
+            )
+    return out
+
+
+def scale(group: Sequence[tuple[Run, Sequence[Step]]]) -> tuple[float | None, float | None]:
+    """The environment's 0 and 1; both None when no run has a score."""
+    tops = [steps[-1].best for _, steps in group if steps]
+    if not tops:
+        return None, None
+    references = [
+        run.record.outcome.random_reference.mean_return
+        for run, _ in group
+        if run.record.outcome.random_reference is not None
+    ]
+    firsts = [steps[0].val_mean for _, steps in group if steps]
+    base = sum(references) / len(references) if references else min(firsts)
+    return base, max(tops)
+
+
+def area(steps: Sequence[Step], budget: int, base: float | None, top: float | None) -> float | None:
+    """Time-averaged normalised best so far: the integral over episodes 0 … budget, divided by the budget."""
+    if base is None or top is None or top <= base or budget <= 0:
+        return None
+    total = 0.0
+    for i, step in enumerate(steps):
+        until = steps[i + 1].consumed if i + 1 < len(steps) else budget
+        level = min(1.0, max(0.0, (step.best - base) / (top - base)))
+        total += level * max(0, until - step.consumed)
+    return total / budget
+
+
+def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: float | None) -> int | None:
+    """Episodes consumed when the best so far first reaches `base + share · (top − base)`; None when never."""
+    if base is None or top is None or top <= base:
+        return None
+    goal = base + share * (top - base)
+    return next((step.consumed for step in steps if step.best >= goal), None)

@@ -1,0 +1,10 @@
+"""Makes the shared test support importable."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+SUPPORT = str(Path(__file__).resolve().parents[2] / "support")
+if SUPPORT not in sys.path:
+    sys.path.append(SUPPORT)

@@ -1,0 +1,118 @@
+"""The files of a run directory: field order, what may be left out, what is skipped and what refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.run_record import (
+    Agent,
+    ExperimentDimensions,
+    Outcome,
+    RunRecord,
+    Timing,
+    Versions,
+    decode_checkpoint_metrics,
+    decode_run_record,
+    encode_run_record,
+)
+from evopolicy_common.summary import Summary, decode_summary, encode_summary, utc_text
+
+FIELDS = ["schema_version", "submit_index", "env", "status", "n_episodes", "first_global_episode", "env_instances", "remaining_budget", "submit_started_at", "submit_completed_at", "wall_time_seconds", "returns", "mean_return", "std_return", "min_return", "max_return", "episode_lengths", "mean_episode_length", "timeouts", "errors"]
+
+NOT_OK = Summary(
+    schema_version=1,
+    submit_index=3,
+    env="toy/line",
+    status="import_error",
+    n_episodes=4,
+    first_global_episode=9,
+    env_instances=None,
+    remaining_budget=100,
+    submit_started_at=utc_text(0.0),
+    submit_completed_at=utc_text(1.25),
+    wall_time_seconds=1.25,
+    returns=None,
+    mean_return=None,
+    std_return=None,
+    min_return=None,
+    max_return=None,
+    episode_lengths=None,
+    mean_episode_length=None,
+    timeouts=None,
+    errors=None,
+)
+
+RECORD = RunRecord(
+    model="m",
+    env="toy/line",
+    exp_id="e",
+    agent=Agent(entry="m", harness="evolve"),
+    sandbox_tier="bwrap",
+    jail="bwrap",
+    experiment_dimensions=ExperimentDimensions(
+        episode_budget=8,
+        min_episodes_per_submit=1,
+        max_episodes_per_submit=8,
+        policy_scope="episode",
+        observations="arrays",
+        n_train=4,
+        n_validation=2,
+        n_heldout=2,
+    ),
+    timing=Timing(started_at=utc_text(0.0), finished_at=utc_text(9.0), wall_s=9.0),
+    outcome=Outcome(status="completed", final_score=1.5, best_submit_index=0, val_scores={"0": 1.0}),
+    versions=Versions(
+        harness="0.1.0",
+        env="line 1",
+        agents_md_hash="a",
+        data_train_hash="b",
+        data_valid_hash="c",
+        data_heldout_hash="d",
+        fingerprint={"numpy": "2.4.6"},
+    ),
+)
+
+
+def test_summary_has_its_fields_in_order_and_nulls_when_not_ok() -> None:
+    found = json.loads(encode_summary(NOT_OK))
+    assert list(found) == FIELDS
+    assert found["returns"] is None
+    assert found["env_instances"] is None
+    assert found["submit_completed_at"] == "1970-01-01T00:00:01.250000Z"
+    assert decode_summary(encode_summary(NOT_OK)) == NOT_OK
+
+
+def test_reward_components_come_last_and_only_where_there_are_any() -> None:
+    import msgspec
+
+    some = msgspec.structs.replace(
+        NOT_OK, reward_components_mean={"a": 1.0}, reward_components_per_episode=({"a": 1.0},)
+    )
+    assert list(json.loads(encode_summary(some))) == [
+        *FIELDS,
+        "reward_components_mean",
+        "reward_components_per_episode",
+    ]
+
+
+def test_run_record_survives_a_round_trip_and_skips_unknown_fields() -> None:
+    data = encode_run_record(RECORD)
+    assert decode_run_record(data) == RECORD
+    more = json.loads(data) | {"colour": "blue"}
+    assert decode_run_record(json.dumps(more).encode()) == RECORD
+
+
+def test_file_of_a_newer_schema_is_refused_by_name() -> None:
+    newer = json.loads(encode_run_record(RECORD)) | {"schema_version": 2}
+    with pytest.raises(ProtocolError, match=r"run\.json has schema_version 2"):
+        decode_run_record(json.dumps(newer).encode())
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{}", b"\xff", b"[" * 100_000, b'{"submit_index": "one"}'])
+def test_bytes_that_are_no_record_are_refused(data: bytes) -> None:
+    for decode in (decode_run_record, decode_summary, decode_checkpoint_metrics):
+        with pytest.raises(ProtocolError, match="not a"):
+            decode(data)

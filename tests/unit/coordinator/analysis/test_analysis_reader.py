@@ -1,0 +1,191 @@
+"""Run directories in: what is read, and what is left out with which reason."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from run_dirs import Version, policy, write_run
+
+from evopolicy_coordinator.analysis.comparability import MixedRunsError, mixtures, refuse_mixtures
+from evopolicy_coordinator.analysis.reader import count_changed_lines, find_run_dirs, load_runs, read_run
+from evopolicy_coordinator.analysis.records import rows
+
+VERSIONS = [
+    Version(policy(gain=1.0), (-200.0, -100.0), -180.0),
+    Version({"policy.py": "import nothing\n"}, (0.0,), None, "import_error"),
+    Version(policy(gain=2.0), (-90.0,), -95.0, failed=(0,)),
+]
+
+
+def test_run_is_read_with_its_submits_and_hidden_scores(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, VERSIONS, rejected=2))
+    assert (run.entry, run.env, run.budget, run.score) == ("Agent A", "gym/acrobot", 128, -95.0)
+    assert [submit.status for submit in run.submits] == ["ok", "import_error", "ok"]
+    assert [(submit.consumed_before, submit.consumed) for submit in run.submits] == [(0, 2), (2, 3), (3, 4)]
+    assert [submit.mean_return for submit in run.submits] == [-150.0, None, -90.0]
+    assert [submit.val_mean for submit in run.submits] == [-180.0, None, -95.0]
+    assert [submit.changed_lines for submit in run.submits] == [None, None, 2]
+    assert [submit.label for submit in run.scored] == ["s000", "s002"]
+    assert run.selected is not None
+    assert run.selected.index == 2
+    assert run.selected.n_failed_episodes == 1
+    assert len(run.record.rejected_submits) == 2
+    assert rows(run.submits)[0]["mean_return"] == -150.0
+
+
+def test_run_is_read_from_checkpoints_when_feedback_is_gone(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, VERSIONS)
+    for summary in folder.glob("workspace/feedback/*/summary.json"):
+        summary.unlink()
+    run = read_run(folder)
+    assert [submit.consumed for submit in run.submits] == [2, 3, 4]
+    assert [submit.status for submit in run.submits] == ["ok", "import_error", "ok"]
+
+
+def test_unknown_fields_are_skipped(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, VERSIONS)
+    record = json.loads((folder / "run.json").read_text())
+    record["mood"] = {"of": "the day"}
+    (folder / "run.json").write_text(json.dumps(record))
+    assert read_run(folder).score == -95.0
+
+
+def damage(folder: Path, how: str) -> None:
+    path = folder / "run.json"
+    record = json.loads(path.read_text())
+    match how:
+        case "no run.json":
+            path.unlink()
+        case "half a run.json":
+            path.write_bytes(path.read_bytes()[:500])
+        case "empty":
+            path.write_bytes(b"")
+        case "not utf-8":
+            path.write_bytes(b"\xff\xfe{}")
+        case "wrong type":
+            record["outcome"]["final_score"] = "high"
+            path.write_text(json.dumps(record))
+        case "newer schema":
+            record["schema_version"] = 99
+            path.write_text(json.dumps(record))
+        case "completed without score":
+            record["outcome"]["final_score"] = None
+            path.write_text(json.dumps(record))
+        case "selected submit is gone":
+            record["outcome"]["best_submit_index"] = 77
+            path.write_text(json.dumps(record))
+        case "truncated summary":
+            (folder / "workspace/feedback/submit_000/summary.json").write_text('{"schema_version": 1,')
+        case "damaged metrics":
+            (folder / "checkpoints/submit_000/metrics.json").write_text("[]")
+        case "run.json is a folder":
+            path.unlink()
+            path.mkdir()
+        case "deeply nested":
+            path.write_text("[" * 200_000)
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("no run.json", "half-finished"),
+        ("half a run.json", "run.json"),
+        ("empty", "run.json"),
+        ("not utf-8", "run.json"),
+        ("wrong type", "final_score"),
+        ("newer schema", "schema_version 99"),
+        ("completed without score", "no final_score"),
+        ("selected submit is gone", "selected submit 77"),
+        ("truncated summary", "submit_000/summary.json"),
+        ("damaged metrics", "metrics.json"),
+        ("run.json is a folder", "half-finished"),
+        ("deeply nested", "run.json"),
+    ],
+)
+def test_damaged_run_is_left_out_with_its_reason(tmp_path: Path, how: str, reason: str) -> None:
+    good = write_run(tmp_path, VERSIONS, exp_id="good")
+    bad = write_run(tmp_path, VERSIONS, exp_id="bad")
+    damage(bad, how)
+    loaded = load_runs([tmp_path])
+    assert [run.path for run in loaded.runs] == [good]
+    assert [left.path for left in loaded.left_out] == [bad]
+    assert reason in loaded.left_out[0].reason
+
+
+def test_run_that_ended_in_an_error_is_left_out(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS, status="error")
+    loaded = load_runs([tmp_path])
+    assert not loaded.runs
+    assert "worker lost" in loaded.left_out[0].reason
+
+
+def test_run_without_an_ok_submit_stays_in_without_a_score(tmp_path: Path) -> None:
+    write_run(tmp_path, [VERSIONS[1]])
+    (run,) = load_runs([tmp_path]).runs
+    assert run.score is None
+    assert run.selected is None
+    assert run.scored == ()
+
+
+def test_same_run_given_twice_counts_once_and_a_copy_is_named(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", VERSIONS)
+    write_run(tmp_path / "b", VERSIONS)
+    twice = load_runs([tmp_path / "a", tmp_path / "a"])
+    assert (len(twice.runs), twice.left_out) == (1, ())
+    copied = load_runs([tmp_path])
+    assert len(copied.runs) == 1
+    assert "repeats the run" in copied.left_out[0].reason
+
+
+def test_path_without_runs_is_listed(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    loaded = load_runs([tmp_path / "empty", tmp_path / "absent"])
+    assert [left.reason for left in loaded.left_out] == ["no run directory here", "no such folder"]
+
+
+def test_a_run_inside_a_run_is_not_searched_for(tmp_path: Path) -> None:
+    outer = write_run(tmp_path, VERSIONS)
+    write_run(outer / "workspace" / "system", VERSIONS)
+    assert find_run_dirs([tmp_path])[0] == [outer]
+
+
+def test_reading_in_several_processes_gives_the_same_runs(tmp_path: Path) -> None:
+    for number in range(45):
+        write_run(tmp_path, VERSIONS[:1], exp_id=f"e{number:02d}")
+    (tmp_path / "Agent-A" / "gym_acrobot" / "e07" / "run.json").write_text("{")
+    assert load_runs([tmp_path], jobs=2) == load_runs([tmp_path], jobs=1)
+
+
+def test_changed_lines_count_both_sides_of_every_file() -> None:
+    assert count_changed_lines({"a": b"1\n2\n3\n"}, {"a": b"1\n5\n3\n", "b": b"x\n"}) == 3
+    assert count_changed_lines({"a": b"1\n"}, {"a": b"1\n"}) == 0
+    big = b"".join(b"%d\n" % i for i in range(15_000))
+    assert count_changed_lines({"a": big}, {"a": big + b"more\n"}) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"budget": 64}, "episode budget"),
+        ({"scope": "submit"}, "policy scope"),
+        ({"split": "split-2"}, "held-out split"),
+        ({"fingerprint": {"numpy": "1.26.4"}}, "fingerprint"),
+        ({"jail": "none"}, "jail"),
+    ],
+)
+def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: dict, what: str) -> None:
+    write_run(tmp_path, VERSIONS)
+    write_run(tmp_path, VERSIONS, entry="Agent B", **change)
+    runs = load_runs([tmp_path]).runs
+    assert what in [mixture.what for mixture in mixtures(runs)]
+    with pytest.raises(MixedRunsError, match=what):
+        refuse_mixtures(runs)
+
+
+def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS)
+    write_run(tmp_path, VERSIONS, entry="Agent B")
+    write_run(tmp_path, VERSIONS, env="gym/ant5", fingerprint={"numpy": "2.4.6", "mujoco": "3.10.0"})
+    assert mixtures(load_runs([tmp_path]).runs) == []
