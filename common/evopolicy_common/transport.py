@@ -206,10 +206,9 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
     Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
     a wrong password looks like: the router does not say.
     """
-    session = await asyncio.to_thread(zenoh.open, client_config(credentials))
+    session = await _open_client(credentials, timeout_s)
     link = Link(session, credentials)
     try:
-        await _wait_connected(link, timeout_s)
         yield link
     finally:
         await asyncio.to_thread(link.close)
@@ -238,8 +237,8 @@ def client_config(credentials: Credentials) -> zenoh.Config:
             **_COMMON,
             "mode": "client",
             "connect/endpoints": list(credentials.endpoints),
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
+            # One attempt: opening a client blocks its thread until it is in, so the patience is `connect`'s.
+            "connect/timeout_ms": 0,
             "transport/auth/usrpwd/user": credentials.user,
             "transport/auth/usrpwd/password": credentials.password,
             **_tls(credentials.tls, "connect"),
@@ -338,18 +337,22 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-async def _wait_connected(link: Link, timeout_s: float | None) -> None:
+async def _open_client(credentials: Credentials, timeout_s: float | None) -> zenoh.Session:
+    config = client_config(credentials)
     loop = asyncio.get_running_loop()
     deadline = None if timeout_s is None else loop.time() + timeout_s
-    pause = 0.005
-    while not link.connected:
-        if deadline is not None and loop.time() > deadline:
-            raise TransportError(
-                f"no connection to {', '.join(link.credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
-                f" there, and are these the {link.credentials.role} credentials of its state folder?"
-            )
+    pause = 0.02
+    while True:
+        try:
+            return await asyncio.to_thread(zenoh.open, config)
+        except zenoh.ZError as error:
+            if deadline is not None and loop.time() > deadline:
+                raise TransportError(
+                    f"no connection to {', '.join(credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
+                    f" there, and are these the {credentials.role} credentials of its state folder?"
+                ) from error
         await asyncio.sleep(pause)
-        pause = min(0.25, pause * 1.5)
+        pause = min(0.5, pause * 1.5)
 
 
 def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None], value: bytes | None) -> None:
@@ -360,9 +363,9 @@ def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None],
 def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]) -> None:
     while (item := lane.get()) is not None:
         query, key, payload = item
-        # The asker may be gone: it asks again if it is not.
+        # The answer is sent as the question was: blocking, never dropped. The asker may be gone: it asks again if not.
         with contextlib.suppress(zenoh.ZError):
-            query.reply(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+            query.reply(key, payload)
         query.drop()  # type: ignore[no-untyped-call]
         del query, item
 

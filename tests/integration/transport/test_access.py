@@ -1,0 +1,181 @@
+"""Real Zenoh sessions against the access rules that the coordinator listens with."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from evopolicy_common import keys, transport
+from evopolicy_common.credentials import Credentials, Role
+from evopolicy_common.errors import TransportError
+from evopolicy_common.transport import IncomingQuery, Link
+
+CLUSTER = "test"
+PASSWORDS: dict[Role, str] = {"worker": "w-secret", "gateway": "g-secret", "operator": "o-secret"}
+OWN_KEY = {
+    "worker": keys.worker_key(CLUSTER, "lease"),
+    "gateway": keys.gateway_key(CLUSTER, "run1", "state"),
+    "operator": keys.operator_key(CLUSTER, "status"),
+}
+
+
+def credentials(folder: Path, role: Role, password: str | None = None) -> Credentials:
+    return Credentials(
+        cluster=CLUSTER,
+        role=role,
+        endpoints=(f"unixsock-stream/{folder}/sock",),
+        user=role,
+        password=password or PASSWORDS[role],
+        token="",
+    )
+
+
+@contextlib.asynccontextmanager
+async def coordinator(folder: Path) -> AsyncIterator[list[str]]:
+    """A listening session that answers every key of the cluster with its own name; yields the keys it was asked."""
+    asked: list[str] = []
+
+    def answer(queries: list[IncomingQuery]) -> None:
+        for query in queries:
+            asked.append(query.key)
+            query.reply(b"coordinator")
+
+    (folder / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
+    config = transport.server_config(
+        CLUSTER, [f"unixsock-stream/{folder}/sock"], folder / "passwords", {role: role for role in PASSWORDS}
+    )
+    async with transport.serve(config, answer) as server:
+        server.declare([keys.worker_expr(CLUSTER), keys.gateway_expr(CLUSTER), keys.operator_expr(CLUSTER)])
+        yield asked
+
+
+async def answered(link: Link, key: str) -> bool:
+    try:
+        return await link.ask(key, b"?", 2.0) == b"coordinator"
+    except TransportError:
+        return False
+
+
+@pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
+def test_a_role_is_answered_on_its_own_keys_only(tmp_path: Path, role: Role) -> None:
+    async def scenario() -> None:
+        async with coordinator(tmp_path) as asked, transport.connect(credentials(tmp_path, role)) as link:
+            for owner, key in OWN_KEY.items():
+                assert await answered(link, key) == (owner == role), key
+            assert asked == [OWN_KEY[role]]
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(("role", "password"), [("worker", "wrong"), ("gateway", PASSWORDS["worker"])])
+def test_a_wrong_password_is_not_let_in(tmp_path: Path, role: Role, password: str) -> None:
+    async def scenario() -> None:
+        async with coordinator(tmp_path) as asked:
+            with pytest.raises(TransportError, match="credentials"):
+                async with transport.connect(credentials(tmp_path, role, password), timeout_s=1.0):
+                    pass
+            assert asked == []
+
+    asyncio.run(scenario())
+
+
+def test_a_session_without_password_is_not_let_in(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with coordinator(tmp_path) as asked:
+            config = zenoh.Config()
+            config.insert_json5("mode", '"client"')
+            config.insert_json5("connect/endpoints", f'["unixsock-stream/{tmp_path}/sock"]')
+            config.insert_json5("connect/timeout_ms", "1000")
+            config.insert_json5("scouting/multicast/enabled", "false")
+            with pytest.raises(zenoh.ZError):
+                await asyncio.to_thread(zenoh.open, config)
+            assert asked == []
+
+    asyncio.run(scenario())
+
+
+def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        overheard: list[str] = []
+
+        def overhear(query: zenoh.Query) -> None:
+            overheard.append(str(query.key_expr))
+            with query:
+                query.reply(query.key_expr, b"impostor")
+
+        async with coordinator(tmp_path), transport.connect(credentials(tmp_path, "gateway")) as honest:
+            impostor = await asyncio.to_thread(
+                zenoh.open, transport.client_config(credentials(tmp_path, "gateway"))
+            )
+            held = [
+                impostor.declare_queryable(keys.gateway_expr(CLUSTER), overhear, complete=True),
+                impostor.declare_queryable("**", overhear, complete=True),
+                impostor.declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr))),
+            ]
+            await asyncio.sleep(0.3)
+            for _ in range(20):
+                assert await answered(honest, OWN_KEY["gateway"])
+            assert overheard == []
+            del held
+            await asyncio.to_thread(impostor.close)
+
+    asyncio.run(scenario())
+
+
+def test_only_a_worker_can_claim_to_be_alive(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        seen: list[tuple[str, bool]] = []
+        key = keys.liveliness_key(CLUSTER, "w1")
+        (tmp_path / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
+        config = transport.server_config(
+            CLUSTER,
+            [f"unixsock-stream/{tmp_path}/sock"],
+            tmp_path / "passwords",
+            {role: role for role in PASSWORDS},
+        )
+        async with transport.serve(config, lambda queries: None) as server:
+            server.watch_liveliness(
+                keys.liveliness_expr(CLUSTER), lambda name, alive: seen.append((name, alive))
+            )
+            async with transport.connect(credentials(tmp_path, "gateway")) as link:
+                link.declare_alive(key)
+                await asyncio.sleep(0.2)
+                assert seen == []
+            async with transport.connect(credentials(tmp_path, "worker")) as link:
+                link.declare_alive(key)
+                await wait_until(lambda: seen == [(key, True)])
+            await wait_until(lambda: seen == [(key, True), (key, False)])
+
+    asyncio.run(scenario())
+
+
+def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            async with coordinator(tmp_path):
+                link = await stack.enter_async_context(transport.connect(credentials(tmp_path, "worker")))
+                assert await answered(link, OWN_KEY["worker"])
+            assert not await answered(link, OWN_KEY["worker"])
+            async with coordinator(tmp_path):
+                await wait_until(lambda: link.connected)
+                for _ in range(100):
+                    if await answered(link, OWN_KEY["worker"]):
+                        return
+                    await asyncio.sleep(0.05)
+                raise AssertionError("not answered after the restart")
+
+    asyncio.run(scenario())
+
+
+async def wait_until(condition: object, attempts: int = 400) -> None:
+    assert callable(condition)
+    for _ in range(attempts):
+        if condition():
+            return
+        await asyncio.sleep(0.025)
+    raise AssertionError("did not happen")
