@@ -151,7 +151,8 @@ def test_random_actions_are_those_of_the_gymnasium_space(env_id: str, warm: Warm
 def test_an_environment_survives_its_repaired_nonsense(env_id: str, warm: Warm) -> None:
     environment = warm(env_id)
     environment.reset(Case(seed=3))
-    for raw in (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf)):
+    nonsense: list[Any] = [None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf)]
+    for raw in nonsense:
         action, invalid = environment.action_codec.repair(raw)
         assert invalid
         if environment.description.action_space["type"] == "Box":

@@ -13,7 +13,7 @@ import pytest
 from environment_checks import FRAMES, play
 
 from evopolicy_common.errors import WorkerError
-from evopolicy_worker.environments import make, offered, process_environment
+from evopolicy_worker.environments import make, mujoco, offered, process_environment
 
 DRAWS_WITH_EGL = [env_id for env_id in offered() if env_id.endswith("5") or "Fetch" in env_id]
 DRAWABLE = [env_id for env_id in offered() if env_id not in DRAWS_WITH_EGL or ctypes.util.find_library("EGL")]
@@ -54,7 +54,9 @@ def test_a_frame_is_a_picture(env_id: str, rendered: dict[str, list[str]]) -> No
 def test_without_egl_a_rendering_environment_says_what_to_install(
     env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    monkeypatch.setattr(mujoco, "find_library", lambda name: None)
+    for name, value in process_environment(render=True).items():
+        monkeypatch.setenv(name, value)  # so that what the attempt sets is taken back
     with pytest.raises(WorkerError, match="libegl1"):
         make(env_id, render=True)
 

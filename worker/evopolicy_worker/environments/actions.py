@@ -94,6 +94,7 @@ class _Box:
         self._low, self._high = bounds(schema)
         self._bounded_below = np.isfinite(self._low)
         self._bounded_above = np.isfinite(self._high)
+        self._bounded = bool(self._bounded_below.all() and self._bounded_above.all())
         self._is_float = self._dtype.kind == "f"
         limits: Any = np.finfo(self._dtype) if self._is_float else np.iinfo(self._dtype)
         # An infinite element becomes the largest finite one: simulators do not survive infinities.
@@ -146,6 +147,8 @@ class _Box:
     def sample(self, rng: np.random.Generator) -> NDArray[Any]:
         low, below, above = self._low, self._bounded_below, self._bounded_above
         high = self._high if self._is_float else self._high + 1
+        if self._is_float and self._bounded:
+            return rng.uniform(low, high).astype(self._dtype)
         values = np.empty(self._shape)
         # Gymnasium's order of drawing, so that the same generator gives the same action.
         free, only_high, only_low, both = ~below & ~above, ~below & above, below & ~above, below & above
@@ -313,9 +316,9 @@ def _shaped(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[Any] |
 
 
 def _inside(limit: Any) -> float:
-    """`limit` of a dtype as a float that casts back: the limits of 64-bit integers round to beyond them."""
+    """`limit` of a dtype as a float that casts back: the upper ones of 64-bit integers round to beyond them."""
     near = float(limit)
-    return near if abs(near) != 2.0**63 and near != 2.0**64 else float(np.nextafter(near, 0.0))
+    return near if near not in (2.0**63, 2.0**64) else float(np.nextafter(near, 0.0))
 
 
 def _float32_spacing(values: NDArray[np.float64]) -> NDArray[np.float64]:

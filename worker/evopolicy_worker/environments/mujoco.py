@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes.util
+from collections.abc import Mapping
+from ctypes.util import find_library
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
@@ -14,9 +15,9 @@ if TYPE_CHECKING:
 
 
 class MujocoFamily(GymnasiumFamily):
-    distributions = ("gymnasium", "mujoco")
-    modules = ("gymnasium", "mujoco")
-    components = {
+    distributions: tuple[str, ...] = ("gymnasium", "mujoco")
+    modules: tuple[str, ...] = ("gymnasium", "mujoco")
+    components: Mapping[str, tuple[str, ...]] = {
         "Reacher-v5": ("reward_dist", "reward_ctrl"),
         "HalfCheetah-v5": ("reward_forward", "reward_ctrl"),
         "Ant-v5": ("reward_forward", "reward_ctrl", "reward_contact", "reward_survive"),
@@ -25,7 +26,7 @@ class MujocoFamily(GymnasiumFamily):
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
         """As others; WorkerError where a picture is asked for and the host has no EGL to draw it."""
-        if render and ctypes.util.find_library("EGL") is None:
+        if render and find_library("EGL") is None:
             raise WorkerError(
                 f"{entry.id} renders with EGL, which is not installed: apt-get install libegl1 libegl-mesa0 "
                 "libgl1-mesa-dri"

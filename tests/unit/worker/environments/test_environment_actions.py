@@ -1,0 +1,347 @@
+"""Repair and sampling of actions, from the schema alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_worker.environments import compile_actions
+
+FOUR = {"type": "Discrete", "n": 4}
+SHIFTED = {"type": "Discrete", "n": 3, "start": -1}
+BOX = {"type": "Box", "shape": [3], "dtype": "float32", "low": [-1.0, 0.0, 0.0], "high": [1.0, 1.0, 1.0]}
+MATRIX = {
+    "type": "Box",
+    "shape": [2, 3],
+    "dtype": "float64",
+    "low": [[-1.0] * 3] * 2,
+    "high": [[1.0] * 3] * 2,
+}
+OPEN = {
+    "type": "Box",
+    "shape": [4],
+    "dtype": "float32",
+    "low": ["-inf", 0.5, "-inf", -2.0],
+    "high": ["inf", "inf", -3.0, 2.0],
+}
+WIDE = {"type": "Box", "shape": [40], "dtype": "float32", "min": -2.0, "max": 2.0}
+BYTES = {"type": "Box", "shape": [2], "dtype": "uint8", "low": [0, 10], "high": [255, 20]}
+LONGS = {"type": "Box", "shape": [1], "dtype": "int64", "low": [-(2**63)], "high": [2**63 - 1]}
+MULTI = {"type": "MultiDiscrete", "nvec": [2, 5], "start": [0, 1]}
+FLAGS = {"type": "MultiBinary", "n": 3}
+TEXT = {"type": "Text", "min_length": 2, "max_length": 5}
+DICT = {"type": "Dict", "spaces": {"steer": BOX, "gear": FOUR}}
+TUPLE = {"type": "Tuple", "spaces": [FOUR, FLAGS]}
+ALL: list[SpaceSchema] = [
+    FOUR,
+    SHIFTED,
+    BOX,
+    MATRIX,
+    OPEN,
+    WIDE,
+    BYTES,
+    LONGS,
+    MULTI,
+    FLAGS,
+    TEXT,
+    DICT,
+    TUPLE,
+]
+
+
+def same(left: Any, right: Any) -> bool:
+    if isinstance(left, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    if isinstance(left, np.ndarray):
+        return left.dtype == right.dtype and np.array_equal(left, right)
+    return type(left) is type(right) and bool(left == right)
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        2,
+        2.0,
+        np.int64(2),
+        np.uint8(2),
+        np.float32(2.0),
+        np.array(2),
+        np.array([2]),
+        np.array([[2.0]]),
+        [2],
+        (2,),
+        [[2]],
+    ],
+    ids=repr,
+)
+def test_any_form_of_a_choice_is_taken_as_it_is_meant(raw: object) -> None:
+    action, invalid = compile_actions(FOUR).repair(raw)
+    assert (action, type(action), invalid) == (2, int, False)
+
+
+@pytest.mark.parametrize(("raw", "choice"), [(True, 1), (False, 0), (np.bool_(True), 1)])
+def test_a_bool_counts_as_a_number(raw: object, choice: int) -> None:
+    assert compile_actions(FOUR).repair(raw) == (choice, False)
+
+
+@pytest.mark.parametrize(
+    ("raw", "choice"), [(4, 3), (-1, 0), (10**400, 3), (-(10**400), 0), (np.int64(9), 3), (7.0, 3), ([12], 3)]
+)
+def test_a_choice_out_of_bounds_is_clipped_and_marked(raw: object, choice: int) -> None:
+    assert compile_actions(FOUR).repair(raw) == (choice, True)
+
+
+NONSENSE = [
+    None,
+    "2",
+    b"2",
+    float("nan"),
+    float("inf"),
+    1.5,
+    1j,
+    {},
+    {"a": 1},
+    [],
+    [1, 2],
+    [[]],
+    [None],
+    object(),
+    np.array(["2"]),
+    np.array([1, 2]),
+    np.array(None),
+    [[[[[[[[[[2]]]]]]]]]],
+]
+
+
+@pytest.mark.parametrize("raw", NONSENSE, ids=repr)
+def test_a_choice_that_is_none_becomes_the_lowest(raw: object) -> None:
+    assert compile_actions(FOUR).repair(raw) == (0, True)
+    assert compile_actions(SHIFTED).repair(raw) == (-1, True)
+
+
+def test_a_shifted_choice_counts_from_its_start() -> None:
+    codec = compile_actions(SHIFTED)
+    assert [codec.repair(raw) for raw in (-2, -1, 0, 1, 2)] == [
+        (-1, True),
+        (-1, False),
+        (0, False),
+        (1, False),
+        (1, True),
+    ]
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        np.array([0.5, 0.25, 1.0], dtype=np.float32),
+        np.array([0.5, 0.25, 1.0]),
+        np.array([[0.5, 0.25, 1.0]]),
+        np.array([[0.5], [0.25], [1.0]], dtype=np.float16),
+        [0.5, 0.25, 1.0],
+        (0.5, 0.25, 1),
+        [np.float64(0.5), np.array(0.25), True],
+        [[0.5, 0.25, 1.0]],
+    ],
+    ids=repr,
+)
+def test_any_form_of_a_vector_is_taken_as_it_is_meant(raw: object) -> None:
+    action, invalid = compile_actions(BOX).repair(raw)
+    assert not invalid
+    assert action.dtype == np.float32
+    assert action.tolist() == [0.5, 0.25, 1.0]
+
+
+def test_a_repaired_array_is_never_the_one_that_came_in() -> None:
+    raw = np.array([0.5, 0.25, 1.0], dtype=np.float32)
+    action, _ = compile_actions(BOX).repair(raw)
+    raw[:] = 0
+    assert action.tolist() == [0.5, 0.25, 1.0]
+
+
+def test_rounding_beyond_a_bound_is_not_marked_but_clipped() -> None:
+    narrow = {"type": "Box", "shape": [1], "dtype": "float64", "low": [-0.1], "high": [0.1]}
+    action, invalid = compile_actions(narrow).repair([float(np.float32(0.1))])  # 0.10000000149
+    assert not invalid
+    assert action.tolist() == [0.1]
+    action, invalid = compile_actions(narrow).repair([0.1001])
+    assert invalid
+    assert action.tolist() == [0.1]
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"),
+    [
+        ([2.0, -1.0, 0.5], [1.0, 0.0, 0.5]),
+        (np.array([np.inf, -np.inf, 0.0]), [1.0, 0.0, 0.0]),
+        (np.array([1e300, 0.0, 0.0]), [1.0, 0.0, 0.0]),
+        ([float("nan"), 0.5, float("nan")], [-1.0, 0.5, 0.0]),
+        (0.5, [0.5, 0.5, 0.5]),
+        ([-7], [-1.0, 0.0, 0.0]),
+        ([0.1, 0.2], [-1.0, 0.0, 0.0]),
+        ([0.1, 0.2, 0.3, 0.4], [-1.0, 0.0, 0.0]),
+        ([10**400, 0, 0], [-1.0, 0.0, 0.0]),
+        ([[0.1, 0.2], [0.3]], [-1.0, 0.0, 0.0]),
+        (["0.1", "0.2", "0.3"], [-1.0, 0.0, 0.0]),
+        ([None, 0.0, 0.0], [-1.0, 0.0, 0.0]),
+        (np.array([1j, 0, 0]), [-1.0, 0.0, 0.0]),
+        ("abc", [-1.0, 0.0, 0.0]),
+        ({}, [-1.0, 0.0, 0.0]),
+    ],
+    ids=repr,
+)
+def test_a_bad_vector_is_repaired_and_marked(raw: object, expected: list[float]) -> None:
+    action, invalid = compile_actions(BOX).repair(raw)
+    assert invalid
+    assert action.dtype == np.float32
+    assert action.tolist() == pytest.approx(expected)
+
+
+def test_a_row_is_broadcast_to_a_matrix_and_marked() -> None:
+    action, invalid = compile_actions(MATRIX).repair([0.1, 0.2, 0.3])
+    assert invalid
+    assert action.tolist() == [[0.1, 0.2, 0.3]] * 2
+    action, invalid = compile_actions(MATRIX).repair([[0.1] * 2] * 3)  # transposed: not what was meant
+    assert invalid
+    assert action.tolist() == [[-1.0] * 3] * 2
+
+
+def test_elements_without_bounds_stay_finite() -> None:
+    codec = compile_actions(OPEN)
+    assert codec.repair(None)[0].tolist() == [0.0, 0.5, -3.0, -2.0]
+    action, invalid = codec.repair([np.inf, np.inf, -np.inf, 0.0])
+    assert invalid
+    assert bool(np.isfinite(action).all())
+    action, invalid = codec.repair([12345.0, 99.0, -1e6, 0.0])
+    assert not invalid
+    assert action.tolist() == [12345.0, 99.0, -1e6, 0.0]
+
+
+def test_a_fraction_in_an_integer_box_is_marked() -> None:
+    assert compile_actions(BYTES).repair([3.7, 12])[1]
+    action, invalid = compile_actions(BYTES).repair([300, 0])
+    assert invalid
+    assert action.tolist() == [255, 10]
+    action, invalid = compile_actions(LONGS).repair([1e30])
+    assert invalid
+    assert action.dtype == np.int64
+    assert action[0] > 2**62
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected", "marked"),
+    [
+        ([1, 3], [1, 3], False),
+        (np.array([1.0, 3.0]), [1, 3], False),
+        ([True, 3], [1, 3], False),
+        ([5, 0], [1, 1], True),
+        ([0.5, 2], [0, 2], True),
+        ([float("nan"), 2], [0, 2], True),
+        ([np.inf, 2], [1, 2], True),
+        ([2**63, 2], [1, 2], True),
+        (1, [1, 1], True),
+        (None, [0, 1], True),
+        ([1, 2, 3], [0, 1], True),
+    ],
+)
+def test_several_choices_are_repaired_one_by_one(raw: object, expected: list[int], marked: bool) -> None:
+    action, invalid = compile_actions(MULTI).repair(raw)
+    assert (action.dtype, action.tolist(), invalid) == (np.int64, expected, marked)
+
+
+def test_flags_text_dicts_and_tuples_are_repaired_by_part() -> None:
+    action, invalid = compile_actions(FLAGS).repair([1, 0, 7])
+    assert (action.dtype, action.tolist(), invalid) == (np.int8, [1, 0, 1], True)
+    assert compile_actions(TEXT).repair("abc") == ("abc", False)
+    assert compile_actions(TEXT).repair("abcdefg") == ("abcde", True)
+    assert compile_actions(TEXT).repair("a") == ("a ", True)
+    assert compile_actions(TEXT).repair(3) == ("  ", True)
+    whole, invalid = compile_actions(DICT).repair({"steer": [0.0, 0.0, 0.0], "gear": 2})
+    assert not invalid
+    assert whole["gear"] == 2
+    for broken in ({"steer": [0.0, 0.0, 0.0]}, {"steer": [0.0] * 3, "gear": 2, "extra": 1}, None, [1, 2]):
+        whole, invalid = compile_actions(DICT).repair(broken)
+        assert invalid
+        assert list(whole) == ["steer", "gear"]
+    pair, invalid = compile_actions(TUPLE).repair([2, [0, 1, 1]])
+    assert (pair[0], pair[1].tolist(), invalid) == (2, [0, 1, 1], False)
+    for bad in ([2], [2, [0, 1, 1], 3], None, 2):
+        pair, invalid = compile_actions(TUPLE).repair(bad)
+        assert invalid
+        assert len(pair) == 2
+
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=True, allow_infinity=True)
+    | st.text(max_size=8)
+    | st.binary(max_size=8)
+    | st.floats(width=32).map(np.float32)
+    | st.integers(-(2**63), 2**63 - 1).map(np.int64)
+    | st.lists(st.floats(width=16), max_size=6).map(lambda items: np.array(items, dtype=np.float16)),
+    lambda inner: (
+        st.lists(inner, max_size=5)
+        | st.lists(inner, max_size=3).map(tuple)
+        | st.dictionaries(st.sampled_from(["steer", "gear", "x"]), inner, max_size=3)
+    ),
+    max_leaves=12,
+)
+
+
+@pytest.mark.parametrize("schema", ALL, ids=lambda schema: schema["type"])
+@settings(deadline=None)
+@given(raw=values)
+def test_repair_never_raises_and_its_result_needs_no_repair(schema: SpaceSchema, raw: object) -> None:
+    codec = compile_actions(schema)
+    action, _ = codec.repair(raw)
+    again, invalid = codec.repair(action)
+    assert not invalid
+    assert same(again, action)
+
+
+@pytest.mark.parametrize("schema", ALL, ids=lambda schema: schema["type"])
+def test_a_random_action_is_valid_and_repeats_with_its_generator(schema: SpaceSchema) -> None:
+    codec = compile_actions(schema)
+    rng, twin = np.random.default_rng(3), np.random.default_rng(3)
+    for _ in range(50):
+        action = codec.sample(rng)
+        assert same(action, codec.sample(twin))
+        repaired, invalid = codec.repair(action)
+        assert not invalid
+        assert same(repaired, action)
+
+
+def test_random_actions_of_leaf_spaces_are_gymnasiums_own() -> None:
+    from gymnasium import spaces
+
+    pairs: list[tuple[Any, SpaceSchema]] = [
+        (spaces.Discrete(4), FOUR),
+        (spaces.Discrete(3, start=-1), SHIFTED),
+        (spaces.Box(np.array([-1, 0, 0], "f"), np.ones(3, "f")), BOX),
+        (
+            spaces.Box(np.array([-np.inf, 0.5, -np.inf, -2], "f"), np.array([np.inf, np.inf, -3, 2], "f")),
+            OPEN,
+        ),
+        (spaces.Box(np.array([0, 10], "uint8"), np.array([255, 20], "uint8"), dtype=np.uint8), BYTES),
+        (spaces.MultiDiscrete([2, 5], start=[0, 1]), MULTI),
+        (spaces.MultiBinary(3), FLAGS),
+    ]
+    for space, schema in pairs:
+        space.seed(11)
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(11)))
+        codec = compile_actions(schema)
+        for _ in range(30):
+            assert np.array_equal(space.sample(), codec.sample(rng))
+
+
+def test_a_space_of_unknown_kind_is_refused() -> None:
+    with pytest.raises(TypeError, match="Graph"):
+        compile_actions({"type": "Graph"})

@@ -1,0 +1,144 @@
+"""The Gymnasium adapter's own rules, on small environments made for the purpose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import ConfigError, WorkerError
+from evopolicy_common.messages.environment import Case
+from evopolicy_worker.environments import gymnasium_adapter, make, registry
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
+
+
+class Counter(gymnasium.Env[Any, Any]):
+    """Counts its steps in a buffer that it keeps writing; `options` change its stride for good, as highway-env's do."""
+
+    observation_space = gymnasium.spaces.Box(0, 1000, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    made = 0
+
+    def __init__(self) -> None:
+        Counter.made += 1
+        self.stride = 1
+        self.buffer = np.zeros(1, dtype=np.float32)
+        self.closed = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.stride = (options or {}).get("stride", self.stride)
+        self.buffer[0] = 0
+        return self.buffer, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        self.buffer[0] += self.stride
+        return (
+            self.buffer,
+            np.float32(0.5),
+            np.bool_(False),
+            False,
+            {"seed": 1, "count": np.int64(self.buffer[0])},
+        )
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class CounterFamily(GymnasiumFamily):
+    def __init__(self, *, rebuilds: bool = False, wrap: int | None = None) -> None:
+        self._rebuilds = rebuilds
+        self._wrap = wrap
+
+    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+        env: gymnasium.Env[Any, Any] = gymnasium.wrappers.OrderEnforcing(Counter())
+        return gymnasium.wrappers.TimeLimit(env, self._wrap) if self._wrap else env
+
+    def rebuilds(self, entry: Entry) -> bool:
+        return self._rebuilds
+
+
+ENTRY = Entry(
+    id="test/counter", gymnasium_id="Counter-v0", family="toy", title="Counter", max_episode_steps=5
+)
+
+
+@pytest.fixture(autouse=True)
+def _text(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gymnasium_adapter, "task_text", lambda env_id: "# Counter\n")
+    monkeypatch.setattr(Counter, "made", 0)
+
+
+def test_an_episode_without_its_own_limit_is_truncated_at_the_catalogues() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily())
+    for _ in range(2):
+        environment.reset(Case(seed=0))
+        assert [environment.step(0).truncated for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_gymnasiums_shorter_limit_counts_and_is_described() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily(wrap=3))
+    environment.reset(Case(seed=0))
+    assert [environment.step(0).truncated for _ in range(3)] == [False, False, True]
+    assert environment.description.max_episode_steps == 3
+
+
+def test_step_values_are_plain_and_observations_are_copies() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily())
+    first = environment.reset(Case(seed=0))
+    step = environment.step(0)
+    environment.step(0)
+    assert (first.tolist(), step.obs.tolist()) == ([0.0], [1.0])
+    assert [type(value) for value in step[1:4]] == [float, bool, bool]
+    assert step.info == {"count": 1}
+
+
+def test_an_environment_is_kept_between_episodes() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily())
+    for _ in range(3):
+        environment.reset(Case(seed=0))
+    assert Counter.made == 1
+
+
+def test_a_family_that_rebuilds_plays_every_episode_in_a_fresh_one() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily(rebuilds=True))
+    first: Any = environment._env
+    for _ in range(3):
+        environment.reset(Case(seed=0))
+    assert Counter.made == 3  # the one that was made to be described serves the first episode
+    assert first.closed
+
+
+def test_options_of_one_case_do_not_reach_the_next() -> None:
+    environment = GymnasiumEnvironment(ENTRY, CounterFamily())
+    environment.reset(Case(seed=0, options={"stride": 7}))
+    assert environment.step(0).obs.tolist() == [7.0]
+    environment.reset(Case(seed=0))
+    assert environment.step(0).obs.tolist() == [1.0]
+
+
+def test_an_id_that_the_catalogue_lacks_is_refused_naming_what_is_near() -> None:
+    with pytest.raises(ConfigError, match="gym/acrobot"):
+        make("gym/acrobat")
+
+
+def test_a_family_that_is_not_installed_is_not_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    from evopolicy_worker.environments import minigrid
+
+    monkeypatch.setattr(minigrid.FAMILY, "modules", ("gymnasium", "no_such_package"), raising=False)
+    assert not [env_id for env_id in registry.offered() if "MiniGrid" in env_id]
+    with pytest.raises(WorkerError, match=r"evopolicy\[worker\]"):
+        make("gymnasium/MiniGrid-FourRooms-v0")
+
+
+def test_an_entry_without_an_adapter_is_not_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "entries", lambda: {ENTRY.id: ENTRY})
+    monkeypatch.setattr(registry, "entry", lambda env_id: ENTRY)
+    assert registry.offered() == []
+    with pytest.raises(WorkerError, match="no adapter"):
+        make(ENTRY.id)

@@ -1,0 +1,129 @@
+"""Gymnasium spaces as plain dicts, and plain observations of them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from evopolicy_worker.environments.observations import compile_observation
+from evopolicy_worker.environments.spaces import bounds, obs_storage, parts, to_schema
+
+
+def test_each_kind_of_space_has_its_form() -> None:
+    assert to_schema(spaces.Discrete(3)) == {"type": "Discrete", "n": 3}
+    assert to_schema(spaces.Discrete(3, start=2)) == {"type": "Discrete", "n": 3, "start": 2}
+    assert to_schema(spaces.MultiDiscrete(np.array([[2, 3], [4, 5]]))) == {
+        "type": "MultiDiscrete",
+        "nvec": [[2, 3], [4, 5]],
+    }
+    assert to_schema(spaces.MultiDiscrete([2, 3], start=[1, 0]))["start"] == [1, 0]
+    assert to_schema(spaces.MultiBinary(4)) == {"type": "MultiBinary", "n": 4}
+    assert to_schema(spaces.MultiBinary([2, 2])) == {"type": "MultiBinary", "n": [2, 2]}
+    assert to_schema(spaces.Text(7, min_length=2)) == {"type": "Text", "min_length": 2, "max_length": 7}
+    assert to_schema(spaces.Tuple([spaces.Discrete(2)])) == {
+        "type": "Tuple",
+        "spaces": [{"type": "Discrete", "n": 2}],
+    }
+
+
+def test_bounds_are_nested_lists_by_shape_with_infinities_spelled() -> None:
+    box = spaces.Box(np.array([[-np.inf, -0.0]], "f"), np.array([[1.5, np.inf]], "f"))
+    assert to_schema(box) == {
+        "type": "Box",
+        "shape": [1, 2],
+        "dtype": "float32",
+        "low": [["-inf", 0.0]],
+        "high": [[1.5, "inf"]],
+    }
+    assert "-0.0" not in json.dumps(to_schema(box))
+
+
+def test_bounds_of_more_than_32_values_are_summed_up() -> None:
+    assert "low" in to_schema(spaces.Box(-1, 1, (32,)))
+    assert to_schema(spaces.Box(-np.inf, 1, (33,))) == {
+        "type": "Box",
+        "shape": [33],
+        "dtype": "float32",
+        "min": "-inf",
+        "max": 1.0,
+    }
+    symbolic = to_schema(spaces.Box(0, 255, (7, 7, 3), np.uint8))
+    assert symbolic == {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "min": 0, "max": 255}
+    assert type(symbolic["max"]) is int
+
+
+@pytest.mark.parametrize("shape", [(96, 96, 3), (16, 16, 1), (210, 160, 3)])
+def test_a_picture_is_an_image_stored_beside_the_rows(shape: tuple[int, ...]) -> None:
+    schema = to_schema(spaces.Box(0, 255, shape, np.uint8))
+    assert schema == {
+        "type": "Image",
+        "shape": list(shape),
+        "dtype": "uint8",
+        "layout": "HWC",
+        "value_range": [0, 255],
+        "storage": "npy",
+    }
+    assert obs_storage(schema) == "npy"
+    low, high = bounds(schema)
+    assert (low.min(), high.max(), low.shape) == (0.0, 255.0, shape)
+
+
+@pytest.mark.parametrize("shape", [(7, 7, 3), (15, 96, 3), (96, 96), (96, 96, 4), (3, 96, 96)])
+def test_other_bytes_are_a_box_kept_in_the_rows(shape: tuple[int, ...]) -> None:
+    schema = to_schema(spaces.Box(0, 255, shape, np.uint8))
+    assert schema["type"] == "Box"
+    assert obs_storage(schema) == "inline"
+
+
+def test_a_picture_inside_a_dict_is_stored_in_an_archive() -> None:
+    schema = to_schema(
+        spaces.Dict({"eye": spaces.Box(0, 255, (64, 64, 3), np.uint8), "dir": spaces.Discrete(4)})
+    )
+    assert schema["spaces"]["eye"]["storage"] == "npz"
+    assert obs_storage(schema) == "npz"
+    assert [part["type"] for part in parts(schema)] == ["Discrete", "Image"]
+
+
+def test_a_space_without_a_form_is_refused() -> None:
+    with pytest.raises(TypeError, match="Graph"):
+        to_schema(spaces.Graph(spaces.Discrete(2), None))
+
+
+def test_observations_become_plain_in_the_order_and_dtypes_of_the_space() -> None:
+    space = spaces.Dict(
+        {
+            "z": spaces.Box(-1, 1, (2,), np.float32),
+            "a": spaces.Discrete(5),
+            "m": spaces.Text(9),
+            "t": spaces.Tuple([spaces.MultiBinary(2), spaces.MultiDiscrete([3, 3])]),
+        }
+    )
+    convert = compile_observation(to_schema(space))
+    raw: dict[str, Any] = {
+        "t": (np.ones(2, "int32"), [1, 2]),
+        "m": np.str_("go"),
+        "a": np.int64(3),
+        "z": np.array([0.5, 1.0], dtype=np.float64),
+    }
+    obs = convert(raw)
+    assert list(obs) == ["a", "m", "t", "z"]
+    assert (type(obs["a"]), type(obs["m"]), type(obs["t"])) == (int, str, tuple)
+    assert (obs["z"].dtype, obs["t"][0].dtype, obs["t"][1].dtype) == (np.float32, np.int8, np.int64)
+
+
+def test_a_transposed_picture_becomes_contiguous_and_its_own() -> None:
+    picture = np.arange(16 * 20 * 3, dtype=np.uint8).reshape(20, 16, 3)
+    convert = compile_observation(to_schema(spaces.Box(0, 255, (16, 20, 3), np.uint8)))
+    obs = convert(picture.transpose(1, 0, 2))
+    assert obs.flags.c_contiguous
+    assert obs.tobytes() == picture.transpose(1, 0, 2).tobytes()
+    assert not np.shares_memory(obs, picture)
+
+
+def test_an_unknown_kind_of_observation_is_refused() -> None:
+    with pytest.raises(TypeError, match="Sequence"):
+        compile_observation({"type": "Sequence"})
