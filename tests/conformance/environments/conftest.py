@@ -1,4 +1,4 @@
-"""Environments are made once a session and shared: reuse is what is being tested."""
+"""Environments are made once per test run and shared: reuse is what is being tested."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evopolicy_worker.environments import Environment, make
 
 @pytest.fixture(scope="session")
 def warm() -> Iterator[Callable[[str], Environment]]:
-    """The session's environment of an id, used by many tests one after another."""
+    """The shared environment of an id, used by many tests one after another."""
     made: dict[str, Environment] = {}
 
     def get(env_id: str) -> Environment:
