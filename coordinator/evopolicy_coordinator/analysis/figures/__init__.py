@@ -1,0 +1,34 @@
+"""Every figure of a report, drawn with matplotlib (imported only here, when a figure is wanted)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from evopolicy_coordinator.analysis.figures import cost, edits, scores
+from evopolicy_coordinator.analysis.figures.style import Plot, looks
+from evopolicy_coordinator.analysis.scores import ordered_environments
+from evopolicy_coordinator.analysis.study import Study
+
+
+def figures_of(study: Study) -> Iterator[Plot]:
+    """The report's figures one after another, in its order; those with nothing to show are left out.
+
+    Each holds its drawing in memory until it is dropped: write it, then take the next.
+    """
+    look = looks(study.entries, study.reference)
+    for suite in study.suites:
+        for plot in (
+            scores.rank_scores(suite, look),
+            scores.score_evolution(suite, study, look),
+            scores.normalised_performance(suite, look),
+        ):
+            if plot is not None:
+                yield plot
+    for draw in (edits.hit_rates, edits.edit_size, cost.structure, cost.tokens, cost.wall_time):
+        plot = draw(study, look)
+        if plot is not None:
+            yield plot
+    for env in ordered_environments(line.env for line in study.timelines):
+        plot = edits.timeline(env, [line for line in study.timelines if line.env == env], look)
+        if plot is not None:
+            yield plot

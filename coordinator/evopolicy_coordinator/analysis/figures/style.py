@@ -1,0 +1,165 @@
+"""How every figure looks, and how it is written: palette, marks, rcParams, SVG and PNG.
+
+An agent has the same colour, marker and dash in every figure of a report, given by its place among the agents' names.
+Colours are Okabe and Ito's colour-blind-safe set (yellow and black left out, too weak on one of the two backgrounds), then
+three of Tol's; after nine agents colours repeat with another dash. The random reference is always grey and dashed.
+
+In the page, ink, muted text and grid follow its light or dark theme: `inline_svg` turns their three colours, which
+nothing else uses, into CSS variables.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import msgspec
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+INK = "#15181d"
+MUTED = "#5c6773"
+GRID = "#d5dae1"
+REFERENCE = "#868b92"
+
+COLOURS = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
+    "#aa4499", "#999933", "#882255",
+)  # fmt: skip
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
+
+EDIT_COLOURS = {"first": "#b9bec6", "synthesis": "#7b6fd0", "parametric": "#c9a227"}
+"""Bands of the timelines; not used by any agent."""
+
+PNG_DPI = 160
+
+RC: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 5.0,
+    "svg.fonttype": "none",
+    "axes.unicode_minus": True,
+}
+
+
+class Look(msgspec.Struct, frozen=True, kw_only=True):
+    """An agent's identity in figures."""
+
+    colour: str
+    marker: str
+    dash: Any
+
+
+class Plot:
+    """A drawn figure with what belongs beside it."""
+
+    __slots__ = ("alt", "caption", "data", "figure", "group", "name", "title")
+
+    def __init__(
+        self, *, name: str, title: str, caption: str, alt: str, data: Any, figure: Figure, group: str
+    ) -> None:
+        self.name = name
+        """File name without suffix."""
+        self.title = title
+        self.caption = caption
+        self.alt = alt
+        """What it shows, for who cannot see it."""
+        self.data = data
+        """JSON-able: the numbers drawn."""
+        self.figure = figure
+        self.group = group
+        """Section of the report."""
+
+
+def looks(agents: Sequence[str], reference: str | None) -> dict[str, Look]:
+    """Agent to look, by the place of its name among all agents of the report; the reference grey and dashed."""
+    out: dict[str, Look] = {}
+    for place, agent in enumerate(sorted(agents, key=lambda name: (name.casefold(), name))):
+        lap = place // len(COLOURS)
+        out[agent] = Look(
+            colour=COLOURS[place % len(COLOURS)],
+            marker=MARKERS[place % len(MARKERS)],
+            dash=DASHES[lap % len(DASHES)],
+        )
+    if reference is not None:
+        out[reference] = Look(colour=REFERENCE, marker="|", dash=DASHES[1])
+    return out
+
+
+def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
+    """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them."""
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure, figure.subplots(squeeze=False, **subplots)
+
+
+def svg_text(figure: Figure, name: str) -> str:
+    """The figure as a stand-alone SVG: text as text, transparent background, the same bytes for the same figure."""
+    out = io.StringIO()
+    with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    return out.getvalue()
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """The figure as PNG on white."""
+    out = io.BytesIO()
+    with matplotlib.rc_context(RC):
+        figure.savefig(out, format="png", dpi=PNG_DPI, facecolor="white")
+    return out.getvalue()
+
+
+_PROLOGUE = re.compile(r"^.*?(?=<svg)", re.DOTALL)
+_METADATA = re.compile(r"<metadata>.*?</metadata>\s*", re.DOTALL)
+_SIZE = re.compile(r'(<svg[^>]*?) width="[^"]*"')
+_HEIGHT = re.compile(r'(<svg[^>]*?) height="[^"]*"')
+_IDS = re.compile(r'(\bid="|xlink:href="#|url\(#)')
+_THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)"}
+
+
+def inline_svg(svg: str, name: str, alt: str) -> str:
+    """The SVG for use inside a page: themed, scaling with its container, named for assistive technology, ids made unique."""
+    prefix = "f" + hashlib.sha256(name.encode()).hexdigest()[:8] + "-"
+    body = _METADATA.sub("", _PROLOGUE.sub("", svg, count=1))
+    body = _IDS.sub(lambda match: match.group(1) + prefix, body)
+    for colour, variable in _THEME.items():
+        body = body.replace(colour, variable)
+    body = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", body, count=1), count=1)
+    label = alt.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    body = body.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+    return body.replace("'DejaVu Sans'", "system-ui, 'DejaVu Sans'")

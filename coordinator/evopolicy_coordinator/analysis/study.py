@@ -1,0 +1,161 @@
+"""Everything a report says about a set of runs, as one typed record: the notebook's entry point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_coordinator.analysis.audit import AuditSignals, TokenUse, audit_signals, token_use
+from evopolicy_coordinator.analysis.comparability import MixedRunsError, Mixture, mixtures
+from evopolicy_coordinator.analysis.edits import EditRates, Transition, classify, edit_rates
+from evopolicy_coordinator.analysis.evolution import Evolution, evolutions
+from evopolicy_coordinator.analysis.normalised import Normalised, normalised
+from evopolicy_coordinator.analysis.ranking import RESAMPLES, Leaderboard, leaderboard
+from evopolicy_coordinator.analysis.reader import load_runs
+from evopolicy_coordinator.analysis.records import LeftOut, Run
+from evopolicy_coordinator.analysis.scores import ScoreTable, ordered_environments, score_table, suites_of
+from evopolicy_coordinator.analysis.structure import (
+    EditSizeBin,
+    StructureMean,
+    edit_size_bins,
+    structure_means,
+)
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True):
+    """The scores of one suite's environments."""
+
+    name: str
+    table: ScoreTable
+    board: Leaderboard
+    normalised: Normalised
+
+
+class Timeline(msgspec.Struct, frozen=True, kw_only=True):
+    """One run's score-bearing submits with their edit types, for its code-phase timeline."""
+
+    run: str
+    entry: str
+    env: str
+    repeat: int
+    budget: int
+    transitions: tuple[Transition, ...]
+
+
+class Study(msgspec.Struct, frozen=True, kw_only=True):
+    """All metrics of a set of runs. Every list of records turns into a data frame by `records.rows`."""
+
+    runs: tuple[Run, ...]
+    left_out: tuple[LeftOut, ...]
+    mixtures: tuple[Mixture, ...]
+    """What the runs differ in that a comparison holds fixed; empty unless mixing was allowed."""
+    suites: tuple[Suite, ...]
+    evolutions: tuple[Evolution, ...]
+    edit_rates: tuple[EditRates, ...]
+    timelines: tuple[Timeline, ...]
+    structure: tuple[StructureMean, ...]
+    edit_sizes: tuple[EditSizeBin, ...]
+    tokens: tuple[TokenUse, ...]
+    audit: tuple[AuditSignals, ...]
+
+    @property
+    def entries(self) -> list[str]:
+        """Every agent by name, without the random reference."""
+        found = {entry for suite in self.suites for entry in suite.table.agents}
+        return sorted(found, key=lambda entry: (entry.casefold(), entry))
+
+    @property
+    def reference(self) -> str | None:
+        return next(
+            (suite.table.reference for suite in self.suites if suite.table.reference is not None), None
+        )
+
+
+def study_of(
+    runs: Sequence[Run],
+    *,
+    left_out: Iterable[LeftOut] = (),
+    allow_mixed: bool = False,
+    scores: ScoreTable | None = None,
+    resamples: int = RESAMPLES,
+) -> Study:
+    """Computes every metric. MixedRunsError when runs are no one comparison and `allow_mixed` is false.
+
+    `scores` adds a table of scores without run directories (such as the paper's): it has no submits, so it shows in
+    the leaderboard and normalised performance only. It may not name an entry that the runs name too.
+    """
+    mixed = mixtures(runs)
+    table = score_table(runs)
+    if scores is not None:
+        table, more = _merged(table, scores)
+        mixed += more
+    if mixed and not allow_mixed:
+        raise MixedRunsError(mixed)
+    ordered = _in_order(runs)
+    return Study(
+        runs=tuple(ordered),
+        left_out=tuple(left_out),
+        mixtures=tuple(mixed),
+        suites=tuple(
+            _suite(name, table.restricted(envs), resamples)
+            for name, envs in suites_of(table.environments).items()
+        ),
+        evolutions=tuple(evolutions(ordered)),
+        edit_rates=tuple(edit_rates(ordered)),
+        timelines=tuple(
+            Timeline(
+                run=run.name,
+                entry=run.entry,
+                env=run.env,
+                repeat=run.record.repeat,
+                budget=run.budget,
+                transitions=tuple(classify(run.submits)),
+            )
+            for run in ordered
+        ),
+        structure=tuple(structure_means(ordered)),
+        edit_sizes=tuple(edit_size_bins(ordered)),
+        tokens=tuple(token_use(ordered)),
+        audit=tuple(audit_signals(ordered)),
+    )
+
+
+def study(paths: Iterable[Path | str], *, allow_mixed: bool = False, jobs: int = 1) -> Study:
+    """Reads the runs at or under `paths` and computes every metric; see `study_of`."""
+    loaded = load_runs([Path(path) for path in paths], jobs=jobs)
+    return study_of(loaded.runs, left_out=loaded.left_out, allow_mixed=allow_mixed)
+
+
+def _suite(name: str, table: ScoreTable, resamples: int) -> Suite:
+    return Suite(
+        name=name, table=table, board=leaderboard(table, resamples=resamples), normalised=normalised(table)
+    )
+
+
+def _in_order(runs: Sequence[Run]) -> list[Run]:
+    place = {env: i for i, env in enumerate(ordered_environments(run.env for run in runs))}
+    return sorted(runs, key=lambda run: (place[run.env], run.entry.casefold(), run.record.repeat, run.name))
+
+
+def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:
+    """Both tables in one, and the mixture that this is where both have scores on an environment."""
+    twice = set(table.agents) & set(scores.agents)
+    if twice:
+        raise MixedRunsError(
+            [Mixture(what="entry from runs and from a CSV", where=n, values={}) for n in sorted(twice)]
+        )
+    cells = {**scores.cells, **table.cells}
+    harness = {**scores.harness, **table.harness}
+    if table.reference is not None and scores.reference is not None and table.reference != scores.reference:
+        for env in scores.environments:
+            cells.pop((scores.reference, env), None)
+        del harness[scores.reference]
+    reference = table.reference or scores.reference
+    shared = set(table.environments) & set(scores.environments)
+    found = [
+        Mixture(what="scores from runs and from a CSV", where=env, values={"runs": 1, "CSV": 1})
+        for env in ordered_environments(shared)
+    ]
+    return ScoreTable(cells=cells, harness=harness, reference=reference), found
