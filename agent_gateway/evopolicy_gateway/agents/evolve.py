@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.families import families_for, pusher_family
-from evopolicy_gateway.agents.feedback import episode_folders, novelty, read_steps
-from evopolicy_gateway.agents.plant import find_pusher_settings
-from evopolicy_gateway.agents.search import Candidate, Search, make_plan
+from evopolicy_gateway.agents.evolved.spaces import goal_keys
+from evopolicy_gateway.agents.families import families_for, moving_families
+from evopolicy_gateway.agents.feedback import Step, episode_folders, novelty, read_steps
+from evopolicy_gateway.agents.plant import find_plant
+from evopolicy_gateway.agents.search import Candidate, Episode, Search, make_plan
 from evopolicy_gateway.agents.staging import stage_candidates, stage_code
 
 MAX_ROWS_READ = 1000
 """Rows of one trajectory that the agent reads at most."""
-MAX_TRAJECTORIES_READ = 24
 MAX_REFUSALS = 3
 
 
@@ -45,6 +45,7 @@ class Agent:
         self._bounds = int(info["min_episodes_per_submit"]), int(info["max_episodes_per_submit"])
         self._search = Search(families_for(*self._spaces), np.random.default_rng(seed))
         self._next_case = 0
+        self._wants_plant = goal_keys(self._spaces[0])
         self._n_refusals = 0
 
     def run(self) -> None:
@@ -58,21 +59,22 @@ class Agent:
         for number, size in enumerate(plan.rounds, start=1):
             if self._budget < size + plan.episodes_per_final:
                 break
-            self._play_population(f"round {number}", self._search.round(size))
+            candidates = self._search.round(max(1, size // self._search.repeats))
+            self._play_population(f"round {number}", candidates, n_episodes=size)
         self._play_finals(plan.finals, plan.episodes_per_final)
 
     def _play_finals(self, n: int, n_episodes: int) -> None:
         """Single candidates on the same fresh cases, until nothing is left that a submit may spend."""
-        finalists = self._search.finalists(n)
         first_case = self._next_case
-        for number, finalist in enumerate(finalists, start=1):
-            if self._budget < max(n_episodes, self._bounds[0]):
-                break
-            spend = n_episodes
-            if number == len(finalists) or self._budget - spend < max(n_episodes, self._bounds[0]):
+        least = max(n_episodes, self._bounds[0])
+        number = 0
+        while self._budget >= self._bounds[0] and self._budget > 0:
+            number += 1
+            spend = min(least, self._budget)
+            if number >= n or self._budget - spend < least:
                 spend = min(self._budget, self._bounds[1])
             self._next_case = first_case
-            self._play_population(f"final {number}", [finalist], n_episodes=spend)
+            self._play_population(f"final {number}", [self._search.finalist()], n_episodes=spend)
 
     def _play_population(self, title: str, candidates: list[Candidate], n_episodes: int | None = None) -> None:
         """One submit in which the candidates take turns: each of them on the same case, then on the next one."""
@@ -82,8 +84,11 @@ class Agent:
             return
         schedule = [i % len(candidates) for i in range(total)]
         turns = [i // len(candidates) for i in range(total)]
-        cases = [(self._next_case + turn) % self._n_cases for turn in turns]
-        self._next_case += turns[-1] + 1
+        # One case for all compares them best; but where reward is rare, each case is another chance to meet it.
+        spread = self._search.is_sparse and len(candidates) > 1
+        offsets = range(total) if spread else turns
+        cases = [(self._next_case + offset) % self._n_cases for offset in offsets]
+        self._next_case += offsets[-1] + 1
         stage_candidates(self._system, candidates, schedule if len(candidates) > 1 else [0])
         verdict = self._client.submit(cases)
         if isinstance(verdict, Refusal):
@@ -102,29 +107,27 @@ class Agent:
         if verdict.status != "ok" or not returns:
             return
         failed = set(verdict.summary.get("errors") or ()) | set(verdict.summary.get("timeouts") or ())
+        episodes = self._trajectories(verdict, len(schedule)) if len(candidates) > 1 else []
         for index, (turn, case, value) in enumerate(zip(schedule, cases, returns, strict=True)):
             if index not in failed and value is not None and np.isfinite(value):
-                candidates[turn].returns.append((case, float(value)))
-        if len(candidates) > 1:
-            self._read_trajectories(verdict, candidates, schedule)
-
-    def _read_trajectories(self, verdict: Verdict, candidates: list[Candidate], schedule: list[int]) -> None:
-        """Novelty while no reward tells candidates apart; the plant, once, where the spaces suggest a pusher."""
-        summary = verdict.summary
-        folders = episode_folders(
-            self._workspace, verdict.submit_id, len(schedule), int(summary["first_global_episode"])
-        )
-        knows_pusher = any(c.family.kind == "pusher" for c in self._search.candidates)
-        wants_plant = not knows_pusher and "desired_goal" in self._spaces[0].get("spaces", {})
-        if not self._search.is_flat and not wants_plant:
-            return
-        episodes = [read_steps(folder, MAX_ROWS_READ) for folder in folders[:MAX_TRAJECTORIES_READ]]
-        for turn, steps in zip(schedule, episodes, strict=False):
-            candidates[turn].novelties.append(float(novelty(steps)))
-        if wants_plant:
-            settings = find_pusher_settings(*self._spaces, episodes)
+                new = float(novelty(episodes[index])) if index < len(episodes) else 0.0
+                candidates[turn].episodes.append(Episode(case=case, episode_return=float(value), novelty=new))
+        if episodes and self._wants_plant:
+            settings = find_plant(*self._spaces, episodes)
             if settings is not None:
-                self._search.add_family(pusher_family(settings, *self._spaces))
+                self._wants_plant = False
+                for family in moving_families(settings, *self._spaces):
+                    self._search.add_family(family)
+
+    def _trajectories(self, verdict: Verdict, n_episodes: int) -> list[list[Step]]:
+        """Trajectories of a population's episodes, where something is to be had from them; else none."""
+        returns = verdict.summary["returns"]
+        tells_apart = len(set(returns)) > len(returns) // 2
+        if tells_apart and not self._wants_plant:
+            return []
+        first = int(verdict.summary["first_global_episode"])
+        folders = episode_folders(self._workspace, verdict.submit_id, n_episodes, first)
+        return [read_steps(folder, MAX_ROWS_READ) for folder in folders]
 
     def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
         """One line: what was played, how it went, what leads, what is left."""
@@ -137,7 +140,7 @@ class Agent:
         ranked = self._search.ranking()
         if ranked:
             leader = ranked[0]
-            values = [value for _, value in leader.returns]
+            values = [episode.episode_return for episode in leader.episodes]
             line += f"; leader {leader.family.name} {np.mean(values):.2f} over {len(values)}"
         print(f"{line}; {self._budget} episodes left", flush=True)
 

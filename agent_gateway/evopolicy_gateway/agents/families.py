@@ -70,24 +70,29 @@ def families_for(obs_space: Schema, action_space: Schema) -> list[Family]:
     return families
 
 
-def pusher_family(settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> Family:
-    """The family that uses a plant found from trajectories; its default first, then variations."""
-    size = parameter_count("pusher", settings, obs_space, action_space)
-    spread = np.full(size, 0.6)
-    free = np.ones(size, dtype=bool)
-    free[-ActionHead(action_space).size :][settings["outputs"]] = False
-    shut, opened = np.zeros(size), np.zeros(size)
-    shut[-ActionHead(action_space).size :] = -1.0
-    opened[-ActionHead(action_space).size :] = 1.0
-    return Family(
-        name="pusher",
-        kind="pusher",
-        settings=settings,
-        first=(shut * free, opened * free),
-        centre=shut * free,
-        spread=spread * free,
-        scale=spread * free,
-    )
+def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> list[Family]:
+    """The families that use a plant found from trajectories; the defaults first, then variations."""
+    n_outputs = ActionHead(action_space).size
+    families = []
+    for kind in ("pusher", "carrier"):
+        size = parameter_count(kind, settings, obs_space, action_space)
+        others = np.zeros(size)
+        others[-n_outputs:] = 1.0
+        others[-n_outputs:][settings["outputs"]] = 0.0
+        parameters = np.zeros(size)
+        parameters[:-n_outputs] = 1.0
+        families.append(
+            Family(
+                name=kind,
+                kind=kind,
+                settings=settings,
+                first=(-others, others),
+                centre=-others if kind == "pusher" else others,
+                spread=0.6 * parameters,
+                scale=0.6 * parameters + 0.3 * others,
+            )
+        )
+    return families
 
 
 def _constant(action_space: Schema, n_outputs: int) -> Family:

@@ -1,4 +1,4 @@
-"""Finds out from trajectories how actions move what is observed: the plant that a pusher needs to know.
+"""Finds out from trajectories how actions move what is observed: the plant that a controller which moves things needs to know.
 
 An effector's coordinate is a component of `observation` whose step-to-step change follows one output, and whose values
 lie where the achieved goal's do on that axis.
@@ -15,34 +15,35 @@ from numpy.typing import NDArray
 from evopolicy_gateway.agents.evolved.spaces import Schema, goal_keys
 from evopolicy_gateway.agents.feedback import Step
 
+N_AXES = 3
+"""Goals are taken for positions when they have this many elements: things in a plane leave no way over them."""
 MIN_STEPS = 40
 MIN_CORRELATION = 0.5
 REACTION_STEPS = 2
 """An action's effect is looked for in the displacement over this many steps."""
 
 
-def find_pusher_settings(
+def find_plant(
     obs_space: Schema, action_space: Schema, episodes: list[list[Step]]
 ) -> dict[str, Any] | None:
-    """Settings for the `pusher` controller, or None where the spaces or the trajectories do not give any."""
+    """Settings for the `pusher` and `carrier` controllers, or None where the spaces or the trajectories do not give any."""
     if not goal_keys(obs_space) or action_space["type"] != "Box":
         return None
     n_axes = math.prod(obs_space["spaces"]["desired_goal"]["shape"])
-    if not 2 <= n_axes <= 3 or math.prod(action_space["shape"]) < n_axes:
+    if n_axes != N_AXES or math.prod(action_space["shape"]) < n_axes:
         return None
     long_enough = [steps for steps in episodes if len(steps) > REACTION_STEPS + 1]
     if sum(map(len, long_enough)) < MIN_STEPS:
         return None
     observed, achieved, desired, displacement, actions = _stack(long_enough)
     correlation = _correlations(displacement, actions)
-    axes = _match_axes(correlation, observed, achieved)
+    axes = _match_axes(correlation, observed, achieved, desired)
     if axes is None:
         return None
     effector = [component for component, _ in axes]
     outputs = [output for _, output in axes]
     slopes = [_slope(displacement[:, c], actions[:, o]) / REACTION_STEPS for c, o in axes]
-    # Pass over along the axis where start and goal differ least: that is where the thing rests on something.
-    lift_axis = int(np.argmin(np.abs(desired - achieved).mean(axis=0)))
+    lift_axis = _lift_axis(achieved, float(np.abs(slopes).mean()))
     return {"effector": effector, "outputs": outputs, "slopes": slopes, "lift_axis": lift_axis}
 
 
@@ -75,16 +76,24 @@ def _correlations(displacement: Rows, actions: Rows) -> Rows:
     return correlation
 
 
-def _match_axes(correlation: Rows, observed: Rows, achieved: Rows) -> list[tuple[int, int]] | None:
+def _lift_axis(achieved: Rows, step: float) -> int:
+    """The axis along which the thing, disturbed, moved least: it rests on something. The last one when none moved."""
+    moved = np.ptp(achieved, axis=0)
+    return int(np.argmin(moved)) if moved.max() > max(step / 2, 3 * moved.min()) else N_AXES - 1
+
+
+def _match_axes(
+    correlation: Rows, observed: Rows, achieved: Rows, desired: Rows
+) -> list[tuple[int, int]] | None:
     """Per goal axis the observation component and output that move along it; None when an axis has none."""
-    spread = float(np.max(achieved.max(axis=0) - achieved.min(axis=0))) or 1.0
+    reach = np.maximum(np.ptp(observed, axis=0), np.abs(desired - achieved).max())
     axes: list[tuple[int, int]] = []
     for axis in range(achieved.shape[1]):
         far = np.abs(observed.mean(axis=0) - achieved[:, axis].mean())
         # What merely repeats the achieved goal is the thing, not the effector.
         same = np.abs(observed - achieved[:, axis : axis + 1]).mean(axis=0) < 1e-9
         taken = [component for component, _ in axes]
-        able = (correlation.max(axis=1) > MIN_CORRELATION) & (far < 2 * spread) & ~same
+        able = (correlation.max(axis=1) > MIN_CORRELATION) & (far < 2 * reach) & ~same
         able[taken] = False
         if not able.any():
             return None

@@ -3,8 +3,10 @@
 - An *opening* tries candidates of every family once; each later *round* re-tries the survivors beside their mutants, all
   on the same case, so that they differ by nothing but themselves; *finals* try single candidates, each a checkpoint.
 - A return is explained as candidate effect + case effect (fitted by alternating means), so that candidates that met
-  different cases can be compared; a candidate's worth is its effect less a penalty for having been seen seldom.
-- Where returns tell nothing apart (a reward that nobody has met yet), novelty stands in for them.
+  different cases can be compared; a candidate's worth is its effect, drawn towards its family's mean while it was seen
+  seldom, since the best of many single returns is mostly luck.
+- Where most returns are one and the same (a reward that hardly anybody has met yet), novelty is added to them, and a
+  round is spread over cases, since a case on which nobody meets the reward teaches nothing.
 """
 
 from __future__ import annotations
@@ -18,27 +20,46 @@ import numpy as np
 
 from evopolicy_gateway.agents.families import Family, Vector
 
-DOUBT = 0.5
-"""Penalty of a candidate seen once, in standard deviations of a single return."""
+MEAN_AFTER = 2
+"""The mean of the best becomes a final after this many others."""
 SURVIVING_SHARE = 0.35
 """Share of a round that re-tries survivors."""
 FIRST_STRENGTH, STRENGTH_DECAY = 0.8, 0.7
 """Mutation strength of the first round after the opening, and its factor from round to round."""
+SPARSE_SHARE = 0.6
+"""Returns are sparse when more than this share of them is the same."""
+NOISY_RATIO = 0.5
+"""Variance of noise over that of candidate effects from which on a candidate meets two cases a round."""
+TIED_SHARE = 0.15
+"""Share of a round that may share its best return before one case is taken to be too easy."""
+NOVELTY_BONUS = 0.3
+"""What the most novel episode is worth while returns are sparse, in units of the returns' range."""
 MAX_PER_FAMILY = 0.6
 """Share of the survivors that one family may hold, so that an early lucky one does not end the race."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One episode that a candidate played."""
+
+    case: int
+    """Train case id."""
+    episode_return: float
+    novelty: float = 0.0
+    """How many different observations it saw; 0 when nobody looked."""
+
+
 @dataclass(kw_only=True, eq=False)
 class Candidate:
-    """One parametrised controller, and every return seen of it."""
+    """One parametrised controller, and every episode seen of it."""
 
     family: Family
     vector: Vector
     origin: str
     """How it came about: `opening`, `mutant`, `mean`."""
-    returns: list[tuple[int, float]] = field(default_factory=list)
-    """(train case, return) of each episode it played."""
-    novelties: list[float] = field(default_factory=list)
+    episodes: list[Episode] = field(default_factory=list)
+    is_final: bool = False
+    """True once it was given a checkpoint of its own."""
 
     def as_json(self) -> dict[str, Any]:
         """As `candidates.json` lists it."""
@@ -65,9 +86,9 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
 
     A small budget goes into finals, since each is judged again on the hidden validation cases; a large one into search.
     """
-    per_final = max(min_per_submit, min(4, budget // 32, max_per_submit), 1)
+    per_final = max(min_per_submit, min(3, budget // 32, max_per_submit), 1)
     share = 0.5 if budget <= 16 else 0.35 if budget <= 64 else 0.28
-    n_finals = max(1, min(8, int(budget * share) // per_final))
+    n_finals = max(1, min(10, int(budget * share) // per_final))
     searching = budget - n_finals * per_final
     if searching < max(2, min_per_submit):
         return Plan(opening=0, rounds=(), finals=max(1, budget // per_final), episodes_per_final=per_final)
@@ -125,51 +146,88 @@ class Search:
         fresh += [self._mutant(survivors, strength) for _ in range(n_mutants)]
         return survivors + self._joined(fresh)
 
-    def finalists(self, n: int) -> list[Candidate]:
-        """`n` candidates worth a checkpoint each: the best, the mean of the best's family, the best of other families."""
-        ranked = self.ranking()
-        if not ranked:
-            return self.opening(n)
-        chosen = ranked[: max(1, n // 2)]
-        mean = self._mean_of_best(ranked)
-        if mean is not None and n >= 4:
-            chosen += self._joined([mean])
-        for family in {c.family.name: c.family for c in ranked}.values():
-            best = next(c for c in ranked if c.family is family)
-            if best not in chosen:
-                chosen.append(best)
-        chosen += [c for c in ranked if c not in chosen]
-        if len(chosen) < n:
-            chosen += self.opening(n - len(chosen))
-        return chosen[:n]
+    def finalist(self) -> Candidate:
+        """The next candidate worth a checkpoint of its own.
+
+        In turn the best that is left, and the best of a family seldom chosen so far: the hidden validation sees more
+        cases than the search did, so a hedge against a leader that was lucky costs little.
+        """
+        taken = [c for c in self.candidates if c.is_final]
+        left = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
+        if not left:
+            left = self.opening(1) or self.ranking()
+        chosen = left[0]
+        if len(taken) == MEAN_AFTER:
+            chosen = self._mean_of_best() or chosen
+        elif len(taken) % 2:
+            worth = self.worth()
+            bar = self._hedge_bar(worth)
+            able = [c for c in left if worth.get(id(c), bar) >= bar] or left[:1]
+            finals = [c.family.name for c in taken]
+            chosen = min(able, key=lambda c: finals.count(c.family.name))
+        chosen.is_final = True
+        return chosen
 
     def ranking(self) -> list[Candidate]:
         """All candidates that were tried, best first."""
         worth = self.worth()
-        tried = [c for c in self.candidates if c.returns]
+        tried = [c for c in self.candidates if c.episodes]
         return sorted(tried, key=lambda c: worth[id(c)], reverse=True)
 
     def worth(self) -> dict[int, float]:
-        """By `id` of each tried candidate: its effect, less the doubt of having been seen seldom."""
-        tried = [c for c in self.candidates if c.returns]
+        """By `id` of each tried candidate: its effect, drawn towards its family's mean while it was seen seldom."""
+        tried = [c for c in self.candidates if c.episodes]
         if not tried:
             return {}
-        use_novelty = self.is_flat
-        effects, noise = _effects([_scores(c, use_novelty) for c in tried])
-        counts = [len(c.returns) for c in tried]
-        return {
-            id(c): effect - DOUBT * noise / np.sqrt(count)
-            for c, effect, count in zip(tried, effects, counts, strict=True)
-        }
+        effects, ratio = self._effects(tried)
+        counts = np.array([len(c.episodes) for c in tried])
+        owner = np.unique([c.family.name for c in tried], return_inverse=True)[1]
+        family_mean = (np.bincount(owner, effects) / np.bincount(owner))[owner]
+        # As many imagined episodes at the family's mean as the noise is worth against the differences.
+        imagined = max(ratio, 1.0 if self.is_sparse else 0.0)
+        shrunk = (counts * effects + imagined * family_mean) / (counts + imagined)
+        return {id(c): float(value) for c, value in zip(tried, shrunk, strict=True)}
 
     @property
-    def is_flat(self) -> bool:
-        """True while, case by case, no return differs from another."""
-        by_case: dict[int, list[float]] = {}
-        for candidate in self.candidates:
-            for case, value in candidate.returns:
-                by_case.setdefault(case, []).append(value)
-        return all(max(values) - min(values) < 1e-9 for values in by_case.values())
+    def repeats(self) -> int:
+        """How many cases each candidate of the next round should meet: two where one does not tell them apart."""
+        tried = [c for c in self.candidates if c.episodes]
+        if not tried or self.is_sparse:
+            return 1
+        last = [c.episodes[-1].episode_return for c in tried if c.episodes[-1].case == tried[-1].episodes[-1].case]
+        tied = last.count(max(last)) > len(last) * TIED_SHARE
+        return 2 if tied or self._effects(tried)[1] > NOISY_RATIO else 1
+
+    def _effects(self, tried: list[Candidate]) -> tuple[Vector, float]:
+        """Effects of `tried`, and the variance of one episode's noise over that of the better half's effects, ≤ 2."""
+        effects, noise = _fit(self._scores(tried))
+        better = np.sort(effects)[len(effects) // 2 :]
+        return effects, min(noise**2 / max(float(np.var(better)), 1e-12), 2.0)
+
+    @property
+    def is_sparse(self) -> bool:
+        """True while most returns are one and the same."""
+        returns = np.array([e.episode_return for c in self.candidates for e in c.episodes])
+        if not returns.size:
+            return False
+        return bool(np.isclose(returns, np.median(returns), rtol=0.0, atol=1e-9).mean() > SPARSE_SHARE)
+
+    def _scores(self, tried: list[Candidate]) -> list[list[tuple[int, float]]]:
+        """Per candidate (case, score) of its episodes: the returns, with a bonus for novelty while they are sparse."""
+        bonus = 0.0
+        if self.is_sparse:
+            returns = [e.episode_return for c in tried for e in c.episodes]
+            most = max(e.novelty for c in tried for e in c.episodes) or 1.0
+            bonus = NOVELTY_BONUS * (max(returns) - min(returns) or 1.0) / most
+        return [[(e.case, e.episode_return + bonus * e.novelty) for e in c.episodes] for c in tried]
+
+    def _hedge_bar(self, worth: dict[int, float]) -> float:
+        """What a hedge must be worth: near the leader where returns are sure, as little as the middle where they are not."""
+        values = np.array(list(worth.values()) or [0.0])
+        tried = [c for c in self.candidates if c.episodes]
+        doubt = min(1.0, self._effects(tried)[1]) if tried else 1.0
+        best = float(values.max())
+        return best - (0.25 + 0.75 * doubt) * (best - float(np.median(values)))
 
     def _survivors(self, n: int) -> list[Candidate]:
         ranked = self.ranking()
@@ -210,27 +268,38 @@ class Search:
                 return Candidate(family=family, vector=vector, origin="opening")
         return Candidate(family=parents[0].family, vector=parents[0].vector, origin="opening")
 
-    def _mean_of_best(self, ranked: list[Candidate]) -> Candidate | None:
+    def _mean_of_best(self) -> Candidate | None:
         """The mean of the leading family's best candidates, as the cross-entropy method would have it."""
-        family = ranked[0].family
-        elite = [c for c in ranked if c.family is family and len(c.returns) > 1][:3]
-        if len(elite) < 2 or not family.scale.any():
+        ranked = self.ranking()
+        elite = [c for c in ranked if c.family is ranked[0].family and len(c.episodes) > 1][:3]
+        if len(elite) < 2 or not elite[0].family.scale.any():
             return None
-        return Candidate(family=family, vector=np.mean([c.vector for c in elite], axis=0), origin="mean")
+        vector = np.mean([c.vector for c in elite], axis=0)
+        return self._joined([Candidate(family=elite[0].family, vector=vector, origin="mean")])[0]
 
     def _joined(self, candidates: list[Candidate]) -> list[Candidate]:
         self.candidates += candidates
         return candidates
 
 
-def _scores(candidate: Candidate, use_novelty: bool) -> list[tuple[int, float]]:
-    if not use_novelty or not candidate.novelties:
-        return candidate.returns
-    cases = [case for case, _ in candidate.returns]
-    return list(zip(cases, candidate.novelties, strict=False))
+def _distinct(kept: list[Candidate], ranked: list[Candidate]) -> list[Candidate]:
+    """`ranked` without those that did exactly as a kept or better one did wherever both were seen: the same behaviour."""
+    seen = list(kept)
+    distinct: list[Candidate] = []
+    for candidate in ranked:
+        if not any(_same_behaviour(candidate, other) for other in seen):
+            distinct.append(candidate)
+            seen.append(candidate)
+    return distinct
 
 
-def _effects(scores: list[list[tuple[int, float]]]) -> tuple[list[float], float]:
+def _same_behaviour(one: Candidate, other: Candidate) -> bool:
+    returns = {e.case: e.episode_return for e in one.episodes}
+    shared = [(returns[e.case], e.episode_return) for e in other.episodes if e.case in returns]
+    return bool(shared) and all(a == b for a, b in shared)
+
+
+def _fit(scores: list[list[tuple[int, float]]]) -> tuple[Vector, float]:
     """Candidate effects of an additive model candidate + case, and the standard deviation of its residuals.
 
     Where nobody played twice there are no residuals to speak of: the noise is then 0, as it is the same for all.
@@ -249,4 +318,4 @@ def _effects(scores: list[list[tuple[int, float]]]) -> tuple[list[float], float]
     residual = values - effect[owner] - case_effect[cases]
     freedom = len(values) - n_candidates - n_cases + 1
     noise = float(np.sqrt((residual**2).sum() / freedom)) if freedom > 0 else 0.0
-    return [float(e) for e in effect], noise
+    return effect, noise

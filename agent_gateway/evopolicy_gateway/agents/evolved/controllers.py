@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .pushing import Pusher
+from .pushing import Carrier, Pusher
 from .spaces import ActionHead, Features, Schema, Vector, as_image
 
 OSCILLATOR_PERIOD_STEPS = 25.0
@@ -30,6 +30,7 @@ def parameter_count(kind: str, settings: dict[str, Any], obs_space: Schema, acti
         "explorer": outputs + 3,
         "saliency": 3 + SALIENCY_FEATURES * outputs,
         "pusher": Pusher.PARAMETERS + outputs,
+        "carrier": Carrier.PARAMETERS + outputs,
     }[kind]
 
 
@@ -131,7 +132,7 @@ def fingerprint(obs: Any) -> bytes:
     return values.tobytes() if values.dtype.kind in "iub" else np.round(values, 2).tobytes()
 
 
-Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher
+Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher | Carrier
 
 
 def build(
@@ -156,4 +157,6 @@ def build(
         return Saliency(head, obs_space, vector)
     if kind == "pusher":
         return Pusher(head, vector, settings)
+    if kind == "carrier":
+        return Carrier(head, vector, settings)
     raise ValueError(f"no controller of kind {kind!r}")

@@ -1,7 +1,13 @@
-"""Brings a thing to its goal with an effector that the actions move: get behind it, touch it, push along the line.
+"""Brings a thing to its goal with an effector that the actions move: by pushing it, or by grasping and carrying it.
 
 Which observation components are the effector's position, and which action moves each, is found from trajectories
-(`plant.py` on the agent's side) and comes as settings; nothing is known of the task but the goal convention.
+(`plant.py` on the agent's side) and comes as settings; nothing is known of the task but the goal convention: Dict
+observations with `observation`, and `achieved_goal` and `desired_goal`, here positions in space.
+
+Settings: `effector`, per axis the index into `observation`; `outputs`, per axis the output that moves it; `slopes`,
+displacement per unit of that output and step; `lift_axis`, the axis along which things are approached from above.
+Parameters are factors around 0 = the default; then comes an offset for every output: what those that move no axis do
+meanwhile, such as a gripper. Lengths are in units of the effector's travel in one step.
 """
 
 from __future__ import annotations
@@ -10,18 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from .spaces import ActionHead, Vector, goal_error
+from .spaces import ActionHead, Vector
+
+FACTOR_RANGE = 3.0
+"""Factors lie between 2 to minus this and 2 to this."""
 
 
-class Pusher:
-    """A controller for Dict observations with `observation`, `achieved_goal` and `desired_goal`.
-
-    Settings: `effector`, per goal axis the index into `observation`; `outputs`, per goal axis the output that moves it;
-    `slopes`, displacement per unit of that output and step; `lift_axis`, the axis along which to pass over the thing.
-    Parameters, as factors around 0 = the default: distance kept behind, clearance, depth of touch, sideways tolerance,
-    speed, goal tolerance; then an offset for every output (what the others do meanwhile, such as a gripper).
-    Lengths are in units of the effector's travel in one step.
-    """
+class _Mover:
+    """What pushing and carrying share: reading the observation, and moving the effector to a point."""
 
     PARAMETERS = 6
 
@@ -31,35 +33,58 @@ class Pusher:
         self._outputs = np.array(settings["outputs"], dtype=int)
         self._slopes = np.array(settings["slopes"], dtype=float)
         self._lift = int(settings["lift_axis"])
-        step = float(np.abs(self._slopes).mean())
-        factors = 2.0 ** np.clip(vector[: self.PARAMETERS], -3, 3)
-        self._behind = 2.5 * step * factors[0]
-        self._clearance = 2.0 * step * factors[1]
-        self._depth = step * vector[2]
-        self._sideways = 0.7 * step * factors[3]
-        self._speed = factors[4]
-        self._near = 0.5 * step * factors[5]
+        self._step = float(np.abs(self._slopes).mean())
+        self._factors = 2.0 ** np.clip(vector[: self.PARAMETERS], -FACTOR_RANGE, FACTOR_RANGE)
+        self._speed = float(self._factors[4])
+        self._depth = float(self._step * vector[2])
         self._offset = vector[self.PARAMETERS :]
 
-    def act(self, obs: Any) -> Any:
-        thing = np.asarray(obs["achieved_goal"], dtype=float).reshape(-1)
+    def _positions(self, obs: Any) -> tuple[Vector, Vector, Vector]:
+        """Thing, its goal, and the effector; each a fresh float64 vector with an element per axis."""
+        thing = np.array(obs["achieved_goal"], dtype=float).reshape(-1)
+        goal = np.array(obs["desired_goal"], dtype=float).reshape(-1)
         effector = np.asarray(obs["observation"], dtype=float).reshape(-1)[self._effector]
-        missing = goal_error(obs)
-        missing[self._lift] = 0.0
-        distance = float(np.linalg.norm(missing))
-        outputs = self._offset.copy()
-        outputs[self._outputs] = 0.0
-        if distance > self._near:
-            move = self._target(thing, effector, missing / distance, distance) - effector
-            outputs[self._outputs] = self._speed * move / self._slopes
+        return thing, goal, effector
+
+    def _level(self, difference: Vector) -> Vector:
+        """The part of `difference` across the lift axis."""
+        level = difference.copy()
+        level[self._lift] = 0.0
+        return level
+
+    def _action(self, move: Vector, others: float = 1.0) -> Any:
+        """The action for a wanted displacement; `others` multiplies what the remaining outputs do."""
+        outputs = others * self._offset
+        outputs[self._outputs] = self._speed * move / self._slopes
         return self._head.action(outputs)
+
+
+class Pusher(_Mover):
+    """Gets behind the thing, touches it, pushes along the line to the goal.
+
+    Parameters: distance kept behind, clearance, depth of touch, sideways tolerance, speed, goal tolerance.
+    """
+
+    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any]) -> None:
+        super().__init__(head, vector, settings)
+        self._behind = 2.5 * self._step * self._factors[0]
+        self._clearance = 2.0 * self._step * self._factors[1]
+        self._sideways = 0.7 * self._step * self._factors[3]
+        self._near = 0.5 * self._step * self._factors[5]
+
+    def act(self, obs: Any) -> Any:
+        thing, goal, effector = self._positions(obs)
+        missing = self._level(goal - thing)
+        distance = float(np.linalg.norm(missing))
+        if distance <= self._near:
+            return self._action(np.zeros_like(missing))
+        return self._action(self._target(thing, effector, missing / distance, distance) - effector)
 
     def _target(self, thing: Vector, effector: Vector, way: Vector, distance: float) -> Vector:
         """Where the effector should go next."""
         touch = thing.copy()
         touch[self._lift] += self._depth
-        offset = effector - thing
-        offset[self._lift] = 0.0
+        offset = self._level(effector - thing)
         along = float(offset @ way)
         beside = float(np.linalg.norm(offset - along * way))
         high = effector[self._lift] - touch[self._lift]
@@ -69,8 +94,37 @@ class Pusher:
         behind: Vector = touch - way * self._behind
         if float(np.linalg.norm(offset + way * self._behind)) > self._sideways:
             # Pass over the thing, rising first so as not to knock it away.
-            behind[self._lift] += self._clearance
             if high < self._clearance / 2 and along > -self._behind / 2:
                 behind = effector.copy()
-                behind[self._lift] = touch[self._lift] + self._clearance
+            behind[self._lift] = touch[self._lift] + self._clearance
         return behind
+
+
+class Carrier(_Mover):
+    """Comes down on the thing from above, reverses the other outputs to grasp it, carries it to the goal.
+
+    Parameters: sideways tolerance, clearance, depth of touch, reach within which to grasp, speed, steps to grasp for.
+    """
+
+    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any]) -> None:
+        super().__init__(head, vector, settings)
+        self._sideways = 0.5 * self._step * self._factors[0]
+        self._clearance = 2.0 * self._step * self._factors[1]
+        self._reach = 0.5 * self._step * self._factors[3]
+        self._grasp_steps = 3.0 * self._factors[5]
+        self._held_steps = 0
+
+    def act(self, obs: Any) -> Any:
+        thing, goal, effector = self._positions(obs)
+        touch = thing.copy()
+        touch[self._lift] += self._depth
+        reach = float(np.linalg.norm(touch - effector))
+        # Once grasped, the thing may slip a little; further away it has been lost.
+        if reach < self._reach * (2.0 if self._held_steps else 1.0):
+            self._held_steps += 1
+            move = goal - thing if self._held_steps > self._grasp_steps else touch - effector
+            return self._action(move, others=-1.0)
+        self._held_steps = 0
+        if float(np.linalg.norm(self._level(touch - effector))) > self._sideways:
+            touch[self._lift] += self._clearance
+        return self._action(touch - effector)
