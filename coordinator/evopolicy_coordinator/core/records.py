@@ -24,6 +24,7 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
 from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.messages.worker import Fingerprint
 
 Phase = Literal["open", "closed", "finished"]
 
@@ -64,8 +65,8 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     """The class of workers that the run is pinned to; None until a worker offers its environment."""
     description: EnvironmentDescription | None = None
     """As told by the worker it was pinned by."""
-    fingerprint: Any = None
-    """That worker's `Fingerprint`, as builtins."""
+    fingerprint: Fingerprint | None = None
+    """That worker's."""
     overrides: tuple[str, ...] = ()
     """An operator's changes of the pin, in words, oldest first."""
     closed_at: float | None = None

@@ -1,0 +1,187 @@
+"""Evaluations: cases that an operator has played outside any run (`try`, `random`).
+
+Rules that this module owns: no budget is concerned; the same key gives the same evaluation; a bundle that brings its slots
+down too often ends its evaluation with that word.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from evopolicy_common.messages import operator
+
+from . import events
+from .effects import ReadEvaluation
+from .jobs import HELDOUT, JobGroup, Template
+from .polls import Poll
+from .queue import Flow
+from .records import EvaluationRow, evaluation_group
+from .seeds import occurrences
+from .turn import Turn
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+@dataclass(slots=True, eq=False)
+class Evaluation:
+    """An unfinished evaluation."""
+
+    row: EvaluationRow
+    flow: Flow
+
+
+@dataclass(slots=True, frozen=True)
+class Ended:
+    """What stays known of a finished one."""
+
+    total: int
+    """Outcomes that are stored."""
+
+
+def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
+    known = core.evaluation_keys.get(event.key)
+    if known is not None:
+        turn.reply(event.request, operator.EvaluationStarted(evaluation=known))
+        return
+    if not event.cases or len(event.cases) != len(event.case_ids):
+        turn.refuse(event.request, "bad_request", "an evaluation needs at least one case")
+        return
+    row = EvaluationRow(
+        evaluation=event.evaluation,
+        key=event.key,
+        env=event.env,
+        bundle=event.bundle,
+        split=event.split,
+        case_ids=event.case_ids,
+        cases=event.cases,
+        secret=event.secret,
+        record=event.record,
+        tier=event.tier,
+        limits=event.limits,
+        created_at=turn.now,
+        stimulus_id=turn.stimulus_id,
+    )
+    turn.persist(row)
+    evaluation = enter(core, row)
+    core.pin(evaluation.flow, turn)
+    play(core, evaluation, turn)
+    turn.reply(event.request, operator.EvaluationStarted(evaluation=row.evaluation))
+
+
+def enter(core: Core, row: EvaluationRow) -> Evaluation:
+    evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier))
+    core.evaluations[row.evaluation] = evaluation
+    core.evaluation_keys[row.key] = row.evaluation
+    return evaluation
+
+
+def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
+    row = evaluation.row
+    n = len(row.cases)
+    template = Template(
+        env=row.env,
+        bundle=row.bundle,
+        cases=row.cases,
+        case_ids=row.case_ids,
+        occurrences=occurrences(row.case_ids),
+        secret=row.secret,
+        split=row.split,
+        submit_index=-1,
+        modulo=n,
+        per_job=1,
+        scope="episode",
+        env_meta={
+            "env": row.env,
+            "submit_index": 0,
+            "n_episodes_this_submit": n,
+            "remaining_budget_after": 0,
+        },
+        observations="arrays",
+        record=row.record,
+        video="off",
+        tier=row.tier,
+        limits=row.limits,
+    )
+    group = JobGroup(
+        id=evaluation_group(row.evaluation),
+        kind="evaluation",
+        run=row.evaluation,
+        submit_index=-1,
+        flow=evaluation.flow,
+        template=template,
+        stimulus_id=row.stimulus_id,
+        priority=HELDOUT,
+        created_at=row.created_at,
+    )
+    core.open_group(group, turn)
+
+
+def pinned(evaluation: Evaluation, fingerprint_class: str, turn: Turn) -> None:
+    evaluation.row = msgspec.structs.replace(evaluation.row, fingerprint_class=fingerprint_class)
+    turn.persist(evaluation.row)
+
+
+def progressed(core: Core, group: JobGroup, turn: Turn) -> None:
+    if group.done == group.n:
+        end(core, group, "", turn)
+    else:
+        _answer_polls(core, group, turn, finished=False)
+
+
+def end(core: Core, group: JobGroup, error: str, turn: Turn) -> None:
+    evaluation = core.evaluations.pop(group.run)
+    turn.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
+    core.ended_evaluations[group.run] = Ended(group.done)
+    core.close_group(group, turn, error or "all done")
+    core.drop_flow(evaluation.flow)
+    _answer_polls(core, group, turn, finished=True)
+
+
+def _answer_polls(core: Core, group: JobGroup, turn: Turn, *, finished: bool) -> None:
+    for poll in core.polls.take_all(group.id):
+        turn.add(_page(core, poll, group, turn, finished=finished))
+
+
+def polled(core: Core, event: events.EvaluationPolled, turn: Turn) -> None:
+    poll = Poll(event.request, "evaluation", evaluation_group(event.evaluation), event.cursor)
+    ended = core.ended_evaluations.get(event.evaluation)
+    if ended is not None:
+        turn.add(
+            ReadEvaluation(
+                request=event.request,
+                evaluation=event.evaluation,
+                cursor=max(0, event.cursor),
+                upto=ended.total,
+                total=ended.total,
+                finished=True,
+                stimulus_id=turn.stimulus_id,
+            )
+        )
+        return
+    group = core.groups.get(poll.target)
+    if group is None:
+        turn.refuse(event.request, "unknown_evaluation", f"there is no evaluation {event.evaluation!r}")
+    elif group.done > event.cursor or not core.polls.wait(poll, event.wait_s, turn.now):
+        turn.add(_page(core, poll, group, turn, finished=False))
+
+
+def answer(core: Core, poll: Poll, turn: Turn) -> None:
+    """Answer a poll whose time is up."""
+    turn.add(_page(core, poll, core.groups[poll.target], turn, finished=False))
+
+
+def _page(core: Core, poll: Poll, group: JobGroup, turn: Turn, *, finished: bool) -> ReadEvaluation:
+    return ReadEvaluation(
+        request=poll.request,
+        evaluation=group.run,
+        cursor=max(0, poll.cursor),
+        upto=group.done,
+        total=group.done if finished else group.n,
+        finished=finished,
+        waits_for="" if finished else core.waits_for(group),
+        stimulus_id=turn.stimulus_id,
+    )

@@ -1,0 +1,175 @@
+"""Results that workers hand in: committed once, whatever is sent twice, late, or by whom it should not be.
+
+Rules that this module owns:
+- A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A verdict about a limit
+  counts only from the attempt that is live: a worker that was frozen would blame the policy for it.
+- A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
+- An attempt that another worker was given, or that was never given, is ignored and logged.
+- An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
+- A strike is counted once per lease.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
+from evopolicy_common.messages.worker import JobResult
+
+from .jobs import JobState, mark_of
+from .leases import Lease, lease_id
+from .records import OutcomeRow, StrikeRow
+from .retry import Mishap
+from .turn import Turn
+from .workers import Worker
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
+    """Take in one result of a hand-in."""
+    job = core.jobs.get(result.job_id)
+    lease = worker.leases.get(result.lease_id)
+    if job is None or result.lease_id != lease_id(result.job_id, result.attempt):
+        _closed(core, worker, lease, result, turn)
+        return
+    known = core.first_attempt >= result.attempt > 0
+    if job.holders.get(result.attempt, worker.name if known else None) != worker.name:
+        turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
+        return
+    live = lease is not None and lease.live and job.lease is lease
+    if lease is not None:
+        core.book.release(worker, lease, turn, f"handed in: {result.kind}")
+    if result.kind == "done":
+        _done(core, worker, job, result, turn, live=live)
+    elif result.kind == "slot_died" and job.group.template.bundle is not None:
+        _strike(core, worker, job, result, turn, live=live, lease=lease)
+    elif live:
+        if result.kind != "returned":
+            core.fleet.failed(worker, turn)
+        mishap: Mishap = "returned" if result.kind == "returned" else "failed"
+        core.book.give_back(job, mishap, worker, turn, ran=True, error=result.error)
+
+
+def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, turn: Turn) -> None:
+    """A result of a job that is done, or was cancelled."""
+    if lease is not None and lease.id == result.lease_id:
+        core.book.release(worker, lease, turn, f"handed in late: {result.kind}")
+    group = core.groups.get(result.job_id.rpartition("/")[0])
+    if group is None or result.kind != "done":
+        return
+    for outcome in result.episodes:
+        mark = group.marks.get(outcome.index)
+        if mark is not None and mark != mark_of(outcome) and not _late_verdict(outcome):
+            turn.log(
+                "warning",
+                "nondeterministic_result",
+                job=result.job_id,
+                worker=worker.name,
+                episode=outcome.index,
+                first=tuple(mark),
+                later=tuple(mark_of(outcome)),
+            )
+            core.nondeterministic(group, turn)
+
+
+def _late_verdict(outcome: EpisodeOutcome) -> bool:
+    failure = outcome.failure
+    return failure is not None and (failure.category in TIME_LIMITS or failure.limit is not None)
+
+
+def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
+    """Why the outcomes cannot be those of the job; None when they can."""
+    indexes = [outcome.index for outcome in episodes]
+    if indexes != list(range(job.first, job.first + job.n)):
+        return f"outcomes of episodes {indexes[:8]} for a job of {job.first} to {job.first + job.n - 1}"
+    for outcome in episodes:
+        numbers = (outcome.episode_return, outcome.wall_s, *outcome.reward_components.values())
+        if not all(math.isfinite(number) for number in numbers):
+            return f"episode {outcome.index} has a number that is not finite: {numbers}"
+        if outcome.length < 0:
+            return f"episode {outcome.index} has length {outcome.length}"
+    return None
+
+
+def _done(core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool) -> None:
+    fault = _fault(job, result.episodes)
+    if fault is not None:
+        turn.log("error", "result_refused", job=job.job_id, worker=worker.name, fault=fault)
+        if live:
+            core.fleet.failed(worker, turn)
+            core.book.give_back(job, "failed", worker, turn, ran=True, error=fault)
+        return
+    if not live and any(_late_verdict(outcome) for outcome in result.episodes):
+        core.chronicle.tell(turn.now, turn.stimulus_id, result.lease_id, "late limit verdict, not counted")
+        return
+    worker.failures = 0
+    commit(core, worker, job, result, turn)
+
+
+def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn) -> None:
+    """Make the outcomes durable and the job done."""
+    group = job.group
+    core.close_job(job, turn, "done by another attempt")
+    for outcome in result.episodes:
+        row = OutcomeRow(
+            group=group.id,
+            index=outcome.index,
+            seq=group.done,
+            outcome=outcome,
+            job_id=job.job_id,
+            attempt=result.attempt,
+            worker=worker.name,
+            fingerprint_class=worker.profile.fingerprint_class,
+            at=turn.now,
+        )
+        group.marks[outcome.index] = mark_of(outcome)
+        turn.persist(row)
+        group.flow.observe(outcome.wall_s)
+    core.count_done(len(result.episodes), turn.now)
+    core.chronicle.tell(
+        turn.now, turn.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
+    )
+    core.concluded(group, result.episodes, turn)
+
+
+def _strike(
+    core: Core,
+    worker: Worker,
+    job: JobState,
+    result: JobResult,
+    turn: Turn,
+    *,
+    live: bool,
+    lease: Lease | None,
+) -> None:
+    """A living supervisor says that the bundle brought its slot down."""
+    group = job.group
+    if result.lease_id in group.strikes:
+        return
+    if not live and lease is None and result.attempt > core.first_attempt:
+        return  # given up in this incarnation, and blamed on whom it was then
+    group.strikes[result.lease_id] = None
+    turn.persist(
+        StrikeRow(
+            group=group.id,
+            lease_id=result.lease_id,
+            worker=worker.name,
+            error=result.error[:4096],
+            at=turn.now,
+        )
+    )
+    turn.log(
+        "warning",
+        "strike",
+        group=group.id,
+        lease=result.lease_id,
+        worker=worker.name,
+        error=result.error[:2000],
+    )
+    if len(group.strikes) >= core.settings.strikes:
+        core.quarantined(group, turn)
+    elif live:
+        core.book.give_back(job, "slot_died", worker, turn, ran=True, error=result.error)

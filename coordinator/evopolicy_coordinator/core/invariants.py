@@ -1,0 +1,129 @@
+"""What must hold between any two steps of a core. Looks at everything: for tests and the simulation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .jobs import N_PRIORITIES, TRAIN
+from .records import train_group
+from .story import InvariantError
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+def check(core: Core) -> None:
+    """Raise InvariantError, with the story of what is concerned, at the first thing that contradicts itself."""
+    _jobs(core)
+    _queue(core)
+    _workers(core)
+    for run in core.runs.values():
+        run.ledger.validate()
+        want(
+            core,
+            run.id,
+            (run.open is not None) == (run.ledger.reserved > 0),
+            "a reservation is an open submit's",
+        )
+        if run.open is not None:
+            want(core, run.id, train_group(run.id, run.open) in core.groups, "an open submit has its group")
+        settled = sum(
+            len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
+        )
+        want(core, run.id, settled == run.ledger.settled, "settled is what ended submits took")
+
+
+def want(core: Core, key: str, holds: bool, what: str) -> None:
+    if not holds:
+        lines = "\n".join(
+            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in core.story(key)
+        )
+        raise InvariantError(f"{key}: violated: {what}\n{lines}")
+
+
+def _jobs(core: Core) -> None:
+    live = 0
+    for group in core.groups.values():
+        left = sum(job.n for job in group.jobs.values())
+        want(core, group.id, left + group.done == group.n, "each episode is open or done")
+        leased = sum(job.lease is not None for job in group.jobs.values())
+        want(core, group.id, leased == group.n_leased, "leased jobs are counted")
+        live += leased
+        for job in group.jobs.values():
+            key = job.job_id
+            want(core, key, core.jobs.get(key) is job, "an open job is known by its id")
+            waits = ("job", key) in core.timers
+            places = [job.queued, job.lease is not None, waits, job in core.adopting]
+            want(
+                core,
+                key,
+                sum(places) == 1,
+                f"it is in one place (queued, leased, backing off, adopting): {places}",
+            )
+            lease = job.lease
+            if lease is not None:
+                worker = core.fleet.workers.get(lease.worker)
+                held = worker is not None and worker.leases.get(lease.id) is lease
+                want(core, key, held and lease.live, "its lease is its worker's, and live")
+                want(core, key, job.holders.get(lease.attempt) == lease.worker, "its holder is noted")
+    want(
+        core,
+        "",
+        len(core.jobs) == sum(len(group.jobs) for group in core.groups.values()),
+        "no job is left over",
+    )
+    want(core, "", live == core.book.n_live, "live leases are counted")
+
+
+def _queue(core: Core) -> None:
+    flows = {group.flow for group in core.groups.values()}
+    for flow in flows:
+        for priority in range(N_PRIORITIES):
+            valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
+            want(core, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
+            stray = [job for job in valid if not job.queued or job.priority != priority or job.alone]
+            want(core, flow.id, not stray, "only queued jobs of that priority wait there")
+            if flow.lane is not None and flow.n_ready[priority]:
+                want(core, flow.id, flow.in_heap[priority], "a flow with ready jobs gets its turn")
+    for lane in core.queue.lanes.values():
+        want(core, str(lane.key), lane.stopping >= 0, "stopping jobs are counted")
+        for priority in range(N_PRIORITIES):
+            total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
+            want(core, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
+        for profile in lane.profiles:
+            want(
+                core,
+                str(lane.key),
+                (lane in profile.busy) == any(lane.n_ready),
+                "profiles know where work waits",
+            )
+
+
+def _workers(core: Core) -> None:
+    for profile in core.queue.profiles.values():
+        workers = [core.fleet.workers[name] for name in profile.workers]
+        want(
+            core,
+            profile.fingerprint_class,
+            sum(w.slots for w in workers) == profile.slots,
+            "slots are counted",
+        )
+        for name in profile.parked:
+            want(core, name, core.fleet.workers[name].poll is not None, "a parked worker has a poll")
+        for names in profile.warm.values():
+            want(
+                core,
+                profile.fingerprint_class,
+                names.keys() <= profile.parked.keys(),
+                "warm workers are parked",
+            )
+        for priority, hidden in enumerate(profile.hidden):
+            for lease in hidden:
+                fits = lease.live and lease.job.priority == priority != TRAIN
+                want(core, lease.id, fits, "what may be preempted is live and hidden")
+    for worker in core.fleet.workers.values():
+        want(core, worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
+        timed = ("worker", worker.name) in core.timers or worker.state == "lost"
+        want(core, worker.name, timed, "a worker that is there is looked at")
+        if worker.alone is not None:
+            want(core, worker.name, worker.alone.id in worker.leases, "what it plays alone is leased to it")

@@ -1,0 +1,227 @@
+"""Jobs and the groups they come in: a submit's train episodes, a checkpoint's hidden ones, an evaluation's.
+
+Rules that this module owns:
+- A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.
+- Outcomes are numbered in order of arrival (`seq`), without gaps.
+- A job's content follows from its group and its position alone, so it need not be stored, and every attempt of it is the
+  same job.
+- Of a finished episode only its mark is kept, and only while the group is open.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from evopolicy_common.messages.environment import Case, EnvironmentDescription, ObservationForm, PolicyScope
+from evopolicy_common.messages.episode import (
+    EpisodeOutcome,
+    EpisodeSpec,
+    FailureCategory,
+    Job,
+    Record,
+    ResourceLimits,
+    Tier,
+)
+from evopolicy_common.messages.gateway import VideoOption
+
+from .records import OutcomeHead
+from .seeds import policy_seed
+
+if TYPE_CHECKING:
+    from .leases import Lease
+    from .queue import Flow
+
+TRAIN, HELDOUT, EARLY_VALIDATION = 0, 1, 2
+"""Priorities, first served first. Validation of a closed run, the random reference and evaluations are `HELDOUT`'s."""
+N_PRIORITIES = 3
+
+GroupKind = Literal["train", "validation", "heldout", "random", "evaluation"]
+
+
+class Mark(NamedTuple):
+    """What is kept of a finished episode while its group is open; equal for attempts that went the same way."""
+
+    episode_return: float
+    length: int
+    failure: FailureCategory | None
+    trajectory: str | None
+
+
+def mark_of(outcome: EpisodeOutcome) -> Mark:
+    return Mark(
+        outcome.episode_return,
+        outcome.length,
+        None if outcome.failure is None else outcome.failure.category,
+        None if outcome.trajectory is None else outcome.trajectory.digest,
+    )
+
+
+@dataclass(slots=True, frozen=True, kw_only=True)
+class Template:
+    """What all jobs of a group have in common."""
+
+    env: str
+    bundle: str | None
+    cases: tuple[Case, ...]
+    """One for each index."""
+    case_ids: tuple[int, ...]
+    occurrences: tuple[int, ...]
+    secret: bytes
+    split: str
+    submit_index: int
+    modulo: int
+    """`episode_index` is the index modulo this."""
+    per_job: int
+    """Episodes in a job: 1, or with policy scope `submit` as many as share one Policy."""
+    scope: PolicyScope
+    env_meta: dict[str, Any]
+    observations: ObservationForm
+    record: Record
+    video: VideoOption
+    tier: Tier
+    limits: ResourceLimits
+
+
+@dataclass(slots=True, eq=False)
+class JobState:
+    """An open job: where it stands."""
+
+    job_id: str
+    group: JobGroup
+    first: int
+    """Index of its first episode."""
+    n: int
+    """Episodes in it."""
+    attempts: int
+    """Number of the last attempt."""
+    priority: int
+    ticket: int = 0
+    """Grows whenever it enters or leaves the queue: older queue entries are void."""
+    queued: bool = False
+    lease: Lease | None = None
+    failures: int = 0
+    """Infrastructure failures so far."""
+    strikes: int = 0
+    avoid: str | None = None
+    avoid_until: float = 0.0
+    alone: bool = False
+    reserved: str | None = None
+    """The worker that is being emptied for it (of a suspect)."""
+    preemptions: int = 0
+    since: float = 0.0
+    """When it last began to wait."""
+    holders: dict[int, str] = field(default_factory=dict)
+    """Attempts of this incarnation and who got them."""
+
+
+@dataclass(slots=True, eq=False)
+class JobGroup:
+    """A list of episodes that are played, stored and concluded together."""
+
+    id: str
+    kind: GroupKind
+    run: str
+    """Run or evaluation that it belongs to."""
+    submit_index: int
+    flow: Flow
+    template: Template
+    stimulus_id: str
+    priority: int
+    created_at: float
+    marks: dict[int, Mark] = field(default_factory=dict)
+    jobs: dict[int, JobState] = field(default_factory=dict)
+    """Open jobs, by their first index."""
+    strikes: dict[str, None] = field(default_factory=dict)
+    """Leases under which the bundle brought its slot down."""
+    first_leased_at: float | None = None
+    n_leased: int = 0
+    closed: bool = False
+
+    @property
+    def n(self) -> int:
+        """Episodes in all."""
+        return len(self.template.cases)
+
+    @property
+    def done(self) -> int:
+        return len(self.marks)
+
+    def returns(self) -> tuple[float, ...]:
+        """Returns in order of index; every episode must be done."""
+        return tuple(self.marks[index].episode_return for index in range(self.n))
+
+    def mean_return(self) -> float:
+        """Mean of the returns, summed exactly, so that order of arrival cannot show."""
+        return math.fsum(self.returns()) / self.n
+
+    def failed(self) -> int:
+        """Episodes whose policy failed."""
+        return sum(mark.failure is not None for mark in self.marks.values())
+
+    def first_unfinished(self) -> int:
+        """Smallest index without an outcome; `n` when all are done."""
+        return next((index for index in range(self.n) if index not in self.marks), self.n)
+
+
+def open_jobs(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
+    """Fill in `group.marks` from the stored heads and `group.jobs` with what is left to play, in order.
+
+    A job of several episodes is stored whole or not at all.
+    """
+    for head in sorted(heads, key=lambda head: head.seq):
+        group.marks[head.index] = Mark(head.episode_return, head.length, head.failure, head.trajectory)
+    per_job = group.template.per_job
+    for first in range(0, group.n, per_job):
+        if first in group.marks:
+            continue
+        group.jobs[first] = JobState(
+            job_id=f"{group.id}/{first}",
+            group=group,
+            first=first,
+            n=min(per_job, group.n - first),
+            attempts=attempts,
+            priority=group.priority,
+            since=now,
+        )
+    return list(group.jobs.values())
+
+
+def build(job: JobState, description: EnvironmentDescription) -> Job:
+    """The job as a worker gets it."""
+    template = job.group.template
+    video = template.video == "all" or (template.video == "first" and job.first == 0)
+    episodes = tuple(
+        EpisodeSpec(
+            index=index,
+            episode_index=index % template.modulo,
+            case=template.cases[index],
+            policy_seed=policy_seed(
+                template.secret,
+                template.submit_index,
+                template.split,
+                template.case_ids[index],
+                template.occurrences[index],
+            ),
+        )
+        for index in range(job.first, job.first + job.n)
+    )
+    return Job(
+        job_id=job.job_id,
+        env=template.env,
+        bundle=template.bundle,
+        episodes=episodes,
+        policy_scope=template.scope,
+        policy_every=template.modulo if template.scope == "submit" else 0,
+        env_meta={
+            **template.env_meta,
+            "max_episode_steps": description.max_episode_steps,
+            "obs_storage": description.obs_storage,
+        },
+        observations=template.observations,
+        record=template.record,
+        video=video,
+        tier=template.tier,
+        limits=template.limits,
+    )

@@ -1,0 +1,90 @@
+"""A run's episode budget: reserve, then settle or refund, each exactly once.
+
+Rules that this module owns:
+- `available + reserved + settled == granted`, always.
+- A reservation is named by its submit; naming one twice, or settling what is not reserved, is a bug and raises.
+- What the protocol refuses is refused before anything is reserved.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from .story import InvariantError
+
+
+class Refusal(NamedTuple):
+    """Why a submit's list of train cases is refused."""
+
+    status: str
+    message: str
+
+
+class Ledger:
+    """Counts train episodes; knows nothing of what they are spent on."""
+
+    def __init__(self, granted: int) -> None:
+        self.granted = granted
+        self.available = granted
+        self.settled = 0
+        self._reservations: dict[int, int] = {}
+
+    @property
+    def reserved(self) -> int:
+        return sum(self._reservations.values())
+
+    @property
+    def spent(self) -> int:
+        """Episodes that no later submit can have: reserved or settled."""
+        return self.granted - self.available
+
+    def reserve(self, submit_index: int, n: int) -> None:
+        if n < 1 or n > self.available or submit_index in self._reservations:
+            raise InvariantError(f"cannot reserve {n} for submit {submit_index}: {self}")
+        self.available -= n
+        self._reservations[submit_index] = n
+
+    def settle(self, submit_index: int) -> None:
+        """Charge what was reserved for the submit."""
+        self.settled += self._take(submit_index)
+
+    def refund(self, submit_index: int) -> None:
+        """Give back what was reserved for the submit."""
+        self.available += self._take(submit_index)
+
+    def _take(self, submit_index: int) -> int:
+        n = self._reservations.pop(submit_index, None)
+        if n is None:
+            raise InvariantError(f"nothing is reserved for submit {submit_index}: {self}")
+        return n
+
+    def validate(self) -> None:
+        total = self.available + self.reserved + self.settled
+        if total != self.granted or min(self.available, self.settled, self.reserved) < 0:
+            raise InvariantError(f"budget is not conserved: {self}")
+
+    def __repr__(self) -> str:
+        return (
+            f"Ledger(granted={self.granted}, available={self.available}, reserved={self._reservations}, "
+            f"settled={self.settled})"
+        )
+
+
+def refusal(
+    env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
+) -> Refusal | None:
+    """Why these train cases cannot be played, or None. Checked in the order that the protocol names."""
+    n = len(env_instances)
+    if n == 0:
+        return Refusal("invalid_env_instance", "env_instances is empty; name at least one train case")
+    for case_id in env_instances:
+        if not 0 <= case_id < n_cases:
+            message = f"env_instances names {case_id}; train cases are 0 to {n_cases - 1}"
+            return Refusal("invalid_env_instance", message)
+    if n < minimum:
+        return Refusal("budget_invalid", f"{n} episodes asked for; a submit takes at least {minimum}")
+    if n > maximum:
+        return Refusal("budget_invalid", f"{n} episodes asked for; a submit takes at most {maximum}")
+    if n > available:
+        return Refusal("budget_invalid", f"{n} episodes asked for; {available} of the budget remain")
+    return None

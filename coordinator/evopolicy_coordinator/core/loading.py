@@ -1,0 +1,103 @@
+"""From a snapshot of the store to a core that goes on: nothing accepted is lost, nothing done is played again.
+
+Rules that this module owns:
+- Budgets are rebuilt from submits, open groups from submits and outcomes; what was complete but not concluded when the
+  process died is concluded first.
+- Jobs that were open may be running somewhere: they wait for heartbeats that claim them, for a short while.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from . import evaluations, finalisation, runs
+from .evaluations import Ended
+from .jobs import JobGroup
+from .records import RunStateRow, Snapshot, SubmitRow, validation_group
+from .runs import Run
+from .turn import Turn
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
+    """Fill an empty core."""
+    core.loading = True
+    for head in snapshot.outcomes:
+        core.heads.setdefault(head.group, []).append(head)
+    for strike in snapshot.strikes:
+        core.struck.setdefault(strike.group, []).append(strike.lease_id)
+    for worker in snapshot.workers:
+        core.fleet.set_state(worker.worker, worker.state)
+    states = {state.run: state for state in snapshot.states}
+    submits: dict[str, list[SubmitRow]] = {}
+    for submit in snapshot.submits:
+        submits.setdefault(submit.run, []).append(submit)
+    for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
+        state = states.get(row.run, RunStateRow(run=row.run))
+        if state.phase == "finished":
+            core.run_keys[row.key] = row.run
+            core.capabilities[row.run] = row.capability
+        else:
+            _run(core, runs.enter(core, row, state), submits.get(row.run, []), turn)
+    for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
+        if each.finished:
+            core.evaluation_keys[each.key] = each.evaluation
+            core.ended_evaluations[each.evaluation] = Ended(len(each.cases))
+            continue
+        evaluation = evaluations.enter(core, each)
+        if each.fingerprint_class is not None:
+            core.place(evaluation.flow, each.fingerprint_class, turn)
+        evaluations.play(core, evaluation, turn)
+    while core.reloaded:
+        group = core.reloaded.pop(0)
+        if not group.closed:
+            _conclude(core, group, turn)
+    core.loading = False
+    core.heads.clear()
+    core.struck.clear()
+    if core.adopting:
+        core.timers.arm(("adopt", ""), turn.now + core.settings.adoption_s)
+    turn.log("info", "core_loaded", incarnation=core.incarnation, runs=len(core.runs), jobs=len(core.jobs))
+
+
+def _run(core: Core, run: Run, submits: list[SubmitRow], turn: Turn) -> None:
+    state = run.state
+    if state.fingerprint_class is not None:
+        core.place(run.flow, state.fingerprint_class, turn)
+        run.flow.description = state.description
+    for row in sorted(submits, key=lambda row: row.submit_index):
+        run.submits.append(row)
+        run.keys[row.key] = row.submit_index
+        run.ledger.reserve(row.submit_index, len(row.env_instances))
+        if row.refunded:
+            run.ledger.refund(row.submit_index)
+        elif row.status is not None:
+            run.ledger.settle(row.submit_index)
+            _spent(run, row)
+        else:
+            run.open = row.submit_index
+            runs.play(core, run, row, turn)
+        if row.status == "ok" and row.val_mean is not None:
+            heads = core.heads.pop(validation_group(run.id, row.submit_index), [])
+            failed = sum(head.failure is not None for head in heads)
+            run.hidden_failures[validation_group(run.id, row.submit_index)] = failed
+        elif row.status == "ok" and row.ineligible is None:
+            finalisation.validate_early(core, run, row, turn)
+    finalisation.advance(core, run, turn)
+
+
+def _spent(run: Run, row: SubmitRow) -> None:
+    """Count what a settled submit took of time, as when it ended."""
+    if row.completed_at is not None:
+        started_at = row.first_leased_at or row.completed_at
+        run.queue_s += max(0.0, started_at - row.accepted_at)
+        run.rollout_s += max(0.0, row.completed_at - started_at)
+
+
+def _conclude(core: Core, group: JobGroup, turn: Turn) -> None:
+    if len(group.strikes) >= core.settings.strikes:
+        core.quarantined(group, turn)
+    elif group.done:
+        core.concluded(group, (), turn)

@@ -1,0 +1,373 @@
+"""The core itself: takes events and deadlines in, lets the modules beside it act, gives ordered effects back.
+
+What it owns: which jobs, groups, runs and evaluations are open; how a snapshot becomes a core; that the loop's own
+lateness expires nobody's lease. Every rule about budget, leases, placement and finalisation is in the module of that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+
+from . import evaluations, events, finalisation, invariants, membership, runs, status
+from .effects import Effect
+from .evaluations import Ended, Evaluation
+from .jobs import JobGroup, JobState, open_jobs
+from .leases import ATTEMPTS_PER_INCARNATION, LeaseBook
+from .loading import load
+from .polls import Polls
+from .queue import Flow, LaneKey, Queue
+from .records import OutcomeHead, Snapshot, SubmitRow, evaluation_group
+from .runs import Run
+from .scheduler import Scheduler
+from .settings import CoreSettings
+from .status import CoreStatus, Rate
+from .story import Story, StoryLine
+from .timers import TimerKey, Timers
+from .turn import Turn
+from .workers import Fleet
+
+TICK_S = 1.0
+"""While leases are out the core wants to be called at least so often, to notice when it is not."""
+
+
+class Core:
+    """The coordinator's state machine. See the package's docstring for the contract with its shell."""
+
+    def __init__(self, settings: CoreSettings, incarnation: int, now: float) -> None:
+        """An empty core; use `load`."""
+        self.settings = settings
+        self.incarnation = incarnation
+        self.first_attempt = (incarnation - 1) * ATTEMPTS_PER_INCARNATION
+        """Attempts up to this number were granted by earlier incarnations."""
+        self.timers = Timers()
+        self.chronicle = Story()
+        self.queue = Queue(settings.warm_bonus_s)
+        self.fleet = Fleet(settings, self.queue, self.timers)
+        self.book = LeaseBook(self)
+        self.scheduler = Scheduler(self)
+        self.polls = Polls(self.timers, settings.max_wait_s)
+        self.rate = Rate()
+        self.runs: dict[str, Run] = {}
+        self.evaluations: dict[str, Evaluation] = {}
+        self.groups: dict[str, JobGroup] = {}
+        self.jobs: dict[str, JobState] = {}
+        self.unpinned: dict[str, Flow] = {}
+        self.adopting: dict[JobState, None] = {}
+        """Jobs that may be running somewhere since before the core was loaded."""
+        self.run_keys: dict[str, str] = {}
+        self.capabilities: dict[str, str] = {}
+        """Of all runs, finished ones too."""
+        self.evaluation_keys: dict[str, str] = {}
+        self.ended_evaluations: dict[str, Ended] = {}
+        self.heads: dict[str, list[OutcomeHead]] = {}
+        """While loading: what is stored of each group."""
+        self.struck: dict[str, list[str]] = {}
+        """While loading: the strikes of each group."""
+        self.loading = False
+        self.reloaded: list[JobGroup] = []
+        """While loading: groups that may be complete already."""
+        self.hold_until = now + settings.lease_ttl_s
+        """Nothing expires before."""
+        self._flows = 0
+        self._called_at = now
+
+    # ---- the four entries ----
+
+    @classmethod
+    def load(cls, settings: CoreSettings, snapshot: Snapshot, now: float) -> tuple[Core, list[Effect]]:
+        """A core that goes on where the store left off, and what is to be done first."""
+        core = cls(settings, snapshot.incarnation, now)
+        turn = Turn(now, f"load-{snapshot.incarnation}")
+        load(core, snapshot, turn)
+        core.scheduler.dispatch(turn)
+        return core, turn.effects()
+
+    def handle(self, event: events.AnyEvent, now: float) -> list[Effect]:
+        """Take in what happened; the effects are to be carried out in order."""
+        self._watch(now)
+        turn = Turn(now, event.stimulus_id)
+        _HANDLERS[type(event)](self, event, turn)
+        self.scheduler.dispatch(turn)
+        return turn.effects()
+
+    def next_deadline(self) -> float | None:
+        """When `handle_deadline` is due; None when nothing waits for time to pass."""
+        at = self.timers.next()
+        if self.book.n_live:
+            tick = self._called_at + TICK_S
+            return tick if at is None else min(at, tick)
+        return at
+
+    def handle_deadline(self, now: float) -> list[Effect]:
+        """Do what is due at `now`."""
+        self._watch(now)
+        effects: list[Effect] = []
+        while (key := self.timers.pop_due(now)) is not None:
+            turn = Turn(now, f"{key[0]}-{key[1]}")
+            self._fire(key, turn)
+            self.scheduler.dispatch(turn)
+            effects += turn.effects()
+        return effects
+
+    def validate(self) -> None:
+        """Check every invariant; InvariantError with the story of what breaks one. For tests: looks at everything."""
+        invariants.check(self)
+
+    # ---- reading ----
+
+    def capability(self, run: str) -> str | None:
+        """The token of a run's gateway, finished runs too; None for no run."""
+        return self.capabilities.get(run)
+
+    def worker_of(self, session: str) -> str | None:
+        """The worker whose present session is `session` (its right to read and write blobs); None when it is nobody's."""
+        return self.fleet.sessions.get(session)
+
+    def status(self, now: float) -> CoreStatus:
+        """The core's part of a `StatusReply`."""
+        return status.status(self, now)
+
+    def story(self, key: str) -> list[StoryLine]:
+        """What happened to a job, lease, worker, group or run, oldest first, as far back as is kept."""
+        return self.chronicle.of(key)
+
+    # ---- time ----
+
+    def _watch(self, now: float) -> None:
+        """Notice when the loop stood still: then heartbeats may be waiting behind this very call."""
+        due = self.next_deadline()
+        if due is not None and now - due > self.settings.late_s:
+            self.hold_until = now + self.settings.lease_ttl_s
+        self._called_at = now
+
+    def _fire(self, key: TimerKey, turn: Turn) -> None:
+        kind, what = key
+        if kind == "worker":
+            worker = self.fleet.workers.get(str(what))
+            if worker is not None:
+                self.book.look(worker, turn)
+        elif kind == "lease":
+            worker = self.fleet.workers.get(str(what))
+            if worker is not None:
+                self.scheduler.drop_poll(worker, turn)
+        elif kind == "beat":
+            worker = self.fleet.workers.get(str(what))
+            if worker is not None and worker.beat is not None:
+                self.fleet.answer_beat(worker, (), turn)
+        elif kind == "poll":
+            self._poll_ended(what, turn)
+        elif kind == "job":
+            job = self.jobs.get(str(what))
+            if job is not None and not job.queued and job.lease is None:
+                self.scheduler.queue(job, turn, front=True)
+        elif kind == "adopt":
+            for job in list(self.adopting):
+                del self.adopting[job]
+                self.scheduler.queue(job, turn)
+        elif kind == "lane":
+            lane = self.queue.lanes.get(cast(LaneKey, what))
+            if lane is not None:
+                turn.dirty[lane] = None
+        elif kind == "bench":
+            worker = self.fleet.workers.get(str(what))
+            if worker is not None:
+                self.scheduler.reconsider(worker, turn)
+        elif kind == "submit":
+            self._submit_limit(key, turn)
+        elif kind == "forget":
+            worker = self.fleet.workers.get(str(what))
+            if worker is not None and worker.state == "lost":
+                self.fleet.forget(worker)
+
+    def _submit_limit(self, key: TimerKey, turn: Turn) -> None:
+        group = self.groups.get(str(key[1]))
+        if group is None:
+            return
+        if turn.now < self.hold_until:
+            self.timers.arm(key, self.hold_until)
+        else:
+            runs.timed_out(self, group, turn)
+
+    def _poll_ended(self, request: Any, turn: Turn) -> None:
+        poll = self.polls.take(request)
+        if poll is None:
+            return
+        if poll.kind == "results":
+            runs.answer(self, self.runs[poll.target.split("/")[0]], poll, turn)
+        elif poll.kind == "evaluation":
+            evaluations.answer(self, poll, turn)
+        else:
+            turn.reply(poll.request, finalisation.progress(self, self.runs[poll.target]))
+
+    # ---- flows and groups ----
+
+    def add_flow(self, name: str, env: str, tier: Tier) -> Flow:
+        self._flows += 1
+        flow = Flow(name, env, tier, self._flows)
+        self.unpinned[name] = flow
+        return flow
+
+    def drop_flow(self, flow: Flow) -> None:
+        self.unpinned.pop(flow.id, None)
+        self.queue.drop(flow)
+
+    def pin(self, flow: Flow, turn: Turn) -> None:
+        """Pin a flow to the fingerprint class that serves it best now, if there is one."""
+        profile = self.fleet.offer(flow) if flow.pin is None else None
+        if profile is None:
+            return
+        description = profile.descriptions[flow.env]
+        self.place(flow, profile.fingerprint_class, turn)
+        flow.description = description
+        run = self.runs.get(flow.id)
+        if run is not None:
+            run.change(
+                turn,
+                fingerprint_class=profile.fingerprint_class,
+                description=description,
+                fingerprint=profile.fingerprint,
+            )
+            turn.log("info", "run_pinned", run=run.id, fingerprint_class=profile.fingerprint_class)
+        else:
+            evaluations.pinned(self.evaluations[flow.id], profile.fingerprint_class, turn)
+
+    def place(self, flow: Flow, fingerprint_class: str, turn: Turn) -> None:
+        self.unpinned.pop(flow.id, None)
+        turn.dirty[self.queue.place(flow, fingerprint_class, None)] = None
+
+    def open_group(self, group: JobGroup, turn: Turn) -> None:
+        """Queue what is not done of a group. While loading, jobs wait to be adopted first."""
+        self.groups[group.id] = group
+        group.strikes.update(dict.fromkeys(self.struck.pop(group.id, ())))
+        heads = self.heads.pop(group.id, [])
+        for job in open_jobs(group, heads, self.first_attempt, turn.now):
+            self.jobs[job.job_id] = job
+            if self.loading:
+                self.adopting[job] = None
+            else:
+                self.scheduler.queue(job, turn)
+        self.chronicle.tell(turn.now, turn.stimulus_id, group.id, f"opened, {group.done} of {group.n} done")
+        if self.loading:
+            self.reloaded.append(group)
+
+    def close_group(self, group: JobGroup, turn: Turn, why: str) -> None:
+        """Nothing more is played of a group; what is leased is stopped."""
+        for job in list(group.jobs.values()):
+            self.close_job(job, turn, why)
+        group.closed = True
+        self.groups.pop(group.id, None)
+        self.timers.disarm(("submit", group.id))
+        self.chronicle.tell(turn.now, turn.stimulus_id, group.id, f"closed: {why}")
+
+    def close_job(self, job: JobState, turn: Turn, why: str) -> None:
+        """A job is open no more."""
+        if job.lease is not None:
+            self.book.stop(job.lease, turn, why)
+        self.queue.withdraw(job)
+        if job.reserved is not None:
+            self.fleet.workers[job.reserved].reserved = None
+            self.scheduler.emptied(self.fleet.workers[job.reserved])
+            job.reserved = None
+        self.adopting.pop(job, None)
+        self.timers.disarm(("job", job.job_id))
+        del job.group.jobs[job.first]
+        del self.jobs[job.job_id]
+
+    def promote(self, group: JobGroup, priority: int, turn: Turn) -> None:
+        """Move a group's open jobs to another priority."""
+        if group.priority == priority:
+            return
+        group.priority = priority
+        for job in group.jobs.values():
+            queued = job.queued
+            self.queue.withdraw(job)
+            job.priority = priority
+            if queued:
+                self.scheduler.queue(job, turn)
+            elif job.lease is not None:
+                self.book.list_hidden(job.lease, self.fleet.workers[job.lease.worker])
+
+    # ---- what the modules tell each other ----
+
+    def group_started(self, group: JobGroup, turn: Turn) -> None:
+        """The first lease of a group was granted."""
+        limit_s = group.template.limits.submit_wall_s
+        if group.kind == "train" and limit_s is not None:
+            self.timers.arm(("submit", group.id), turn.now + limit_s)
+
+    def concluded(self, group: JobGroup, outcomes: tuple[EpisodeOutcome, ...], turn: Turn) -> None:
+        """Episodes of a group are done (none in `outcomes`: before the core was loaded)."""
+        if group.kind == "train":
+            runs.progressed(self, group, outcomes, turn)
+        elif group.kind == "evaluation":
+            evaluations.progressed(self, group, turn)
+        else:
+            finalisation.progressed(self, group, turn)
+
+    def quarantined(self, group: JobGroup, turn: Turn) -> None:
+        """A group's bundle brought its slot down too often."""
+        turn.log("warning", "quarantined", group=group.id, bundle=group.template.bundle)
+        if group.kind == "train":
+            runs.quarantine(self, group, turn)
+        elif group.kind == "evaluation":
+            text = f"the policy brought its slot down on {len(group.strikes)} attempts"
+            evaluations.end(self, group, text, turn)
+        else:
+            finalisation.quarantine(self, group, turn)
+
+    def submit_ended(self, run: Run, row: SubmitRow, turn: Turn) -> None:
+        if row.status == "ok":
+            finalisation.validate_early(self, run, row, turn)
+        finalisation.advance(self, run, turn)
+
+    def counted_retry(self, job: JobState, turn: Turn) -> None:
+        run = self.runs.get(job.group.run)
+        if run is not None:
+            run.change(turn, infrastructure_retries=run.state.infrastructure_retries + 1)
+
+    def nondeterministic(self, group: JobGroup, turn: Turn) -> None:
+        run = self.runs.get(group.run)
+        if run is not None:
+            run.change(turn, nondeterministic_results=run.state.nondeterministic_results + 1)
+
+    def count_done(self, n: int, now: float) -> None:
+        self.rate.count(n, now)
+
+    def waits_for(self, group: JobGroup) -> str:
+        return status.waits_for(self, group)
+
+    def forget_run(self, run: Run) -> None:
+        del self.runs[run.id]
+        self.drop_flow(run.flow)
+
+    def cancel_evaluation(self, name: str, turn: Turn) -> bool:
+        """End an evaluation that runs; False when there is none."""
+        if name not in self.evaluations:
+            return name in self.ended_evaluations
+        evaluations.end(self, self.groups[evaluation_group(name)], "cancelled by the operator", turn)
+        return True
+
+
+_HANDLERS: dict[type, Callable[[Core, Any, Turn], None]] = {
+    events.RunCreated: runs.create,
+    events.RunWaited: finalisation.waited,
+    events.RunCancelled: finalisation.cancel,
+    events.RunRepinned: membership.repinned,
+    events.EvaluationRequested: evaluations.request,
+    events.EvaluationPolled: evaluations.polled,
+    events.WorkerStateSet: membership.worker_state,
+    events.RunOpened: runs.opened,
+    events.StateRequested: runs.state_requested,
+    events.SubmitRequested: runs.submit,
+    events.ResultsRequested: runs.results,
+    events.RunClosed: finalisation.close,
+    events.WorkerRegistered: membership.registered,
+    events.LeaseRequested: membership.lease_requested,
+    events.HeartbeatReceived: membership.heartbeat,
+    events.ResultsHandedIn: membership.handed_in,
+    events.LivenessLost: membership.liveness_lost,
+    events.RequestAbandoned: membership.abandoned,
+}

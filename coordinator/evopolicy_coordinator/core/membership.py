@@ -1,0 +1,137 @@
+"""What workers say, and what operators say of them: who is there, who may have work, and under which class.
+
+Rules that this module owns:
+- A request under a session that is not the worker's present one is refused, upon which the worker registers again.
+- A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
+- A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
+- Draining outlives restarts. An operator's change of a run's fingerprint class is recorded in the run.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_common.messages import operator
+from evopolicy_common.messages import worker as wire
+
+from . import events, handin
+from .records import WorkerRow
+from .turn import Turn
+from .workers import Worker
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
+    old = core.fleet.workers.get(event.worker)
+    if old is not None:
+        core.scheduler.drop_poll(old, turn)
+        if old.beat is not None:
+            core.fleet.answer_beat(old, (), turn)
+    core.timers.disarm(("forget", event.worker))
+    worker = core.fleet.register(event, turn)
+    reply = wire.Registered(
+        session=event.session,
+        lease_ttl_s=core.settings.lease_ttl_s,
+        heartbeat_s=core.settings.heartbeat_s,
+    )
+    turn.reply(event.request, reply)
+    name = worker.profile.fingerprint_class
+    turn.log("info", "worker_registered", worker=worker.name, slots=worker.slots, fingerprint_class=name)
+    for flow in list(core.unpinned.values()):
+        if flow.env in worker.profile.key[0] and flow.tier in worker.profile.key[1]:
+            core.pin(flow, turn)
+
+
+def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
+    worker = core.fleet.of_session(event.worker, event.session, turn.now)
+    if worker is None:
+        text = f"session of worker {event.worker!r} is not known here; register again"
+        turn.refuse(event.request, "unknown_worker", text)
+    else:
+        core.timers.arm_once(("worker", worker.name), turn.now + core.settings.lease_ttl_s)
+    return worker
+
+
+def lease_requested(core: Core, event: events.LeaseRequested, turn: Turn) -> None:
+    worker = worker_of(core, event, turn)
+    if worker is not None:
+        core.scheduler.poll(worker, event, turn)
+
+
+def heartbeat(core: Core, event: events.HeartbeatReceived, turn: Turn) -> None:
+    worker = worker_of(core, event, turn)
+    if worker is None:
+        return
+    if worker.beat is not None:
+        core.fleet.answer_beat(worker, (), turn)
+    stop = core.book.hear(worker, event.held, turn)
+    worker.beat = event.request
+    if stop or not event.wait_s > 0.0:
+        core.fleet.answer_beat(worker, stop, turn)
+    else:
+        core.timers.arm(("beat", worker.name), turn.now + min(event.wait_s, core.settings.max_wait_s))
+
+
+def handed_in(core: Core, event: events.ResultsHandedIn, turn: Turn) -> None:
+    worker = worker_of(core, event, turn)
+    if worker is None:
+        return
+    for result in event.results:
+        handin.take(core, worker, result, turn)
+    turn.reply(event.request, wire.HandInReply(n=len(event.results)))
+
+
+def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
+    worker = core.fleet.workers.get(event.worker)
+    if worker is not None and worker.state != "lost" and worker.doubted_at is None:
+        worker.doubted_at = turn.now
+        core.timers.arm(("worker", worker.name), turn.now + core.settings.liveness_grace_s)
+
+
+def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
+    turn.persist(WorkerRow(worker=event.worker, state=event.state))
+    worker = core.fleet.workers.get(event.worker)
+    if worker is not None and event.state == "draining":
+        core.scheduler.drop_poll(worker, turn)
+    core.fleet.set_state(event.worker, event.state)
+    if worker is not None:
+        if worker.beat is not None:
+            core.fleet.answer_beat(worker, (), turn)
+        core.scheduler.emptied(worker)
+        for lane in worker.profile.lanes.values():
+            turn.dirty[lane] = None
+    turn.reply(event.request, operator.Done())
+
+
+def repinned(core: Core, event: events.RunRepinned, turn: Turn) -> None:
+    run = core.runs.get(event.run)
+    offered = {
+        profile.fingerprint_class: profile
+        for profile in core.queue.profiles.values()
+        if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
+    }
+    if run is None:
+        turn.refuse(event.request, "unknown_run", f"there is no unfinished run {event.run!r}")
+    elif event.fingerprint_class not in offered:
+        text = f"no worker of class {event.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
+        turn.refuse(event.request, "unknown_class", text)
+    else:
+        text = f"{run.state.fingerprint_class} → {event.fingerprint_class}: {event.reason}"
+        profile = offered[event.fingerprint_class]
+        run.change(
+            turn,
+            fingerprint_class=event.fingerprint_class,
+            overrides=(*run.state.overrides, text),
+            description=run.state.description or profile.descriptions[run.flow.env],
+            fingerprint=run.state.fingerprint or profile.fingerprint,
+        )
+        run.flow.description = run.state.description
+        core.place(run.flow, event.fingerprint_class, turn)
+        turn.log("warning", "run_repinned", run=run.id, override=text)
+        turn.reply(event.request, operator.Done())
+
+
+def abandoned(core: Core, event: events.RequestAbandoned, turn: Turn) -> None:
+    core.polls.take(event.request)

@@ -1,0 +1,64 @@
+"""Long polls for outcomes and for the end of a run: who waits, for what, until when.
+
+Rules that this module owns: a poll is answered once; at its deadline it is answered with what there is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from .events import RequestId
+from .timers import Timers
+
+PollKind = Literal["results", "evaluation", "run"]
+
+
+@dataclass(slots=True, frozen=True)
+class Poll:
+    """Someone who waits."""
+
+    request: RequestId
+    kind: PollKind
+    target: str
+    """Group id, or run."""
+    cursor: int = 0
+
+
+class Polls:
+    """Waiting polls, by request and by what they wait for."""
+
+    def __init__(self, timers: Timers, max_wait_s: float) -> None:
+        self._timers = timers
+        self._max_wait_s = max_wait_s
+        self._polls: dict[RequestId, Poll] = {}
+        self._of: dict[str, dict[RequestId, None]] = {}
+
+    def wait(self, poll: Poll, wait_s: float, now: float) -> bool:
+        """Let a poll wait; False when it does not want to."""
+        wait_s = min(wait_s, self._max_wait_s)
+        if not wait_s > 0.0:
+            return False
+        self._polls[poll.request] = poll
+        self._of.setdefault(poll.target, {})[poll.request] = None
+        self._timers.arm(("poll", poll.request), now + wait_s)
+        return True
+
+    def take(self, request: RequestId) -> Poll | None:
+        """End one poll's waiting; None when it waits no more."""
+        poll = self._polls.pop(request, None)
+        if poll is not None:
+            self._timers.disarm(("poll", request))
+            waiting = self._of[poll.target]
+            del waiting[request]
+            if not waiting:
+                del self._of[poll.target]
+        return poll
+
+    def take_all(self, target: str) -> list[Poll]:
+        """End the waiting of all who wait for `target`, in the order they came."""
+        polls = [self.take(request) for request in list(self._of.get(target, ()))]
+        return [poll for poll in polls if poll is not None]
+
+    def __len__(self) -> int:
+        return len(self._polls)

@@ -1,0 +1,324 @@
+"""Jobs that wait: in lanes by what a worker must be able to do, by priority, and by fair share between runs.
+
+Rules that this module owns:
+- A lane is (environment, sandbox tier, fingerprint class); a flow (a run, or an evaluation) is in one lane, or in none
+  until it is pinned to a class.
+- A lower priority number goes first, whatever the shares say.
+- Between flows of one priority the one that got the least play time goes first (start-time fair queueing: each priority
+  has a virtual clock; a flow that was idle starts at the clock, so idleness earns nothing). A worker that has the
+  environment or the bundle warm may bend this by a bounded amount.
+- Within a flow jobs go in order; what goes back after a mishap goes to the front.
+- A job is not given to a worker it avoids, as long as its lane has another.
+- No operation looks at all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Container
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.worker import Fingerprint
+
+from .jobs import N_PRIORITIES, JobState
+
+if TYPE_CHECKING:
+    from .leases import Lease
+
+LaneKey = tuple[str, Tier, str]
+"""Environment, sandbox tier, fingerprint class."""
+
+SKIPS_MAX = 16
+"""So many jobs of a flow that avoid the asking worker are looked past; more, and it waits."""
+
+PASSES_MAX = 4
+"""So many flows with nothing but such jobs are looked past."""
+
+
+@dataclass(slots=True, eq=False)
+class Flow:
+    """A run or an evaluation, as something that gets its share."""
+
+    id: str
+    env: str
+    tier: Tier
+    seq: int
+    """Order of creation: breaks ties."""
+    pin: str | None = None
+    """Fingerprint class; None until there is a worker for it."""
+    description: EnvironmentDescription | None = None
+    lane: Lane | None = None
+    served: list[float] = field(default_factory=lambda: [0.0] * N_PRIORITIES)
+    """Virtual time by priority: slot seconds handed out, counted from the clock it started at."""
+    ready: tuple[deque[tuple[int, JobState]], ...] = field(
+        default_factory=lambda: tuple(deque() for _ in range(N_PRIORITIES))
+    )
+    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    in_heap: list[bool] = field(default_factory=lambda: [False] * N_PRIORITIES)
+    n_leased: int = 0
+    episode_s: float | None = None
+    """Moving average of an episode's wall time; None before the first."""
+
+    def cost_s(self, job: JobState) -> float:
+        """What a job is expected to take, seconds of a slot; one second while nothing is known."""
+        return (1.0 if self.episode_s is None else self.episode_s) * job.n
+
+    def observe(self, wall_s: float) -> None:
+        self.episode_s = wall_s if self.episode_s is None else 0.8 * self.episode_s + 0.2 * wall_s
+
+    def waiting(self) -> bool:
+        return any(self.n_ready)
+
+
+@dataclass(slots=True, eq=False)
+class Lane:
+    """Flows that the same workers can serve."""
+
+    key: LaneKey
+    heaps: tuple[list[tuple[float, int, Flow]], ...] = field(
+        default_factory=lambda: tuple([] for _ in range(N_PRIORITIES))
+    )
+    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    profiles: dict[Profile, None] = field(default_factory=dict)
+    stopping: int = 0
+    """Hidden jobs that were stopped for this lane's sake and whose workers have not let go of them yet."""
+
+    def slots(self) -> int:
+        """Slots of the workers that may serve it."""
+        return sum(profile.slots for profile in self.profiles)
+
+    def workers(self) -> int:
+        return sum(len(profile.workers) for profile in self.profiles)
+
+    def top(self, priority: int) -> Flow | None:
+        """The flow to serve first; None when none waits."""
+        heap = self.heaps[priority]
+        while heap:
+            served, seq, flow = heap[0]
+            if flow.lane is not self or flow.n_ready[priority] == 0:
+                heapq.heappop(heap)
+                if flow.lane is self or flow.lane is None:
+                    flow.in_heap[priority] = False
+            elif served < flow.served[priority]:
+                heapq.heapreplace(heap, (flow.served[priority], seq, flow))
+            else:
+                return flow
+        return None
+
+
+@dataclass(slots=True, eq=False)
+class Profile:
+    """Workers that can do the same: environments, tiers and fingerprint class."""
+
+    key: tuple[frozenset[str], frozenset[Tier], str]
+    fingerprint: Fingerprint
+    descriptions: dict[str, EnvironmentDescription]
+    lanes: dict[LaneKey, Lane] = field(default_factory=dict)
+    busy: dict[Lane, None] = field(default_factory=dict)
+    """Its lanes in which something waits."""
+    workers: dict[str, None] = field(default_factory=dict)
+    """Those that are active: not lost, not draining."""
+    slots: int = 0
+    """Of the active ones."""
+    parked: dict[str, None] = field(default_factory=dict)
+    """Workers whose lease poll waits and could be answered now, oldest first."""
+    warm: dict[str, dict[str, None]] = field(default_factory=dict)
+    """Warm environment or bundle digest to those of `parked` that have it."""
+    hidden: tuple[dict[Lease, None], ...] = field(
+        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
+    )
+    """Live leases of its workers that may be preempted, by priority, oldest first."""
+
+    @property
+    def fingerprint_class(self) -> str:
+        return self.key[2]
+
+    def serves(self, key: LaneKey) -> bool:
+        env, tier, fingerprint_class = key
+        return env in self.key[0] and tier in self.key[1] and fingerprint_class == self.key[2]
+
+
+class Queue:
+    """All lanes, the flows in them and the profiles that serve them."""
+
+    def __init__(self, warm_bonus_s: float) -> None:
+        self.lanes: dict[LaneKey, Lane] = {}
+        self.profiles: dict[tuple[frozenset[str], frozenset[Tier], str], Profile] = {}
+        self.suspects: dict[JobState, None] = {}
+        """Waiting jobs that are to run alone; few."""
+        self._clock = [0.0] * N_PRIORITIES
+        self._warm_bonus_s = warm_bonus_s
+
+    # ---- shape ----
+
+    def add_profile(self, profile: Profile) -> None:
+        self.profiles[profile.key] = profile
+        for lane in self.lanes.values():
+            self._join(profile, lane)
+
+    def place(self, flow: Flow, pin: str, description: EnvironmentDescription | None) -> Lane:
+        """Put a flow into the lane of class `pin`, with whatever of it waits."""
+        old = flow.lane
+        if old is not None:
+            for priority in range(N_PRIORITIES):
+                old.n_ready[priority] -= flow.n_ready[priority]
+            self._settle(old)
+        key = (flow.env, flow.tier, pin)
+        lane = self.lanes.get(key)
+        if lane is None:
+            lane = self.lanes[key] = Lane(key)
+            for profile in self.profiles.values():
+                self._join(profile, lane)
+        flow.pin, flow.lane = pin, lane
+        if description is not None:
+            flow.description = description
+        for priority in range(N_PRIORITIES):
+            flow.in_heap[priority] = False
+            if flow.n_ready[priority]:
+                lane.n_ready[priority] += flow.n_ready[priority]
+                self._enter(flow, lane, priority)
+        self._settle(lane)
+        return lane
+
+    def drop(self, flow: Flow) -> None:
+        """Forget a flow that has nothing waiting any more."""
+        flow.lane = None
+
+    def _join(self, profile: Profile, lane: Lane) -> None:
+        if profile.serves(lane.key):
+            profile.lanes[lane.key] = lane
+            lane.profiles[profile] = None
+            if any(lane.n_ready):
+                profile.busy[lane] = None
+
+    def _enter(self, flow: Flow, lane: Lane, priority: int) -> None:
+        if not flow.in_heap[priority]:
+            flow.in_heap[priority] = True
+            heapq.heappush(lane.heaps[priority], (flow.served[priority], flow.seq, flow))
+
+    def _settle(self, lane: Lane) -> None:
+        """Let the profiles know whether anything waits in the lane."""
+        if any(lane.n_ready):
+            for profile in lane.profiles:
+                profile.busy[lane] = None
+        else:
+            for profile in lane.profiles:
+                profile.busy.pop(lane, None)
+
+    # ---- jobs ----
+
+    def push(self, job: JobState, *, front: bool = False) -> Lane | None:
+        """Let a job wait; gives its lane, None while its flow is not pinned."""
+        flow, priority = job.group.flow, job.priority
+        job.ticket += 1
+        job.queued = True
+        if job.alone:
+            self.suspects[job] = None
+            return flow.lane
+        ready = flow.ready[priority]
+        (ready.appendleft if front else ready.append)((job.ticket, job))
+        if flow.n_ready[priority] == 0:
+            flow.served[priority] = max(flow.served[priority], self._clock[priority])
+        flow.n_ready[priority] += 1
+        lane = flow.lane
+        if lane is not None:
+            lane.n_ready[priority] += 1
+            self._enter(flow, lane, priority)
+            if lane.n_ready[priority] == 1:
+                self._settle(lane)
+        return lane
+
+    def withdraw(self, job: JobState) -> None:
+        """Take a waiting job out, wherever it stands."""
+        if not job.queued:
+            return
+        job.queued = False
+        job.ticket += 1
+        if job.alone:
+            self.suspects.pop(job, None)
+            return
+        flow, priority = job.group.flow, job.priority
+        flow.n_ready[priority] -= 1
+        if flow.n_ready[priority] == 0:
+            flow.ready[priority].clear()
+        lane = flow.lane
+        if lane is not None:
+            lane.n_ready[priority] -= 1
+            if lane.n_ready[priority] == 0:
+                self._settle(lane)
+
+    def take(self, profile: Profile, worker: str, warm: Container[str], now: float) -> JobState | None:
+        """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
+        for priority in range(N_PRIORITIES):
+            passed: list[Flow] = []
+            job: JobState | None = None
+            while job is None and len(passed) < PASSES_MAX:
+                flow = self._best(profile, priority, warm)
+                if flow is None or flow.lane is None:
+                    break
+                lane = flow.lane
+                job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
+                if job is None:
+                    heapq.heappop(lane.heaps[priority])
+                    flow.in_heap[priority] = False
+                    passed.append(flow)
+            for flow in passed:
+                if flow.lane is not None:
+                    self._enter(flow, flow.lane, priority)
+            if job is not None:
+                self._serve(job)
+                return job
+        return None
+
+    def _serve(self, job: JobState) -> None:
+        flow, priority = job.group.flow, job.priority
+        self.withdraw(job)
+        self._clock[priority] = max(self._clock[priority], flow.served[priority])
+        flow.served[priority] += flow.cost_s(job)
+
+    def _best(self, profile: Profile, priority: int, warm: Container[str]) -> Flow | None:
+        best: Flow | None = None
+        best_score = 0.0
+        for lane in profile.busy:
+            flow = lane.top(priority) if lane.n_ready[priority] else None
+            if flow is None:
+                continue
+            score = flow.served[priority]
+            if flow.env in warm or (flow.ready[priority][0][1].group.template.bundle or "") in warm:
+                score -= self._warm_bonus_s
+            if best is None or (score, flow.seq) < (best_score, best.seq):
+                best, best_score = flow, score
+        return best
+
+    @staticmethod
+    def _first(flow: Flow, priority: int, worker: str, now: float, *, sole: bool) -> JobState | None:
+        """The flow's first job that does not avoid `worker`; void entries on the way are dropped."""
+        ready = flow.ready[priority]
+        skipped: list[tuple[int, JobState]] = []
+        found: JobState | None = None
+        while ready and len(skipped) < SKIPS_MAX:
+            ticket, job = ready[0]
+            if job.ticket != ticket:
+                ready.popleft()
+            elif job.avoid == worker and now < job.avoid_until and not sole:
+                skipped.append(ready.popleft())
+            else:
+                found = job
+                break
+        ready.extendleft(reversed(skipped))
+        return found
+
+    def next_bundle(self, lane: Lane) -> tuple[str | None, str] | None:
+        """Bundle and environment of what goes next in the lane; None when nothing waits."""
+        for priority in range(N_PRIORITIES):
+            flow = lane.top(priority) if lane.n_ready[priority] else None
+            if flow is not None:
+                ready = flow.ready[priority]
+                while ready and ready[0][1].ticket != ready[0][0]:
+                    ready.popleft()
+                return (ready[0][1].group.template.bundle if ready else None, flow.env)
+        return None

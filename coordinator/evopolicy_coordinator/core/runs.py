@@ -1,0 +1,456 @@
+"""Runs and their submits: from creation until the agent is gone. What follows is `finalisation`'s.
+
+Rules that this module owns:
+- A submit is reserved, durable, then answered; one submit per key; one open submit per run; refused ones change nothing.
+- The episode at index 0 gates: until its outcome shows that the bundle yields a Policy no episode is released, and when it
+  shows the contrary that is the whole submit's verdict.
+- A submit's end settles its reservation, once, whatever the verdict. Only a cancelled run's open submit is refunded.
+- Nothing here that a gateway is answered with depends on hidden work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages.episode import NO_POLICY, EpisodeOutcome, PolicyFailure
+from evopolicy_common.messages.gateway import SubmitStatus
+
+from . import events
+from .effects import ReadFinished, ReadResults
+from .jobs import TRAIN, JobGroup, Template
+from .ledger import Ledger, refusal
+from .polls import Poll
+from .queue import Flow
+from .records import RunRow, RunStateRow, SubmitRow, train_group
+from .seeds import occurrences
+from .turn import Turn
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+
+@dataclass(slots=True, eq=False)
+class Run:
+    """An unfinished run."""
+
+    row: RunRow
+    state: RunStateRow
+    ledger: Ledger
+    flow: Flow
+    submits: list[SubmitRow] = field(default_factory=list)
+    keys: dict[str, int] = field(default_factory=dict)
+    """Idempotency key to submit index."""
+    open: int | None = None
+    """The submit in flight."""
+    hidden_failures: dict[str, int] = field(default_factory=dict)
+    """Group id to hidden episodes in which the policy failed, of finished groups."""
+    hidden_returns: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Held-out and random group id to returns, of finished groups."""
+    rollout_s: float = 0.0
+    queue_s: float = 0.0
+
+    @property
+    def id(self) -> str:
+        return self.row.run
+
+    def change(self, turn: Turn, **fields: object) -> None:
+        """Change the durable state."""
+        self.state = msgspec.structs.replace(self.state, **fields)
+        turn.persist(self.state)
+
+    def change_submit(self, index: int, turn: Turn, **fields: object) -> SubmitRow:
+        row = self.submits[index] = msgspec.structs.replace(self.submits[index], **fields)
+        turn.persist(row)
+        return row
+
+
+def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
+    known = core.run_keys.get(event.key)
+    if known is not None:
+        turn.reply(event.request, operator.RunCreated(run=known, capability=core.capabilities[known]))
+        return
+    fault = _fault(event)
+    if fault is None and event.run in core.capabilities:
+        fault = f"there is a run {event.run!r} already"
+    if fault is not None:
+        turn.refuse(event.request, "bad_settings", fault)
+        return
+    row = RunRow(
+        run=event.run,
+        key=event.key,
+        capability=event.capability,
+        secret=event.secret,
+        settings=event.settings,
+        budget=event.budget,
+        min_episodes_per_submit=event.min_episodes_per_submit,
+        max_episodes_per_submit=event.max_episodes_per_submit,
+        train=event.train,
+        validation=event.validation,
+        heldout=event.heldout,
+        split_hashes=event.split_hashes,
+        split_secret=event.split_secret,
+        allowed_imports=event.allowed_imports,
+        denied_imports=event.denied_imports,
+        created_at=turn.now,
+        stimulus_id=turn.stimulus_id,
+    )
+    state = RunStateRow(run=event.run)
+    turn.persist(row)
+    run = enter(core, row, state)
+    turn.persist(state)
+    core.pin(run.flow, turn)
+    turn.reply(event.request, operator.RunCreated(run=event.run, capability=event.capability))
+    turn.log("info", "run_created", run=event.run, env=event.settings.env, budget=event.budget)
+
+
+def enter(core: Core, row: RunRow, state: RunStateRow) -> Run:
+    """Take a run into the core, with its whole budget available."""
+    flow = core.add_flow(row.run, row.settings.env, row.settings.sandbox_tier)
+    run = Run(row, state, Ledger(row.budget), flow)
+    core.runs[row.run] = run
+    core.run_keys[row.key] = row.run
+    core.capabilities[row.run] = row.capability
+    return run
+
+
+def _fault(event: events.RunCreated) -> str | None:
+    least, most = event.min_episodes_per_submit, event.max_episodes_per_submit
+    if event.budget < 1:
+        return f"a budget of {event.budget} episodes; at least 1 is needed"
+    if not 1 <= least <= most:
+        return f"a submit of {least} to {most} episodes; wanted is 1 ≤ minimum ≤ maximum"
+    if least > event.budget:
+        return f"a submit takes at least {least} episodes, the budget is {event.budget}"
+    for name, cases in (("train", event.train), ("validation", event.validation), ("heldout", event.heldout)):
+        if not cases:
+            return f"the {name} split has no cases"
+    return None
+
+
+# ---- what a gateway asks ----
+
+
+def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
+    run = _live(core, event.request, event.run, turn)
+    if run is None:
+        return
+    if run.flow.pin is None:
+        core.pin(run.flow, turn)
+    description = run.state.description
+    row, settings = run.row, run.row.settings
+    if description is None:
+        text = (
+            f"no worker that offers {settings.env} with sandbox tier {settings.sandbox_tier} is connected yet"
+        )
+        turn.refuse(event.request, "no_worker", text)
+        return
+    turn.reply(
+        event.request,
+        gateway.RunOpened(
+            env=description,
+            n_env_instances=len(row.train),
+            episode_budget=row.budget,
+            min_episodes_per_submit=row.min_episodes_per_submit,
+            max_episodes_per_submit=row.max_episodes_per_submit,
+            policy_scope=settings.policy_scope,
+            observations=settings.observations,
+            sandbox_tier=settings.sandbox_tier,
+            video=settings.video,
+            limits=settings.limits,
+            allowed_imports=row.allowed_imports,
+            denied_imports=row.denied_imports,
+            state=run_state(core, run),
+        ),
+    )
+
+
+def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> None:
+    run = _live(core, event.request, event.run, turn)
+    if run is not None:
+        turn.reply(event.request, gateway.StateReply(state=run_state(core, run)))
+
+
+def run_state(core: Core, run: Run) -> gateway.RunState:
+    in_flight = None
+    if run.open is not None:
+        group = core.groups[train_group(run.id, run.open)]
+        in_flight = gateway.SubmitInFlight(
+            submit_index=run.open,
+            n_episodes=group.n,
+            n_done=group.done,
+            waits_for=core.waits_for(group),
+        )
+    return gateway.RunState(
+        remaining_budget=run.ledger.available,
+        n_submits=len(run.submits),
+        is_finalized=run.state.phase != "open",
+        in_flight=in_flight,
+    )
+
+
+def _live(core: Core, request: events.RequestId, name: str, turn: Turn) -> Run | None:
+    run = core.runs.get(name)
+    if run is None:
+        finished = name in core.capabilities
+        text = f"run {name!r} is finished" if finished else f"there is no run {name!r}"
+        turn.refuse(request, "run_finished" if finished else "unknown_run", text)
+    return run
+
+
+def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
+    run = _live(core, event.request, event.run, turn)
+    if run is None:
+        return
+    known = run.keys.get(event.key)
+    if known is not None:
+        _again(run, event, run.submits[known], turn)
+        return
+    if run.state.phase != "open":
+        turn.refuse(event.request, "run_closed", f"run {run.id!r} takes no more submits")
+        return
+    if run.open is not None:
+        turn.refuse(event.request, "busy", f"submit {run.open} is still running; one runs at a time")
+        return
+    refused = refusal(
+        event.env_instances,
+        n_cases=len(run.row.train),
+        minimum=run.row.min_episodes_per_submit,
+        maximum=run.row.max_episodes_per_submit,
+        available=run.ledger.available,
+    )
+    if refused is not None:
+        turn.refuse(event.request, refused.status, refused.message)
+        return
+    if event.bundle is None and event.bundle_error is None:
+        turn.refuse(event.request, "bad_request", "a submit names a bundle, or says why there is none")
+        return
+    _accept(core, run, event, turn)
+
+
+def _again(run: Run, event: events.SubmitRequested, row: SubmitRow, turn: Turn) -> None:
+    """The answer to a key that is known: the same as the first time, if the request is."""
+    if (event.env_instances, event.bundle) != (row.env_instances, row.bundle):
+        text = f"key {event.key!r} was used for submit {row.submit_index} with another request"
+        turn.refuse(event.request, "key_conflict", text)
+        return
+    turn.reply(event.request, _accepted(row))
+
+
+def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
+    return gateway.SubmitAccepted(
+        submit_index=row.submit_index,
+        first_global_episode=row.first_global_episode,
+        remaining_budget=row.remaining_budget,
+    )
+
+
+def _accept(core: Core, run: Run, event: events.SubmitRequested, turn: Turn) -> None:
+    index, n = len(run.submits), len(event.env_instances)
+    first_global_episode = run.ledger.spent
+    run.ledger.reserve(index, n)
+    row = SubmitRow(
+        run=run.id,
+        submit_index=index,
+        key=event.key,
+        env_instances=event.env_instances,
+        bundle=event.bundle,
+        first_global_episode=first_global_episode,
+        remaining_budget=run.ledger.available,
+        accepted_at=turn.now,
+        stimulus_id=turn.stimulus_id,
+    )
+    run.submits.append(row)
+    run.keys[event.key] = index
+    turn.reply(event.request, _accepted(row))
+    turn.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
+    failure = event.bundle_error
+    if failure is not None:
+        run.ledger.settle(index)
+        status: SubmitStatus = "import_error"
+        if failure.category in NO_POLICY:
+            status = cast(SubmitStatus, failure.category)
+        run.change_submit(index, turn, status=status, failure=failure, completed_at=turn.now)
+        return
+    turn.persist(row)
+    run.open = index
+    play(core, run, row, turn)
+
+
+def play(core: Core, run: Run, row: SubmitRow, turn: Turn) -> JobGroup:
+    """Queue what is left of an open submit."""
+    n = len(row.env_instances)
+    settings = run.row.settings
+    template = Template(
+        env=settings.env,
+        bundle=row.bundle,
+        cases=tuple(run.row.train[case_id] for case_id in row.env_instances),
+        case_ids=row.env_instances,
+        occurrences=occurrences(row.env_instances),
+        secret=run.row.secret,
+        split="train",
+        submit_index=row.submit_index,
+        modulo=n,
+        per_job=n if settings.policy_scope == "submit" else 1,
+        scope=settings.policy_scope,
+        env_meta=env_meta(run, row),
+        observations=settings.observations,
+        record="full",
+        video=settings.video,
+        tier=settings.sandbox_tier,
+        limits=settings.limits,
+    )
+    group = JobGroup(
+        id=train_group(run.id, row.submit_index),
+        kind="train",
+        run=run.id,
+        submit_index=row.submit_index,
+        flow=run.flow,
+        template=template,
+        stimulus_id=row.stimulus_id,
+        priority=TRAIN,
+        created_at=row.accepted_at,
+    )
+    core.open_group(group, turn)
+    return group
+
+
+def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
+    """What a submit's policies are told, in every split; the worker adds the spaces."""
+    return {
+        "env": run.row.settings.env,
+        "submit_index": row.submit_index,
+        "n_episodes_this_submit": len(row.env_instances),
+        "remaining_budget_after": row.remaining_budget,
+    }
+
+
+# ---- how a submit goes on and ends ----
+
+
+def progressed(core: Core, group: JobGroup, outcomes: tuple[EpisodeOutcome, ...], turn: Turn) -> None:
+    """Some episodes of an open submit are done."""
+    run = core.runs[group.run]
+    for outcome in outcomes:
+        failure = outcome.failure
+        if outcome.index == 0 and failure is not None and failure.category in NO_POLICY:
+            end(core, run, group, cast(SubmitStatus, failure.category), failure, turn)
+            return
+    if group.done == group.n:
+        end(core, run, group, "ok", None, turn)
+    elif 0 in group.marks:
+        answer_polls(core, group, turn)
+
+
+def quarantine(core: Core, group: JobGroup, turn: Turn) -> None:
+    """The submit's bundle brought its slot down too often."""
+    text = f"the policy brought its whole slot down on {len(group.strikes)} attempts; the submit was ended"
+    failure = PolicyFailure(category="killed", step_index=None, message=text)
+    end(core, core.runs[group.run], group, "quarantined", failure, turn)
+
+
+def timed_out(core: Core, group: JobGroup, turn: Turn) -> None:
+    """The operator's limit on a whole submit's wall time has passed."""
+    run = core.runs[group.run]
+    limit_s = run.row.settings.limits.submit_wall_s
+    text = (
+        f"the submit took longer than its limit of {limit_s} s; {group.done} of {group.n} episodes were done"
+    )
+    failure = PolicyFailure(category="episode_timeout", step_index=None, message=text, limit=limit_s)
+    end(core, run, group, "rollout_timeout", failure, turn)
+
+
+def end(
+    core: Core, run: Run, group: JobGroup, status: SubmitStatus, failure: PolicyFailure | None, turn: Turn
+) -> None:
+    """Settle a submit with its verdict."""
+    n_kept = 0
+    if status == "ok":
+        n_kept = group.n
+    elif status == "rollout_timeout":
+        n_kept = group.first_unfinished()
+    row = run.change_submit(
+        group.submit_index,
+        turn,
+        status=status,
+        failure=failure,
+        completed_at=turn.now,
+        first_leased_at=group.first_leased_at,
+        released=group.done if n_kept else 0,
+        n_kept=n_kept,
+        mean_return=group.mean_return() if status == "ok" else None,
+    )
+    started_at = group.first_leased_at or turn.now
+    run.queue_s += max(0.0, started_at - row.accepted_at)
+    run.rollout_s += turn.now - started_at
+    run.ledger.settle(group.submit_index)
+    run.open = None
+    core.close_group(group, turn, f"submit ended: {status}")
+    answer_polls(core, group, turn)
+    turn.log("info", "submit_ended", run=run.id, submit=group.submit_index, status=status, episodes=group.n)
+    core.submit_ended(run, row, turn)
+
+
+# ---- long polls ----
+
+
+def results(core: Core, event: events.ResultsRequested, turn: Turn) -> None:
+    run = core.runs.get(event.run)
+    if run is None:
+        if event.run in core.capabilities:
+            turn.add(_page(event.request, event.run, event.submit_index, event.cursor, None, "", turn))
+        else:
+            turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
+        return
+    if not 0 <= event.submit_index < len(run.submits):
+        text = f"run {run.id!r} has {len(run.submits)} submits, none of index {event.submit_index}"
+        turn.refuse(event.request, "unknown_submit", text)
+        return
+    target = train_group(run.id, event.submit_index)
+    poll = Poll(event.request, "results", target, event.cursor)
+    closed = run.submits[event.submit_index].status is not None
+    ready = closed or _released(core, target) > event.cursor
+    if ready or not core.polls.wait(poll, event.wait_s, turn.now):
+        answer(core, run, poll, turn)
+
+
+def _released(core: Core, target: str) -> int:
+    """Episodes of an open submit that its gateway may see."""
+    group = core.groups[target]
+    return group.done if 0 in group.marks else 0
+
+
+def answer_polls(core: Core, group: JobGroup, turn: Turn) -> None:
+    """There is something new for those who wait for a submit's results."""
+    for poll in core.polls.take_all(group.id):
+        answer(core, core.runs[group.run], poll, turn)
+
+
+def answer(core: Core, run: Run, poll: Poll, turn: Turn) -> None:
+    """Answer a poll with what there is."""
+    index = int(poll.target.split("/")[1][1:])
+    row = run.submits[index]
+    waits_for = "" if row.status is not None else core.waits_for(core.groups[poll.target])
+    upto = row.released if row.status is not None else _released(core, poll.target)
+    turn.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, turn))
+
+
+def _page(
+    request: events.RequestId, run: str, index: int, cursor: int, upto: int | None, waits_for: str, turn: Turn
+) -> ReadResults:
+    return ReadResults(
+        request=request,
+        run=run,
+        submit_index=index,
+        cursor=max(0, cursor),
+        upto=upto,
+        waits_for=waits_for,
+        stimulus_id=turn.stimulus_id,
+    )
+
+
+def finished_effect(request: events.RequestId, run: str, turn: Turn) -> ReadFinished:
+    return ReadFinished(request=request, run=run, stimulus_id=turn.stimulus_id)

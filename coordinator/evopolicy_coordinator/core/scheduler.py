@@ -1,0 +1,263 @@
+"""Brings waiting jobs and waiting workers together.
+
+Rules that this module owns:
+- Work is pulled: a worker's poll says how many leases it can take and waits until there is some. It gets more than it
+  asked for only of episodes so short that a batch is worth about `batch_s`, and never so many that another idle worker
+  goes without.
+- New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
+- A suspect runs alone: on an idle worker, or on one that is emptied for it; nothing else goes there meanwhile.
+- A waiting train job stops hidden jobs: early validation as often as it takes, others a bounded number of times. The
+  hidden job goes back into the queue; its worker lets go of it and polls again.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from evopolicy_common.messages import worker as wire
+
+from .events import LeaseRequested
+from .jobs import EARLY_VALIDATION, HELDOUT, TRAIN, JobState
+from .queue import Lane, Profile
+from .turn import Turn
+from .workers import LeasePoll, Worker
+
+if TYPE_CHECKING:
+    from .machine import Core
+
+TRIES_MAX = 4
+"""Parked workers that are tried for a lane in one step before the rest waits for the next."""
+
+LOOK_AGAIN_S = 1.0
+"""What waits although someone waits for it (they avoid each other) is looked at again after so long."""
+
+SUSPECTS_MAX = 16
+"""Suspects looked at in one step."""
+
+
+class Scheduler:
+    """Parks polls, hands out leases, preempts."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._emptied: dict[str, None] = {}
+
+    def queue(self, job: JobState, turn: Turn, *, front: bool = False) -> None:
+        """Let a job wait, and see at the end of the step whether someone waits for it."""
+        lane = self._core.queue.push(job, front=front)
+        if lane is not None:
+            turn.dirty[lane] = None
+
+    def emptied(self, worker: Worker) -> None:
+        """A worker let go of a lease: its waiting poll may be answerable now."""
+        self._emptied[worker.name] = None
+
+    # ---- polls ----
+
+    def poll(self, worker: Worker, event: LeaseRequested, turn: Turn) -> None:
+        """A worker asks for leases; an older poll of it is answered with none."""
+        core = self._core
+        self.drop_poll(worker, turn)
+        warm = frozenset(event.warm_bundles) | frozenset(event.warm_environments)
+        worker.poll = LeasePoll(event.request, max(1, min(event.n, 2 * worker.slots)), warm)
+        if not self._serve(worker, turn):
+            wait_s = min(max(event.wait_s, 0.0), core.settings.max_wait_s)
+            core.timers.arm(("lease", worker.name), turn.now + wait_s)
+            if core.fleet.available(worker, turn.now) and worker.reserved is None:
+                self._park(worker, turn)
+
+    def _park(self, worker: Worker, turn: Turn) -> None:
+        self._core.fleet.park(worker)
+        for lane in worker.profile.busy:
+            self._core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
+
+    def drop_poll(self, worker: Worker, turn: Turn) -> None:
+        """Answer a worker's waiting poll with no leases."""
+        if worker.poll is not None:
+            self._answer(worker, (), turn)
+
+    def _answer(self, worker: Worker, leases: tuple[wire.Lease, ...], turn: Turn) -> None:
+        poll = worker.poll
+        assert poll is not None
+        self._core.fleet.unpark(worker)
+        self._core.timers.disarm(("lease", worker.name))
+        worker.poll = None
+        turn.reply(poll.request, wire.Leases(leases=leases))
+
+    def _serve(self, worker: Worker, turn: Turn) -> bool:
+        """Answer a worker's poll if there is anything for it."""
+        leases = self._fill(worker, turn)
+        if leases:
+            self._answer(worker, tuple(leases), turn)
+        return bool(leases)
+
+    def _fill(self, worker: Worker, turn: Turn) -> list[wire.Lease]:
+        core, poll = self._core, worker.poll
+        if poll is None or not core.fleet.available(worker, turn.now):
+            return []
+        if core.queue.suspects and (suspect := self._suspect(worker, turn)) is not None:
+            return [suspect]
+        if worker.reserved is not None:
+            return []
+        leases: list[wire.Lease] = []
+        limit, spent_s = poll.n, 0.0
+        while len(leases) < limit:
+            job = core.queue.take(worker.profile, worker.name, poll.warm, turn.now)
+            if job is None:
+                break
+            if not leases:
+                limit = self._batch(job, worker.profile, poll.n)
+            spent_s += job.group.flow.cost_s(job)
+            leases.append(core.book.grant(job, worker, turn))
+            if len(leases) >= poll.n and spent_s >= poll.n * core.settings.batch_s:
+                break
+        return leases
+
+    def _batch(self, job: JobState, profile: Profile, n: int) -> int:
+        """How many leases a poll for `n` gets at most, the first being of `job`."""
+        flow, settings = job.group.flow, self._core.settings
+        if flow.episode_s is None or flow.lane is None:
+            return n
+        per_slot = min(settings.batch_max, int(settings.batch_s / max(flow.cost_s(job), 1e-4)))
+        if per_slot <= 1:
+            return n
+        share = math.ceil((sum(flow.lane.n_ready) + 1) * n / max(1, flow.lane.slots()))
+        return max(n, min(n * per_slot, share))
+
+    # ---- suspects ----
+
+    def _suspect(self, worker: Worker, turn: Turn) -> wire.Lease | None:
+        """The suspect that an idle worker is to play; a busy one may be reserved for one instead."""
+        core, idle = self._core, not worker.leases
+        if worker.reserved is not None:
+            job = worker.reserved
+            if not job.queued:
+                worker.reserved = job.reserved = None
+            elif not idle:
+                return None
+            else:
+                return self._alone(job, worker, turn)
+        for job in list(islice(core.queue.suspects, SUSPECTS_MAX)):
+            lane = job.group.flow.lane
+            if lane is None or worker.profile not in lane.profiles:
+                continue
+            if job.reserved is not None and not idle:
+                continue
+            if job.avoid == worker.name and turn.now < job.avoid_until and lane.workers() > 1:
+                continue
+            if job.priority == EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
+                continue
+            if idle:
+                return self._alone(job, worker, turn)
+            job.reserved = worker.name
+            worker.reserved = job
+            core.chronicle.tell(turn.now, turn.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
+            return None
+        return None
+
+    def _alone(self, job: JobState, worker: Worker, turn: Turn) -> wire.Lease:
+        core = self._core
+        if job.reserved is not None and job.reserved in core.fleet.workers:
+            core.fleet.workers[job.reserved].reserved = None
+            self._emptied[job.reserved] = None
+        worker.reserved = job.reserved = None
+        core.queue.withdraw(job)
+        return core.book.grant(job, worker, turn)
+
+    # ---- the end of a step ----
+
+    def dispatch(self, turn: Turn) -> None:
+        """Hand out what this step made available."""
+        core = self._core
+        while self._emptied:
+            name = next(iter(self._emptied))
+            del self._emptied[name]
+            worker = core.fleet.workers.get(name)
+            if worker is not None and worker.poll is not None and name not in worker.profile.parked:
+                self.reconsider(worker, turn)
+        for job in list(islice(core.queue.suspects, SUSPECTS_MAX)):
+            lane = job.group.flow.lane
+            if lane is not None and job.queued:
+                self._try_parked(lane, turn, TRIES_MAX)
+        fed = list(turn.dirty)
+        for lane in fed:
+            self._feed(lane, turn)
+        for lane in fed:
+            if lane.n_ready[TRAIN]:
+                self._preempt(lane, turn)
+        for lane in [lane for lane in turn.dirty if lane not in fed]:
+            self._feed(lane, turn)
+
+    def reconsider(self, worker: Worker, turn: Turn) -> None:
+        """A worker with a waiting poll may have become available."""
+        fleet = self._core.fleet
+        if worker.poll is None or not fleet.available(worker, turn.now):
+            return
+        if not self._serve(worker, turn) and worker.reserved is None:
+            self._park(worker, turn)
+
+    def _feed(self, lane: Lane, turn: Turn) -> None:
+        """Answer parked polls while the lane has something for them."""
+        tries = 0
+        while any(lane.n_ready) and tries < TRIES_MAX:
+            worker = self._parked(lane)
+            if worker is None:
+                return
+            if self._serve(worker, turn):
+                tries = 0
+            else:
+                tries += 1
+                self._to_the_back(worker)
+        if any(lane.n_ready):
+            self._core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
+
+    def _try_parked(self, lane: Lane, turn: Turn, tries: int) -> None:
+        for profile in lane.profiles:
+            for name in list(islice(profile.parked, tries)):
+                worker = self._core.fleet.workers[name]
+                if not self._serve(worker, turn):
+                    self._to_the_back(worker)
+
+    def _to_the_back(self, worker: Worker) -> None:
+        fleet = self._core.fleet
+        fleet.unpark(worker)
+        if worker.reserved is None:
+            fleet.park(worker)
+
+    def _parked(self, lane: Lane) -> Worker | None:
+        """The waiting worker that should get what goes next in the lane."""
+        following = self._core.queue.next_bundle(lane)
+        if following is None:
+            return None
+        for item in following:
+            for profile in lane.profiles if item is not None else ():
+                names = profile.warm.get(item or "")
+                if names:
+                    return self._core.fleet.workers[next(iter(names))]
+        for profile in lane.profiles:
+            if profile.parked:
+                return self._core.fleet.workers[next(iter(profile.parked))]
+        return None
+
+    def _preempt(self, lane: Lane, turn: Turn) -> None:
+        """Stop hidden jobs for the train jobs that wait in the lane."""
+        core = self._core
+        wanted = lane.n_ready[TRAIN] - lane.stopping
+        for priority in (EARLY_VALIDATION, HELDOUT):
+            for profile in lane.profiles:
+                hidden = profile.hidden[priority]
+                while wanted > 0 and hidden:
+                    lease = next(iter(hidden))
+                    job = lease.job
+                    if priority == HELDOUT and job.preemptions >= core.settings.preemptions_max:
+                        del hidden[lease]
+                        continue
+                    job.preemptions += 1
+                    wanted -= 1
+                    lane.stopping += 1
+                    lease.stopped_for = lane
+                    worker = core.fleet.workers[lease.worker]
+                    core.book.stop(lease, turn, f"preempted for {lane.key[0]}")
+                    core.book.give_back(job, "returned", worker, turn, ran=False)

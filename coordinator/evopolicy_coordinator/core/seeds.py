@@ -1,0 +1,30 @@
+"""Seeds of policy processes: keyed hashes that repeat, and that tell neither the case's seed nor the split.
+
+policy_seed = HMAC-SHA256(run secret, submit index | split | case id | occurrence)[:16]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Iterable
+
+
+def policy_seed(secret: bytes, submit_index: int, split: str, case_id: int, occurrence: int) -> bytes:
+    """16 bytes for the `occurrence`-th (from 0) time that a submit plays `case_id` of `split`.
+
+    `submit_index` is −1 where no submit is concerned: the random reference and evaluations outside runs.
+    """
+    text = f"{submit_index}|{split}|{case_id}|{occurrence}".encode()
+    return hmac.digest(secret, text, hashlib.sha256)[:16]
+
+
+def occurrences(case_ids: Iterable[int]) -> tuple[int, ...]:
+    """For each position, how often its case stood earlier in the list."""
+    seen: dict[int, int] = {}
+    counts: list[int] = []
+    for case_id in case_ids:
+        count = seen.get(case_id, 0)
+        counts.append(count)
+        seen[case_id] = count + 1
+    return tuple(counts)

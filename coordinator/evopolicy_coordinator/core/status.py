@@ -1,0 +1,157 @@
+"""What an operator may see of the whole: workers, runs, and what waits longer than it should, and for what.
+
+Looks at everything, so it is for a status request only, never for an event.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+from evopolicy_common.messages.operator import RunStatus, WorkerStatus
+
+from .finalisation import progress
+from .jobs import JobGroup
+from .queue import Flow, Lane
+from .runs import Run
+
+if TYPE_CHECKING:
+    from .machine import Core
+    from .workers import Worker
+
+RATE_S = 60
+
+
+class CoreStatus(NamedTuple):
+    """The core's part of a `StatusReply`."""
+
+    episodes_done: int
+    """Since the core was loaded."""
+    episodes_per_s: float
+    """Over the last minute."""
+    workers: tuple[WorkerStatus, ...]
+    runs: tuple[RunStatus, ...]
+    stalls: tuple[str, ...]
+
+
+class Rate:
+    """Episodes done, in all and over the last minute; one count a second is kept."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._seconds: deque[list[int]] = deque(maxlen=RATE_S)
+
+    def count(self, n: int, now: float) -> None:
+        self.total += n
+        second = int(now)
+        if self._seconds and self._seconds[-1][0] == second:
+            self._seconds[-1][1] += n
+        else:
+            self._seconds.append([second, n])
+
+    def per_s(self, now: float) -> float:
+        """Episodes a second over the last minute."""
+        return sum(n for second, n in self._seconds if second > now - RATE_S) / RATE_S
+
+
+def waits_for(core: Core, group: JobGroup) -> str:
+    """What an open group waits for when nothing of it is leased, in words that an agent may read; else empty."""
+    if group.n_leased or group.closed or not group.jobs:
+        return ""
+    flow = group.flow
+    if flow.lane is None or not flow.lane.profiles:
+        return _a_worker(flow)
+    if flow.lane.slots() == 0:
+        return f"{_a_worker(flow)}, of the same versions as the run began with"
+    if any(job.lease is None and not job.queued for job in group.jobs.values()):
+        waits_to_adopt = any(job in core.adopting for job in group.jobs.values())
+        return "workers to report after a restart" if waits_to_adopt else "another try after a fault of ours"
+    return "a free slot"
+
+
+def _a_worker(flow: Flow) -> str:
+    return f"a worker that offers {flow.env} with sandbox tier {flow.tier}"
+
+
+def status(core: Core, now: float) -> CoreStatus:
+    workers = tuple(_worker(core, worker, now) for worker in core.fleet.workers.values())
+    runs = tuple(_run(core, run) for run in core.runs.values())
+    return CoreStatus(core.rate.total, core.rate.per_s(now), workers, runs, _stalls(core, now))
+
+
+def _worker(core: Core, worker: Worker, now: float) -> WorkerStatus:
+    profile = worker.profile
+    live = [lease for lease in worker.leases.values() if lease.live]
+    refused = {
+        run.id: _mismatch(run, profile.fingerprint_class)
+        for run in core.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.pin not in (None, profile.fingerprint_class)
+    }
+    refused |= {
+        run.id: f"the run demands sandbox tier {run.flow.tier}; the worker has {', '.join(sorted(profile.key[1]))}"
+        for run in core.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.tier not in profile.key[1]
+    }
+    return WorkerStatus(
+        worker=worker.name,
+        host=worker.host,
+        slots=worker.slots,
+        state=worker.state,
+        tiers=tuple(sorted(profile.key[1])),
+        environments=tuple(sorted(profile.descriptions)),
+        fingerprint=profile.fingerprint_class,
+        held=len(live),
+        running=sum(lease.running for lease in live),
+        last_seen_s=max(0.0, now - worker.last_seen),
+        refused=refused,
+    )
+
+
+def _mismatch(run: Run, offered: str) -> str:
+    return f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class {offered}"
+
+
+def _run(core: Core, run: Run) -> RunStatus:
+    groups = [group for group in core.groups.values() if group.run == run.id]
+    waiting = [text for group in groups if (text := waits_for(core, group))]
+    return RunStatus(
+        run=run.id,
+        entry=run.row.settings.entry,
+        env=run.row.settings.env,
+        phase=progress(core, run).phase,
+        budget=run.row.budget,
+        remaining_budget=run.ledger.available,
+        n_submits=len(run.submits),
+        queued=sum(run.flow.n_ready),
+        running=run.flow.n_leased,
+        done=run.ledger.settled + sum(group.done for group in groups),
+        waits_for=waiting[0] if waiting else "",
+    )
+
+
+def _stalls(core: Core, now: float) -> tuple[str, ...]:
+    """What waits longer than `stall_s`, oldest group first."""
+    stalls: list[str] = []
+    limit_s = core.settings.stall_s
+    for group in core.groups.values():
+        waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
+        if waiting:
+            oldest = min(waiting, key=lambda job: job.since)
+            what = waits_for(core, group) or _behind(group.flow.lane)
+            again = f", after {oldest.failures} faults" if oldest.failures else ""
+            stalls.append(
+                f"{len(waiting)} jobs of {group.id} wait for {what}; {oldest.job_id} for {now - oldest.since:.0f} s{again}"
+            )
+        for job in group.jobs.values():
+            lease = job.lease
+            if lease is not None and lease.running and now - lease.progress_at > limit_s:
+                stalls.append(
+                    f"{job.job_id} makes no progress on {lease.worker} for {now - lease.progress_at:.0f} s "
+                    f"at step {lease.steps}"
+                )
+    return tuple(stalls)
+
+
+def _behind(lane: Lane | None) -> str:
+    slots = 0 if lane is None else lane.slots()
+    return f"a free slot among {slots}"

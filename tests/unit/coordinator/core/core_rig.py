@@ -1,0 +1,271 @@
+"""A core with a store in memory and a clock that tests set: what a shell does, without waiting or failing."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
+from evopolicy_common.messages.episode import EpisodeOutcome, FailureCategory, Job, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import Effect, Log, Persist, ReadEvaluation, ReadFinished, ReadResults, Reply
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import (
+    EvaluationRow,
+    FinishedRow,
+    OutcomeRow,
+    Row,
+    RunRow,
+    RunStateRow,
+    Snapshot,
+    StrikeRow,
+    SubmitRow,
+    WorkerRow,
+    head_of,
+)
+from evopolicy_coordinator.core.settings import CoreSettings
+
+ENV = "toy/line"
+BUNDLE = "a" * 64
+T = TypeVar("T")
+
+
+def describe(env: str = ENV) -> EnvironmentDescription:
+    return EnvironmentDescription(
+        env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=10, task_text=""
+    )
+
+
+def fingerprint(version: str = "1") -> wire.Fingerprint:
+    return wire.Fingerprint(code_version=version, python="3.11", packages={"numpy": "2.4"}, cpu="x")
+
+
+def outcome_of(index: int, value: float = 1.0, failure: FailureCategory | None = None) -> EpisodeOutcome:
+    failed = None if failure is None else PolicyFailure(category=failure, step_index=None, message="it failed")
+    return EpisodeOutcome(
+        index=index, episode_return=value, length=3, terminated=True, truncated=False, failure=failed, wall_s=1.0
+    )
+
+
+def key_of(row: Row) -> tuple[Any, ...]:
+    match row:
+        case SubmitRow():
+            return (SubmitRow, row.run, row.submit_index)
+        case OutcomeRow():
+            return (OutcomeRow, row.group, row.index)
+        case StrikeRow():
+            return (StrikeRow, row.group, row.lease_id)
+        case EvaluationRow():
+            return (EvaluationRow, row.evaluation)
+        case WorkerRow():
+            return (WorkerRow, row.worker)
+        case _:
+            return (type(row), row.run)
+
+
+class Rig:
+    """Drives a core; `now` is what tests say it is."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.settings = CoreSettings(**settings)
+        self.rows: dict[tuple[Any, ...], Row] = {}
+        self.now = 1000.0
+        self.replies: dict[events.RequestId, Any] = {}
+        self.logs: list[Log] = []
+        self.incarnation = 0
+        self._requests = 0
+        self.core = self.load()
+
+    def load(self) -> Core:
+        """A new core from what is stored, as after a crash."""
+        self.incarnation += 1
+        self.core, effects = Core.load(self.settings, self.snapshot(), self.now)
+        self._carry_out(effects)
+        return self.core
+
+    def snapshot(self) -> Snapshot:
+        def of(kind: type[T]) -> tuple[T, ...]:
+            return tuple(row for row in self.rows.values() if isinstance(row, kind))
+
+        return Snapshot(
+            incarnation=self.incarnation,
+            runs=of(RunRow),
+            states=of(RunStateRow),
+            submits=of(SubmitRow),
+            outcomes=tuple(head_of(row) for row in of(OutcomeRow)),
+            strikes=of(StrikeRow),
+            evaluations=of(EvaluationRow),
+            workers=of(WorkerRow),
+        )
+
+    # ---- driving ----
+
+    def request(self) -> int:
+        self._requests += 1
+        return self._requests
+
+    def tell(self, event: events.AnyEvent) -> Any:
+        """Hand an event in; gives the answer to its request, None while it waits."""
+        self._carry_out(self.core.handle(event, self.now))
+        self.core.validate()
+        return self.replies.get(getattr(event, "request", None))  # type: ignore[arg-type]
+
+    def pass_time(self, seconds: float, step_s: float = 0.5) -> None:
+        """Let time pass, serving every deadline when it is due."""
+        until = self.now + seconds
+        while True:
+            due = self.core.next_deadline()
+            if due is None or due > until:
+                break
+            self.now = max(self.now, due)
+            self._carry_out(self.core.handle_deadline(self.now))
+            self.core.validate()
+        self.now = until
+
+    def _carry_out(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case Persist():
+                    for row in effect.rows:
+                        self.rows[key_of(row)] = row
+                case Log():
+                    self.logs.append(effect)
+                case Reply():
+                    assert effect.request not in self.replies, "one answer each"
+                    self.replies[effect.request] = effect.message
+                case ReadResults() | ReadEvaluation() | ReadFinished():
+                    assert effect.request not in self.replies, "one answer each"
+                    self.replies[effect.request] = effect
+
+    # ---- words ----
+
+    def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
+               budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, **settings: Any) -> Any:  # fmt: skip
+        return self.tell(
+            events.RunCreated(
+                request=self.request(),
+                stimulus_id=f"create-{run}",
+                run=run,
+                key=key or f"key-{run}",
+                capability=f"cap-{run}",
+                secret=b"s" * 32,
+                settings=RunSettings(env=env, entry="e", model="m", exp_id="x", **settings),
+                budget=budget,
+                min_episodes_per_submit=least,
+                max_episodes_per_submit=most,
+                train=tuple(Case(seed=seed) for seed in range(train)),
+                validation=tuple(Case(seed=1000 + seed) for seed in range(n_valid)),
+                heldout=tuple(Case(seed=2000 + seed) for seed in range(n_held)),
+                split_hashes={},
+                split_secret=True,
+            )
+        )
+
+    def register(
+        self, worker: str = "w1", *, slots: int = 2, version: str = "1", envs: tuple[str, ...] = (ENV,), **more: Any
+    ) -> str:
+        session = f"{worker}-s{self.request()}"
+        reply = self.tell(
+            events.WorkerRegistered(
+                request=self.request(),
+                worker=worker,
+                session=session,
+                slots=slots,
+                tiers=more.get("tiers", ("bwrap",)),
+                environments=tuple(describe(env) for env in envs),
+                fingerprint=fingerprint(version),
+            )
+        )
+        assert isinstance(reply, wire.Registered)
+        return session
+
+    def submit(self, *ids: int, run: str = "r1", key: str = "k0", bundle: str | None = BUNDLE, **more: Any) -> Any:
+        return self.tell(
+            events.SubmitRequested(
+                request=self.request(), stimulus_id=f"submit-{key}", run=run, key=key, env_instances=ids, bundle=bundle, **more
+            )
+        )
+
+    def poll(self, session: str, n: int = 2, wait_s: float = 0.0, **more: Any) -> Any:
+        """The leases that a poll gets; None while it waits."""
+        reply = self.tell(
+            events.LeaseRequested(
+                request=self.request(), worker=session.split("-")[0], session=session, n=n, wait_s=wait_s, **more
+            )
+        )
+        if reply is None and wait_s == 0.0:
+            request = self._requests
+            self.pass_time(0.0)
+            reply = self.replies.get(request)
+        return list(reply.leases) if isinstance(reply, wire.Leases) else reply
+
+    def beat(self, session: str, *held: wire.Lease, running: bool = True, wait_s: float = 0.0) -> Any:
+        leases = tuple(
+            wire.HeldLease(lease_id=each.lease_id, job_id=each.job.job_id, attempt=each.attempt, running=running)
+            for each in held
+        )
+        return self.tell(
+            events.HeartbeatReceived(
+                request=self.request(), worker=session.split("-")[0], session=session, held=leases, wait_s=wait_s
+            )
+        )
+
+    def hand_in(self, session: str, *results: wire.JobResult) -> Any:
+        return self.tell(
+            events.ResultsHandedIn(
+                request=self.request(), worker=session.split("-")[0], session=session, results=results
+            )
+        )
+
+    def play(self, session: str, *leases: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None) -> Any:
+        """Hand in outcomes of leases."""
+        return self.hand_in(session, *(done(lease, value, failure) for lease in leases))
+
+    def results(self, submit_index: int = 0, cursor: int = 0, wait_s: float = 0.0, run: str = "r1") -> Any:
+        return self.tell(
+            events.ResultsRequested(
+                request=self.request(), run=run, submit_index=submit_index, cursor=cursor, wait_s=wait_s
+            )
+        )
+
+    def close(self, run: str = "r1") -> Any:
+        return self.tell(events.RunClosed(request=self.request(), run=run, reason="budget_spent"))
+
+    def work_off(self, session: str, values: Any = lambda job: 1.0, rounds: int = 10_000) -> int:
+        """Let one worker play all there is; gives the number of jobs."""
+        n = 0
+        for _ in range(rounds):
+            leases = self.poll(session, n=4)
+            if not leases:
+                return n
+            n += len(leases)
+            self.hand_in(session, *(done(lease, values(lease.job)) for lease in leases))
+        raise AssertionError("there is no end to the work")
+
+    # ---- looking ----
+
+    def row(self, kind: type[T], *key: Any) -> T:
+        row = self.rows[(kind, *key)]
+        assert isinstance(row, kind)
+        return row
+
+    def finished(self, run: str = "r1") -> RunFinished:
+        return self.row(FinishedRow, run).result
+
+
+def done(lease: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None) -> wire.JobResult:
+    episodes = tuple(outcome_of(spec.index, value, failure) for spec in lease.job.episodes)
+    return result(lease, "done", episodes=episodes)
+
+
+def result(lease: wire.Lease, kind: wire.ResultKind, **more: Any) -> wire.JobResult:
+    return wire.JobResult(lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, kind=kind, **more)
+
+
+def split_of(job: Job) -> str:
+    """Which list a job is from: train, validation, heldout, random or an evaluation's."""
+    return job.job_id.rsplit("/", 2)[1]
+
+
+NO_LIMITS = ResourceLimits()

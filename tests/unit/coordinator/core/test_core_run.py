@@ -1,0 +1,56 @@
+"""A run from creation to its end, and what its gateway and operator are told on the way."""
+
+from __future__ import annotations
+
+from core_rig import Rig, split_of
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages.worker import Refused
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
+from evopolicy_coordinator.core.records import SubmitRow, submit_done
+
+
+def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
+    rig = Rig()
+    session = rig.register()
+    assert isinstance(rig.create(), operator.RunCreated)
+    opened = rig.tell(events.RunOpened(request="open", run="r1"))
+    assert isinstance(opened, gateway.RunOpened)
+    assert opened.state.remaining_budget == 16
+
+    accepted = rig.submit(0, 1, 1, 7)
+    assert accepted == gateway.SubmitAccepted(submit_index=0, first_global_episode=0, remaining_budget=12)
+    rig.work_off(session, lambda job: 2.0)
+    page = rig.results()
+    assert isinstance(page, ReadResults)
+    assert page.upto == 4
+    row = rig.row(SubmitRow, "r1", 0)
+    done = submit_done(row)
+    assert done is not None
+    assert (done.status, done.n_kept, row.mean_return, row.val_mean) == ("ok", 4, 2.0, 2.0)
+
+    rig.submit(3, key="k1")
+    rig.work_off(session, lambda job: 5.0)
+    rig.submit(4, key="k2")
+    rig.work_off(session, lambda job: 5.0)
+    waiting = rig.tell(events.RunWaited(request="wait", run="r1", wait_s=60.0))
+    assert waiting is None
+    rig.close()
+    rig.work_off(session, lambda job: {"heldout": 7.0, "random": -1.0}[split_of(job)])
+    assert isinstance(rig.replies["wait"], ReadFinished)
+    finished = rig.finished()
+    assert finished.status == "completed"
+    assert finished.best_submit_index == 2  # a tie goes to the later submit
+    assert finished.val_scores == {0: 2.0, 1: 5.0, 2: 5.0}
+    assert finished.heldout_returns == (7.0, 7.0, 7.0)
+    assert finished.random_heldout_returns == (-1.0, -1.0, -1.0)
+    assert (finished.final_score, finished.budget_used) == (7.0, 6)
+    assert not rig.core.groups
+    assert not rig.core.jobs
+
+
+def test_a_request_of_an_unknown_run_is_refused() -> None:
+    rig = Rig()
+    for answer in (rig.submit(0), rig.results(), rig.close(), rig.tell(events.StateRequested(request="s", run="r1"))):
+        assert isinstance(answer, Refused)
+        assert answer.status == "unknown_run"
