@@ -1,0 +1,101 @@
+"""`replay`: submits given policies one after another, dividing the budget evenly.
+
+Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is a
+folder with a `policy.py`, or with a `system/` that has one (as a run's `checkpoints/submit_NNN/`). DIR is one itself, or
+its subfolders are, and are played in sorted order.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+
+
+def policies_in(folder: Path) -> list[Path]:
+    """Folders of the policies in `folder`, in the order in which they are played."""
+    itself = _policy(folder)
+    if itself is not None:
+        return [itself]
+    found = (_policy(child) for child in sorted(folder.iterdir()) if child.is_dir())
+    return [policy for policy in found if policy is not None]
+
+
+def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
+    """Episodes for each policy, in order: as even as can be, the first ones one more; [] when not one is possible.
+
+    With too small a budget the last policies get none; `least` and `most` bound a submit.
+    """
+    least = max(1, least)
+    n_played = min(n_policies, budget // least)
+    if n_played == 0:
+        return []
+    even, more = divmod(budget, n_played)
+    return [min(most, even + (index < more)) for index in range(n_played)]
+
+
+def stage(policy: Path, system: Path) -> None:
+    """Makes `system` a copy of `policy`; links are copied as links, for the service to judge."""
+    system.mkdir(exist_ok=True)
+    for old in system.iterdir():
+        if old.is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink()
+    shutil.copytree(
+        policy, system, symlinks=True, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
+    )
+
+
+def play(client: Client, folder: Path, workspace: Path) -> int:
+    """Submits all; how many were taken. ProtocolError when the gateway stays away."""
+    info = client.info()
+    n_cases = int(info["env_meta"]["n_env_instances"])
+    policies = policies_in(folder)
+    if not policies:
+        raise ProtocolError(f"{folder} holds no policy: neither policy.py nor folders with one")
+    plan = shares(
+        int(info["state"]["remaining_budget"]),
+        len(policies),
+        int(info["min_episodes_per_submit"]),
+        int(info["max_episodes_per_submit"]),
+    )
+    # The policies that got no episodes are said, not dropped in silence.
+    for policy in policies[len(plan) :]:
+        print(f"{policy}: no budget left", flush=True)
+    n_taken = 0
+    for policy, n_episodes in zip(policies, plan, strict=False):
+        stage(policy, workspace / "system")
+        verdict = client.submit([index % n_cases for index in range(n_episodes)])
+        if isinstance(verdict, Refusal):
+            print(f"{policy}: refused, {verdict.status}: {verdict.message}", flush=True)
+            continue
+        n_taken += 1
+        print(
+            f"{policy}: {verdict.submit_id} {verdict.status} {verdict.summary.get('mean_return')}", flush=True
+        )
+    return n_taken
+
+
+def _policy(folder: Path) -> Path | None:
+    for candidate in (folder, folder / "system"):
+        if os.path.lexists(candidate / "policy.py"):
+            return candidate
+    return None
+
+
+def main() -> None:
+    """Plays in the current directory."""
+    try:
+        taken = play(Client.from_environment(), Path(sys.argv[1]), Path.cwd())
+    except ProtocolError as error:
+        print(f"replay: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    raise SystemExit(0 if taken else 1)
+
+
+if __name__ == "__main__":
+    main()

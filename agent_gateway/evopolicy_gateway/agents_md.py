@@ -1,0 +1,183 @@
+"""The staged `AGENTS.md`: the rules of a run, with the literal URLs and commands that run as they stand. Pure."""
+
+from __future__ import annotations
+
+from string import Template
+
+import msgspec
+
+from evopolicy_common.messages.gateway import RunOpened
+from evopolicy_gateway.formatting import episode_name, submit_id
+
+
+class Urls(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a run's agent finds its gateway."""
+
+    info: str
+    task: str
+    submit: str
+
+    def environment(self) -> dict[str, str]:
+        """As the variables that an agent's process is started with."""
+        return {
+            "EVOPOLICYGYM_INFO_URL": self.info,
+            "EVOPOLICYGYM_TASK_URL": self.task,
+            "EVOPOLICYGYM_SUBMIT_URL": self.submit,
+        }
+
+
+def urls_at(host: str, port: int, token: str) -> Urls:
+    """The URLs of a service on that address."""
+    root = f"http://{f'[{host}]' if ':' in host else host}:{port}/{token}"
+    return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit")
+
+
+NO_URLS = Urls(info="INFO_URL", task="TASK_URL", submit="SUBMIT_URL")
+"""What stands for the URLs where only the rules count: for the hash in `run.json`."""
+
+_TEXT = Template("""\
+# Improve a policy
+
+You improve one program, `system/policy.py`, that plays an environment: `$env`. You may run as many experiments on this
+machine as you like, but only a **submit** plays the environment, and the run has a budget of **$budget episodes**.
+
+1. Read the task: what is observed, what actions do, how reward is computed.
+2. Edit `system/policy.py` (and other files in `system/`).
+3. Submit it on train cases. Read the feedback. Repeat while budget remains.
+
+When the budget is spent or you stop, every submit with status `ok` is scored on hidden cases; the best of them is your
+result, its mean return on further hidden cases your score. So what counts is how a policy does on cases it has not seen.
+
+## Where things are
+
+| path | what |
+|---|---|
+| `system/` | yours: `policy.py` with a top-level `class Policy`, and whatever it imports or reads |
+| `feedback/` | written by the service after each submit; read it, do not change it |
+| `AGENTS.md` | this file; do not change it |
+
+Anything else you put here is your own scratch space and is never played. Your working directory is this folder. The
+service's addresses are also in `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.
+
+## Ask
+
+The task, in markdown:
+
+```bash
+curl -sS $task_url
+```
+
+Budget left, spaces, limits and allowed imports, as JSON:
+
+```bash
+curl -sS $info_url
+```
+
+## Submit
+
+`env_instances` lists train ids from 0 to $last_id, `$example` or `"0-3,7"`; order and repeats are kept. A submit has $least
+to $most episodes. **Every episode asked for is charged**, also when the policy crashes. One submit at a time.
+
+```bash
+curl -sS -X POST -H 'Content-Type: application/json' -d '{"env_instances": $example}' '$submit_url'
+```
+
+It answers when all episodes are played. If your tools give up on slow commands, do not wait: `?wait=false` answers at once
+with a `submit_id`, which you can ask about until its `status` is no longer `running`. From Python:
+
+```python
+import json, time, urllib.request, uuid
+
+SUBMIT_URL = "$submit_url"
+
+def submit(env_instances):
+    request = urllib.request.Request(
+        SUBMIT_URL + "?wait=false",
+        data=json.dumps({"env_instances": env_instances}).encode(),
+        # The key makes it safe to send the same request again: it is charged once.
+        headers={"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())},
+    )
+    answer = json.load(urllib.request.urlopen(request))
+    while answer["status"] == "running":
+        time.sleep(1)
+        answer = json.load(urllib.request.urlopen(SUBMIT_URL + "/" + answer["submit_id"]))
+    return answer
+
+answer = submit($example)
+print(answer["submit_id"], answer["status"], answer["summary"]["mean_return"])
+```
+
+| answer | meaning |
+|---|---|
+| 200, status `ok` | played; single episodes may have failed, see `errors` in the summary |
+| 200, `missing_policy`, `denied_import`, `import_error`, `init_error` | `system/` gives no `Policy`: charged, see `errors.txt` |
+| 200, `rollout_timeout`, `quarantined` | it took too long, or it kept bringing its sandbox down: charged |
+| 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
+| 409 | another submit is running, or an `Idempotency-Key` was used twice for different requests |
+
+## The policy
+
+```python
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta): ...
+    def reset(self, episode_index): ...      # before each episode
+    def act(self, obs): ...                  # once a step; returns an action
+```
+
+$scope
+It runs in a sandbox: Python's standard library and $imports, no network, no other files, limits on time and memory (`/info`).
+If it raises or exceeds a limit, random actions play the rest of that episode.
+
+## Feedback
+
+The first submit is `$first_submit`, its first episode `$first_episode`:
+
+```bash
+cat feedback/$first_submit/summary.json
+head -n 2 feedback/$first_submit/episodes/$first_episode/trajectory.jsonl
+```
+
+| file | what |
+|---|---|
+| `summary.json` | status, returns, lengths, failed episodes; the same as the answer's `summary` |
+| `errors.txt` | why a submit is not `ok`, JSON lines |
+| `episodes/ep_*/trajectory.jsonl` | a line a step: `t, obs, action, reward, terminated, truncated, info` |
+| `episodes/ep_*/observations.npy`, `.npz` | observations that are pictures; `obs` is null then |
+| `episodes/ep_*/stdout.txt`, `stderr.txt` | what the policy printed |
+| `episodes/ep_*/error.txt` | step, category and traceback where the policy failed |
+| `episodes/ep_*/video.mp4` | a frame a step, where this run records videos |
+
+Episodes are numbered through the run. While a submit runs, its finished episodes are in `$first_submit.partial/` and so on.
+
+## Not allowed
+
+- Looking for hidden cases, seeds or scores, or for other runs; reaching the environment in any way but a submit.
+- Changing `feedback/` or this file; interfering with the service or with the sandbox.
+- Policies that try to tell hidden cases from train cases, or that leave data behind for later.
+""")
+
+
+def agents_md(run: RunOpened, urls: Urls) -> str:
+    """The text for one run."""
+    n_example = max(run.min_episodes_per_submit, min(2, run.max_episodes_per_submit, run.episode_budget))
+    example = [index % run.n_env_instances for index in range(n_example)]
+    scope = (
+        "Every episode gets a fresh process and a fresh `Policy`."
+        if run.policy_scope == "episode"
+        else "One `Policy` plays all episodes of a submit one after another; `reset` is called before each."
+    )
+    return _TEXT.substitute(
+        env=run.env.env,
+        budget=run.episode_budget,
+        least=run.min_episodes_per_submit,
+        most=min(run.max_episodes_per_submit, run.episode_budget),
+        last_id=run.n_env_instances - 1,
+        example=str(example),
+        scope=scope,
+        imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "nothing else",
+        first_submit=submit_id(0, run.episode_budget),
+        first_episode=episode_name(0, run.episode_budget),
+        task_url=urls.task,
+        info_url=urls.info,
+        submit_url=urls.submit,
+    )

@@ -1,0 +1,153 @@
+"""What a parent and its child processes say to each other: JSON lines on the child's stdin and stdout.
+
+The child's stdout holds nothing else. When its stdin ends, its parent is gone, and it ends too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+
+
+class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
+    """Child to parent."""
+
+
+class Ready(Event, frozen=True, kw_only=True, tag="ready"):
+    """The gateway serves."""
+
+    info_url: str
+    task_url: str
+    submit_url: str
+
+
+class Progress(Event, frozen=True, kw_only=True, tag="progress"):
+    """How far a run's train side is."""
+
+    episode_budget: int
+    remaining_budget: int
+    n_submits: int
+    n_rejected: int = 0
+    submit_id: str | None = None
+    """The submit that runs."""
+    n_episodes: int = 0
+    n_done: int = 0
+    waits_for: str = ""
+    last_submit_id: str | None = None
+    """The last one with a verdict."""
+    last_status: str | None = None
+    last_mean: float | None = None
+    best_mean: float | None = None
+    """Highest visible mean return so far."""
+    spent: bool = False
+    """No further submit can be taken, and none runs."""
+
+
+class RunClosed(Event, frozen=True, kw_only=True, tag="closed"):
+    """The coordinator knows that no more submits come."""
+
+
+class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
+    """The agent has said something."""
+
+    turn: int
+    text: str
+
+
+class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
+    """The agent and all its children are gone."""
+
+    reason: str
+    """`agent_stopped`, `agent_failed`, `wall_limit`, or `told` when the parent ended it."""
+    detail: str = ""
+    turns: int = 0
+    retries: int = 0
+    facts: dict[str, Any] = {}
+    """What else `run.json` tells of it."""
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
+    """Parent to child."""
+
+
+class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
+    reason: str
+    agent: dict[str, Any] = {}
+
+
+class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
+    """The first line to an agent's keeper."""
+
+    agent: str
+    """As `--agent` takes it."""
+    workspace: str
+    agent_log: str
+    urls: dict[str, str]
+    """The `EVOPOLICYGYM_*` variables."""
+    started_in: str
+    """Where the operator's command was given: file names in the agent's command are meant from there."""
+    wall_limit_s: float
+
+
+class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
+    pass
+
+
+AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentEnded
+AnyOrder = CloseRun | StartAgent | StopAgent
+_events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
+_orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
+
+
+def line(message: Event | Order) -> bytes:
+    return msgspec.json.encode(message) + b"\n"
+
+
+def event_of(data: bytes) -> AnyEvent:
+    """The event in a line; ProtocolError for anything else."""
+    try:
+        return _events.decode(data)
+    except msgspec.DecodeError as error:
+        raise ProtocolError(f"not an event of a child process: {data[:200]!r} ({error})") from error
+
+
+def emit(event: Event) -> None:
+    """Tells the parent; what it no longer hears is dropped."""
+    try:
+        os.write(sys.stdout.fileno(), line(event))
+    except BrokenPipeError:
+        pass
+
+
+class Orders:
+    """The parent's orders, on the event loop; None when its end of the pipe is gone."""
+
+    def __init__(self) -> None:
+        self._queue: asyncio.Queue[AnyOrder | None] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+        # A thread, since a pipe inherited as stdin may not be set non-blocking: it is shared with the parent.
+        threading.Thread(target=self._read, args=(loop,), name="orders", daemon=True).start()
+
+    async def next(self) -> AnyOrder | None:
+        return await self._queue.get()
+
+    def end(self) -> None:
+        """As if the parent were gone: for a signal."""
+        self._queue.put_nowait(None)
+
+    def _read(self, loop: asyncio.AbstractEventLoop) -> None:
+        with open(sys.stdin.fileno(), "rb", closefd=False) as stdin:
+            for data in stdin:
+                try:
+                    order = _orders.decode(data)
+                except msgspec.DecodeError:
+                    continue
+                loop.call_soon_threadsafe(self._queue.put_nowait, order)
+        loop.call_soon_threadsafe(self._queue.put_nowait, None)

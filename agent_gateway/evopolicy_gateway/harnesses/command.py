@@ -1,0 +1,109 @@
+"""Any program as an agent: started in the workspace with the three URLs.
+
+It may also speak the turn protocol, JSON lines: it is sent `{"type": "prompt", "turn": N, "message": …}` on stdin and
+answers `{"turn": N, "text": …, "stop": bool}` on stdout, until it says stop or exits. A program that never reads its
+stdin and prints what it likes is as good: it plays until it exits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+import orjson
+
+from evopolicy_gateway.harnesses.agent_process import AgentProcess
+from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
+
+_STOP_PATIENCE_S = 10.0
+"""How long a program that has said stop may take to exit by itself."""
+
+
+class CommandHarness(Harness):
+    """`command:PROGRAM…`, and the agents that come with this package."""
+
+    def __init__(self, name: str, program: list[str], settings: dict[str, Any] | None = None) -> None:
+        self.name = name
+        self._program = program
+        self._settings = settings or {}
+
+    async def play(self, stage: Stage) -> Ending:
+        process = await stage.start(self._program, talks=True)
+        talk = asyncio.create_task(_talk(process, stage))
+        try:
+            ended = asyncio.create_task(process.ended())
+            await asyncio.wait([talk, ended], return_when=asyncio.FIRST_COMPLETED)
+            if ended.done():
+                # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+                await asyncio.wait([talk], timeout=1.0)
+            turns, stopped = talk.result() if talk.done() else (0, False)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(asyncio.shield(ended), _STOP_PATIENCE_S if stopped else None)
+            return self._ending(ended.result() if ended.done() else 0, turns)
+        finally:
+            talk.cancel()
+            await asyncio.gather(talk, return_exceptions=True)
+            await process.close()
+
+    def _ending(self, exit_code: int, turns: int) -> Ending:
+        facts: dict[str, Any] = {"settings": self._settings | {"program": self._program}}
+        if exit_code == 0:
+            return Ending(reason="agent_stopped", turns=turns, facts=facts)
+        how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"
+        return Ending(
+            reason="agent_failed", detail=f"{self._program[0]} ended with {how}", turns=turns, facts=facts
+        )
+
+
+async def _talk(process: AgentProcess, stage: Stage) -> tuple[int, bool]:
+    """Turns answered, and whether the program said stop. Ends with the program's stdout."""
+    turn = 0
+    saying = asyncio.create_task(_prompt(process, stage, turn))
+    try:
+        async for line in process.lines():
+            answer = _answer(line)
+            if answer is None or answer["turn"] != turn:
+                continue
+            turn += 1
+            stage.on_turn(turn, str(answer.get("text", "")))
+            if answer["stop"]:
+                return turn, True
+            await saying
+            saying = asyncio.create_task(_prompt(process, stage, turn))
+    finally:
+        saying.cancel()
+        await asyncio.gather(saying, return_exceptions=True)
+    return turn, False
+
+
+async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> None:
+    message = await _message(stage, turn)
+    prompt = {"type": "prompt", "turn": turn, "message": message}
+    stage.log.note(prompt)
+    await process.say(orjson.dumps(prompt))
+
+
+async def _message(stage: Stage, turn: int) -> str:
+    if turn == 0:
+        return (
+            "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed."
+            " Work until the episode budget is spent or you cannot improve the policy any further."
+        )
+    try:
+        left = (await stage.info())["state"]["remaining_budget"]
+    except (OSError, ValueError, KeyError):
+        return "Go on. Ask /info for the budget that is left."
+    return f"Go on: {left} episodes of the budget are left. Answer with stop set to true if you are done."
+
+
+def _answer(line: bytes) -> dict[str, Any] | None:
+    """The line as a turn's answer; None for anything else that a program prints."""
+    if not line.lstrip().startswith(b"{"):
+        return None
+    try:
+        document = orjson.loads(line)
+    except orjson.JSONDecodeError:
+        return None
+    known = isinstance(document.get("turn"), int) and isinstance(document.get("stop"), bool)
+    return document if known else None

@@ -1,0 +1,105 @@
+"""The agent's keeper: a process that starts one agent, watches its clock, and leaves nothing of it behind.
+
+It speaks the lines of `control.py` with `evopolicy run`. It is apart from the gateway, so that an agent's parent holds no
+credentials, and so that a gateway that dies and comes back finds the agent still at work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import structlog
+
+from evopolicy_common.cli import setup_logging
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_gateway import control, processes
+from evopolicy_gateway.control import AgentEnded, AgentTurn, Orders, StartAgent
+from evopolicy_gateway.harnesses import make
+from evopolicy_gateway.harnesses.agent_log import AgentLog
+from evopolicy_gateway.harnesses.agent_process import environment_of
+from evopolicy_gateway.harnesses.base import Ending, Stage
+
+END_GRACE_S = 3.0
+"""From SIGTERM to SIGKILL."""
+LAST_WORDS_S = 2.0
+_TEXT_SHOWN = 2000
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
+    """Plays the agent to its end, or until told; everything that it started is gone afterwards."""
+    agent_log = AgentLog(Path(order.agent_log))
+    stage = Stage(
+        workspace=Path(order.workspace),
+        urls=order.urls,
+        environment=environment_of(order.urls),
+        log=agent_log,
+        on_turn=lambda turn, text: control.emit(AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
+    )
+    play = asyncio.create_task(_play(order, stage))
+    told = asyncio.create_task(_stopped(orders))
+    log.info("agent started", agent=order.agent)
+    try:
+        await asyncio.wait([play, told], timeout=order.wall_limit_s, return_when=asyncio.FIRST_COMPLETED)
+        reason = None if play.done() else "told" if told.done() else "wall_limit"
+        left = await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=stage.started)
+        # With its programs gone a harness ends by itself, and can still say how far it came.
+        await asyncio.wait([play], timeout=LAST_WORDS_S)
+        play.cancel()
+        ending = (await asyncio.gather(play, return_exceptions=True))[0]
+    finally:
+        told.cancel()
+        agent_log.close()
+    if left:
+        log.error("processes of the agent survive", pids=left)
+    if isinstance(ending, Ending):
+        return AgentEnded(
+            reason=reason or ending.reason,
+            detail=ending.detail if reason is None else "",
+            turns=ending.turns,
+            retries=ending.retries,
+            facts=ending.facts,
+        )
+    if isinstance(ending, EvopolicyError) or reason is not None:
+        return AgentEnded(reason=reason or "agent_failed", detail=str(ending))
+    raise ending
+
+
+async def _play(order: StartAgent, stage: Stage) -> Ending:
+    return await make(order.agent, Path(order.started_in)).play(stage)
+
+
+async def _stopped(orders: Orders) -> None:
+    """Returns when the parent says stop, or is gone."""
+    while (order := await orders.next()) is not None:
+        if isinstance(order, control.StopAgent):
+            return
+
+
+async def _main() -> int:
+    setup_logging()
+    processes.become_subreaper()
+    orders = Orders()
+    loop = asyncio.get_running_loop()
+    first = await orders.next()
+    if not isinstance(first, StartAgent):
+        return 2
+    main = asyncio.create_task(keep(first, orders))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, orders.end)
+    ended = await main
+    log.info("agent ended", reason=ended.reason, detail=ended.detail, turns=ended.turns)
+    control.emit(ended)
+    return 0
+
+
+if __name__ == "__main__":
+    # A thread that still reads stdin must not hold up the exit.
+    code = asyncio.run(_main())
+    sys.stdout.flush()
+    os._exit(code)

@@ -1,0 +1,222 @@
+"""The agent's HTTP service: `/info`, `/task`, `/submit`, all below a secret path token.
+
+Rules: the token is compared in constant time and everything else is the same 404; nothing of a request is ever a path of
+the file system; a body is read only as far as a submit may be long; an error says what the agent can act on and nothing
+of this machine; no answer depends on whether the one who asked still listens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import orjson
+import structlog
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from evopolicy_common.errors import RequestError
+from evopolicy_gateway.info import info_document, progress_document
+from evopolicy_gateway.submit_request import MAX_BODY_BYTES, refuse_size
+from evopolicy_gateway.submits import Desk
+from evopolicy_gateway.task import task_markdown
+from evopolicy_gateway.tickets import ConflictError, Ticket
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+BODY_WAIT_S = 30.0
+"""A body that has not arrived by then is not waited for."""
+DECIDED_WAIT_S = 5.0
+"""How long `?wait=false` waits for the coordinator's word before it answers 202 all the same."""
+MAX_KEY_CHARS = 200
+_LINGER_BYTES = 256 << 20
+_LINGER_S = 10.0
+
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+def make_app(desk: Desk, token: str) -> ASGIApp:
+    """The service of one run."""
+    task = task_markdown(desk.run).encode()
+
+    async def info(request: Request) -> Response:
+        state = await desk.refresh()
+        return _json(200, info_document(desk.run, state, desk.closed, desk.in_flight))
+
+    async def task_text(request: Request) -> Response:
+        return Response(task, media_type="text/markdown; charset=utf-8")
+
+    async def submit(request: Request) -> Response:
+        key = request.headers.get("idempotency-key")
+        if key is not None and not (0 < len(key) <= MAX_KEY_CHARS and key.isprintable()):
+            raise RequestError(
+                "budget_invalid", f"an Idempotency-Key has 1 to {MAX_KEY_CHARS} printable characters"
+            )
+        wait = request.query_params.get("wait", "true").lower()
+        if wait not in ("true", "false"):
+            raise RequestError("budget_invalid", "the query parameter wait is 'true' or 'false'")
+        try:
+            body = await _read_body(request)
+        except RequestError as error:
+            await desk.note_rejected(error)
+            raise
+        ticket = await desk.submit(body, key)
+        if wait == "true":
+            await ticket.done.wait()
+        else:
+            await _within(ticket.decided, DECIDED_WAIT_S)
+        return _of_ticket(ticket)
+
+    async def ask_submit(request: Request) -> Response:
+        ticket = desk.find(request.path_params["submit_id"])
+        if ticket is None:
+            raise HTTPException(404)
+        return _of_ticket(ticket)
+
+    app = Starlette(
+        routes=[
+            Route("/info", info, methods=["GET"]),
+            Route("/task", task_text, methods=["GET"]),
+            Route("/submit", submit, methods=["POST"]),
+            Route("/submit/{submit_id}", ask_submit, methods=["GET"]),
+        ],
+        exception_handlers={
+            HTTPException: _http_error,
+            RequestError: _request_error,
+            ClientDisconnect: _gone,
+            Exception: _our_error,
+        },
+    )
+    app.router.redirect_slashes = False
+    return _TokenGate(app, token)
+
+
+def _of_ticket(ticket: Ticket) -> Response:
+    """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
+    if ticket.error is not None:
+        raise ticket.error
+    if ticket.summary is None:
+        return _json(202, progress_document(ticket))
+    head = orjson.dumps({"submit_id": ticket.submit_id, "status": ticket.status})
+    body = head[:-1] + b',"summary":' + ticket.summary + b"}"
+    return Response(body, media_type="application/json")
+
+
+async def _read_body(request: Request) -> bytes:
+    """The body, or a refusal as soon as it is known to be too long."""
+    told = request.headers.get("content-length", "")
+    if told.isdecimal() and int(told) > MAX_BODY_BYTES:
+        refuse_size(int(told))
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_WAIT_S):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > MAX_BODY_BYTES:
+                    refuse_size(None)
+    except TimeoutError as error:
+        raise RequestError("budget_invalid", f"the body did not arrive within {BODY_WAIT_S:g} s") from error
+    return bytes(body)
+
+
+async def _within(event: asyncio.Event, seconds: float) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await event.wait()
+    except TimeoutError:
+        pass
+
+
+def _json(status: int, document: dict[str, Any]) -> Response:
+    return Response(orjson.dumps(document), status_code=status, media_type="application/json")
+
+
+async def _request_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestError)
+    document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
+    if isinstance(error, ConflictError):
+        return _json(409, document | {"submit_id": error.submit_id})
+    return _json(503 if error.status == "closed" else 400, document)
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    words = {404: "there is nothing here", 405: "this method is not for this URL"}
+    message = words.get(error.status_code, "the request cannot be served")
+    response = _json(error.status_code, {"error": {"message": message}})
+    response.headers.update(error.headers or {})
+    return response
+
+
+async def _gone(request: Request, error: Exception) -> Response:
+    return Response(status_code=400)
+
+
+async def _our_error(request: Request, error: Exception) -> Response:
+    log.error("request failed", path=request.url.path[-80:], exc_info=error)
+    return _json(500, {"error": {"message": "the gateway failed; nothing was changed by this request"}})
+
+
+class _TokenGate:
+    """Lets through what knows the token, without it; lets a client that is still sending hear a refusal."""
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app = app
+        self._token = token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        _, _, rest = scope["path"].partition("/")
+        token, slash, path = rest.partition("/")
+        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
+            path = slash = ""
+        inner = dict(scope) | {"path": slash + path, "raw_path": None, "root_path": ""}
+        exchange = _Exchange(scope, receive, send)
+        await self._app(inner, exchange.receive, exchange.send)
+
+
+class _Exchange:
+    """Ends a refusal only when the rest of the body was read and thrown away, within bounds.
+
+    A server that closes while the client still sends resets the connection, and the client never reads the refusal.
+    """
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._receive = receive
+        self._send = send
+        self._refused = False
+        # Who waits for "100 Continue" sends no body to a refusal.
+        self._unread = (b"expect", b"100-continue") not in scope["headers"]
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        if message["type"] != "http.request" or not message.get("more_body", False):
+            self._unread = False
+        return message
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self._refused = message["status"] >= 400
+        last = message["type"] == "http.response.body" and not message.get("more_body", False)
+        if not (last and self._refused and self._unread):
+            await self._send(message)
+            return
+        await self._send({**message, "more_body": True})
+        try:
+            async with asyncio.timeout(_LINGER_S):
+                await self._discard()
+        except TimeoutError:
+            pass
+        await self._send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    async def _discard(self) -> None:
+        left = _LINGER_BYTES
+        while self._unread and left > 0:
+            left -= len((await self.receive()).get("body", b""))

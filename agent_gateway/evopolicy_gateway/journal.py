@@ -1,0 +1,127 @@
+"""What the gateway must not forget: every request before it is sent, and what came of it. JSON lines, fsynced.
+
+It lies outside the workspace. After a restart the gateway asks again by key whatever has no end here, and completes the
+feedback tree from the answers. A torn last line (the machine died while it was written) is cut off.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.blobs import fsync_directory
+from evopolicy_common.errors import StorageError
+from evopolicy_common.messages.episode import PolicyFailure
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
+    """A line of the journal."""
+
+
+class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
+    """A submit that passed the checks; written before anything of it is sent."""
+
+    key: str
+    """Idempotency key towards the coordinator."""
+    client_key: str | None
+    """The agent's `Idempotency-Key`."""
+    body_digest: str
+    """SHA-256 of the request's body, hex."""
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    """Digest of the snapshot; its bytes are in the blob store beside the journal."""
+    bundle_error: PolicyFailure | None
+
+
+class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
+    """The coordinator has it: durable and charged."""
+
+    key: str
+    submit_index: int
+    first_global_episode: int
+    remaining_budget: int
+
+
+class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
+    """Its feedback is committed."""
+
+    key: str
+    status: str
+    summary: str
+    """The text of `summary.json`, byte for byte."""
+
+
+class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
+    """The coordinator did not take it; nothing was charged."""
+
+    key: str
+    status: str
+    message: str
+
+
+class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
+    """A request that broke the format or the bounds: refused here, before the snapshot."""
+
+    status: str
+    message: str
+    at: float
+    """Unix time, seconds."""
+    after_submits: int
+    """Accepted submits before it."""
+
+
+class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
+    """The coordinator was told that no more submits come."""
+
+    reason: str
+
+
+AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Closed
+_decoder = msgspec.json.Decoder(AnyEntry)
+
+
+class Journal:
+    """The journal's file, opened for appending. `append` blocks on the disk."""
+
+    def __init__(self, path: Path) -> None:
+        """Opens or makes it. StorageError when a line other than the last cannot be read."""
+        self._path = path
+        self.entries: list[AnyEntry] = []
+        """All lines, oldest first."""
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._file = os.fdopen(fd, "r+b", buffering=0)
+        self._load()
+        fsync_directory(path.parent)
+
+    def append(self, entry: AnyEntry) -> None:
+        """Durable when it returns; StorageError when the disk refuses, and then nothing was added."""
+        start = self._file.seek(0, os.SEEK_END)
+        try:
+            _write_all(self._file.fileno(), msgspec.json.encode(entry) + b"\n")
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            os.ftruncate(self._file.fileno(), start)
+            raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
+        self.entries.append(entry)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _load(self) -> None:
+        data = self._file.read() or b""
+        whole = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[:whole].splitlines(), start=1):
+            try:
+                self.entries.append(_decoder.decode(line))
+            except msgspec.DecodeError as error:
+                raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error
+        if whole != len(data):
+            os.ftruncate(self._file.fileno(), whole)
+
+
+def _write_all(fd: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]

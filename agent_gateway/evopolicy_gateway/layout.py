@@ -1,0 +1,115 @@
+"""Where a run's files are: `runs/<entry>/<env with / as _>/<exp-id>/`, and in it what `protocol.md` lists.
+
+While a run is open its folder also holds `.gateway/` (mode 0700): the gateway's credentials, its port and token, the
+journal and the bundles. It lies outside the workspace and is removed when `run.json` is written.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common import keys
+from evopolicy_common.blobs import write_atomically
+from evopolicy_common.errors import ConfigError
+
+_ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
+
+
+class RunFolder(msgspec.Struct, frozen=True):
+    """Paths of one run."""
+
+    root: Path
+
+    @property
+    def workspace(self) -> Path:
+        """The agent's working directory."""
+        return self.root / "workspace"
+
+    @property
+    def system(self) -> Path:
+        return self.workspace / "system"
+
+    @property
+    def feedback(self) -> Path:
+        return self.workspace / "feedback"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.root / "checkpoints"
+
+    @property
+    def run_json(self) -> Path:
+        return self.root / "run.json"
+
+    @property
+    def harness_log(self) -> Path:
+        return self.root / "logs" / "harness.log"
+
+    @property
+    def agent_log(self) -> Path:
+        return self.root / "logs" / "agent.jsonl"
+
+    @property
+    def state(self) -> Path:
+        """The gateway's own folder, while the run is open."""
+        return self.root / ".gateway"
+
+    @property
+    def credentials(self) -> Path:
+        return self.state / "credentials.json"
+
+    @property
+    def service(self) -> Path:
+        """Port and token of the HTTP service, so that a restarted gateway has the same."""
+        return self.state / "service.json"
+
+    @property
+    def journal(self) -> Path:
+        return self.state / "journal.jsonl"
+
+    @property
+    def blobs(self) -> Path:
+        return self.state / "bundles"
+
+    @property
+    def opened(self) -> Path:
+        """Which run this is: `OpenedRun`."""
+        return self.state / "run.json"
+
+    @property
+    def staged(self) -> Path:
+        """What was put into the workspace: `Staged`."""
+        return self.state / "staged.json"
+
+
+class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """Which run of the cluster a folder is for."""
+
+    run: str
+
+
+class Staged(msgspec.Struct, frozen=True, kw_only=True):
+    """Hashes (SHA-256, hex) of what a workspace started with."""
+
+    agents_md_hash: str
+    """Of the rules, with placeholders for the URLs: equal for runs with equal rules."""
+    initial_policy_hash: str
+    """Of `system/policy.py`."""
+
+
+def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
+    """The folder of a run. ConfigError for names that cannot be a folder's."""
+    if not keys.valid_name(exp_id):
+        raise ConfigError(f"--exp-id {exp_id!r}: letters, digits, '.', '_' and '-' only, 63 at most")
+    name = _ODD.sub("_", entry).strip(" .")
+    if not name or len(name) > 100:
+        raise ConfigError(f"entry {entry!r}: a name of 1 to 100 characters is needed")
+    return RunFolder((runs / name / env.replace("/", "_") / exp_id).absolute())
+
+
+def save(path: Path, value: msgspec.Struct) -> None:
+    """Writes a small private file of the gateway's folder."""
+    write_atomically(path, msgspec.json.encode(value), mode=0o600)

@@ -1,0 +1,39 @@
+"""Starts a program that ends when its parent does: `python -I -S leash.py PARENT_PID SIGNAL PROGRAM…`.
+
+Sets the parent-death signal, which survives exec, and becomes the program. A program of its own because code between fork
+and exec is not safe in a process with threads or a Zenoh session.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+_PR_SET_PDEATHSIG = 1
+
+
+def leashed(program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM) -> list[str]:
+    """The arguments that start `program` on a leash of this process.
+
+    The child must be started from this process's main thread: the kernel means the parent's thread.
+    """
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(death_signal)), *program]
+
+
+def main(arguments: list[str]) -> None:
+    parent, death_signal, program = int(arguments[0]), int(arguments[1]), arguments[2:]
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, death_signal, 0, 0, 0)
+    if os.getppid() != parent:
+        raise SystemExit(1)  # it died before we asked to be told
+    try:
+        os.execvp(program[0], program)
+    except OSError as error:
+        print(f"cannot start {program[0]}: {error.strerror}", file=sys.stderr)
+        raise SystemExit(127) from None
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,93 @@
+"""Process trees: nothing that an agent started may outlive it, also not what left its process group or its parent."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import time
+from collections.abc import Collection
+
+_PR_SET_CHILD_SUBREAPER = 36
+_PAUSE_S = 0.01
+KILL_PATIENCE_S = 10.0
+
+
+def become_subreaper() -> None:
+    """From now on descendants whose parent dies become children of this process, so that none is lost sight of."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def descendants(root: int) -> list[int]:
+    """Ids of the live processes below `root`, parents before children; zombies are not listed."""
+    children: dict[int, list[int]] = {}
+    for pid, parent, state in _table():
+        if state != b"Z":
+            children.setdefault(parent, []).append(pid)
+    found: list[int] = []
+    level = [root]
+    while level:
+        level = [child for parent in level for child in children.get(parent, ())]
+        found += level
+    return found
+
+
+def end_descendants(
+    grace_s: float, *, spare: Collection[int] = (), waited: Collection[int] = ()
+) -> list[int]:
+    """Ends everything below this process: SIGTERM, then after `grace_s` seconds SIGKILL until nothing is left.
+
+    Blocks. `spare`: process ids that are left alone with all that is below them. `waited`: ids whose exit status
+    somebody else takes. Returns what survived `KILL_PATIENCE_S` seconds of killing: nothing, unless the kernel holds it.
+    """
+    kept = {*spare, *waited}
+    _signal_all(_below(spare), signal.SIGTERM)
+    deadline = time.monotonic() + grace_s
+    while _below(spare) and time.monotonic() < deadline:
+        _reap(kept)
+        time.sleep(_PAUSE_S)
+    deadline = time.monotonic() + KILL_PATIENCE_S
+    while (left := _below(spare)) and time.monotonic() < deadline:
+        # Stopped first: what forks faster than it is found must not outrun the killing.
+        _signal_all(left, signal.SIGSTOP)
+        _signal_all(_below(spare), signal.SIGKILL)
+        _reap(kept)
+        time.sleep(_PAUSE_S)
+    _reap(kept)
+    return _below(spare)
+
+
+def _table() -> list[tuple[int, int, bytes]]:
+    """Id, parent and state of every process."""
+    rows = []
+    for name in os.listdir("/proc"):
+        if name.isdecimal():
+            with (
+                contextlib.suppress(OSError, IndexError, ValueError),
+                open(f"/proc/{name}/stat", "rb") as file,
+            ):
+                # The command's name is in parentheses and may hold anything, spaces and parentheses too.
+                fields = file.read().rpartition(b")")[2].split()
+                rows.append((int(name), int(fields[1]), fields[0]))
+    return rows
+
+
+def _below(spare: Collection[int]) -> list[int]:
+    kept = set(spare) | {pid for root in spare for pid in descendants(root)}
+    return [pid for pid in descendants(os.getpid()) if pid not in kept]
+
+
+def _signal_all(pids: list[int], number: signal.Signals) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, number)
+
+
+def _reap(kept: Collection[int]) -> None:
+    """Takes the exit status of dead children, so that no zombies pile up."""
+    me = os.getpid()
+    for pid, parent, state in _table():
+        if parent == me and state == b"Z" and pid not in kept:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)

@@ -1,0 +1,139 @@
+"""`evopolicy-gateway`: serves one run's workspace over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import orjson
+import typer
+
+from evopolicy_common.cli import fail_on_our_errors, setup_logging
+from evopolicy_gateway import control
+from evopolicy_gateway.agents_md import Urls
+from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed
+from evopolicy_gateway.gateway import Close, Gateway, folder_of
+from evopolicy_gateway.layout import RunFolder
+from evopolicy_gateway.submits import Desk
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def serve(
+    run_directory: Annotated[
+        Path, typer.Argument(help="Folder of an open run, as `evopolicy run` made it.", show_default=False)
+    ],
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Endpoint of the coordinator, in place of the one in the folder.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the URLs as one JSON object.")] = False,
+    controlled: Annotated[
+        bool,
+        typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
+    ] = False,
+) -> None:
+    """Serves the workspace of one run on a loopback port, and prints its three URLs.
+
+    Example: evopolicy-gateway runs/evolve/gym_acrobot/first
+
+    `evopolicy run` starts it by itself; started by hand it takes an open run over after a crash, on the same port. It
+    closes the run when the budget is spent. Ctrl-C leaves the run open.
+    """
+    setup_logging()
+    with fail_on_our_errors():
+        folder = folder_of(run_directory)
+        closed = asyncio.run(_serve(folder, tuple(connect or ()), json_output, controlled))
+    sys.stdout.flush()
+    # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
+    os._exit(0 if closed or not controlled else 3)
+
+
+async def _serve(folder: RunFolder, connect: tuple[str, ...], json_output: bool, controlled: bool) -> bool:
+    def ready(urls: Urls, desk: Desk) -> None:
+        if controlled:
+            control.emit(Ready(info_url=urls.info, task_url=urls.task, submit_url=urls.submit))
+        elif json_output:
+            print(orjson.dumps(urls.environment()).decode(), flush=True)
+        else:
+            print("".join(f"{name}={url}\n" for name, url in urls.environment().items()), end="", flush=True)
+
+    def changed(desk: Desk) -> None:
+        if controlled:
+            control.emit(progress_of(desk))
+
+    gateway = Gateway(folder, connect, on_ready=ready, on_change=changed, close_when_spent=not controlled)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, gateway.tell, None)
+    listener = asyncio.create_task(_listen(gateway)) if controlled else None
+    try:
+        closed = await gateway.run()
+    finally:
+        if listener is not None:
+            listener.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await listener
+    if closed and controlled:
+        control.emit(RunClosed())
+    return closed
+
+
+async def _listen(gateway: Gateway) -> None:
+    orders = Orders()
+    while True:
+        order = await orders.next()
+        if order is None:
+            gateway.tell(None)
+            return
+        if isinstance(order, control.CloseRun):
+            gateway.tell(Close(reason=order.reason, agent=order.agent))
+
+
+def progress_of(desk: Desk) -> Progress:
+    """What the operator's live view shows of a run."""
+    settled = [ticket for ticket in desk.tickets if ticket.summary is not None]
+    means = [mean for ticket in settled if (mean := _mean_of(ticket.summary)) is not None]
+    running = desk.in_flight
+    return Progress(
+        episode_budget=desk.run.episode_budget,
+        remaining_budget=desk.state.remaining_budget,
+        n_submits=desk.state.n_submits,
+        n_rejected=desk.n_rejected,
+        submit_id=None if running is None else running.submit_id,
+        n_episodes=0 if running is None else len(running.request.env_instances),
+        n_done=0 if running is None else running.n_done,
+        waits_for="" if running is None else running.waits_for,
+        last_submit_id=settled[-1].submit_id if settled else None,
+        last_status=settled[-1].status if settled else None,
+        last_mean=_mean_of(settled[-1].summary) if settled else None,
+        best_mean=max(means, default=None),
+        spent=desk.spent,
+    )
+
+
+class _Mean(msgspec.Struct):
+    mean_return: float | str | None
+
+
+def _mean_of(summary: bytes | None) -> float | None:
+    if summary is None:
+        return None
+    mean = msgspec.json.decode(summary, type=_Mean).mean_return
+    return mean if isinstance(mean, float | int) and math.isfinite(mean) else None
+
+
+def main() -> None:
+    """The console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""The gateway's side of the conversation with the coordinator: typed questions about one run.
+
+Each is asked until it is answered, across restarts of the coordinator, and safe to ask again. Whoever calls decides
+what a refusal means.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from typing import Any
+
+from evopolicy_common import codec, keys
+from evopolicy_common.blobs import digest_of
+from evopolicy_common.errors import ProtocolError, TransportError
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.gateway import (
+    CloseRun,
+    GatewayReply,
+    OpenRun,
+    ResultsPage,
+    ResultsRequest,
+    RunClosed,
+    RunOpened,
+    RunState,
+    StateReply,
+    StateRequest,
+    Submit,
+    SubmitAccepted,
+)
+from evopolicy_common.requests import Requester
+from evopolicy_common.transport import Link
+from evopolicy_gateway.journal import Requested
+
+RESULTS_WAIT_S = 10.0
+"""How long the coordinator may hold a question for results."""
+STATE_PATIENCE_S = 1.0
+
+
+class Session:
+    """One run, as its gateway talks about it. RefusedError where the coordinator says no."""
+
+    def __init__(self, link: Link, run: str) -> None:
+        self._run = run
+        self._token = link.credentials.token
+        self._requests: Requester[GatewayReply] = Requester(
+            link, partial(keys.gateway_key, link.credentials.cluster, run), codec.gateway_replies
+        )
+
+    async def open(self) -> RunOpened:
+        """All that is fixed for the run, and its state."""
+        return await self._requests.until_answered(
+            "open", OpenRun(run=self._run, token=self._token), RunOpened
+        )
+
+    async def state(self) -> RunState | None:
+        """The run's state now; None when the coordinator does not answer at once."""
+        question = StateRequest(run=self._run, token=self._token)
+        try:
+            async with asyncio.timeout(STATE_PATIENCE_S):
+                return (await self._requests.once("state", question, StateReply)).state
+        except (TransportError, TimeoutError):
+            return None
+
+    async def upload(self, digest: str, data: bytes) -> None:
+        """Brings a bundle to the coordinator."""
+        await self._requests.upload(self._run, self._token, digest, data)
+
+    async def submit(self, request: Requested) -> SubmitAccepted:
+        """Asks for an evaluation; the same request gives the same answer however often it is sent."""
+        message = Submit(
+            run=self._run,
+            token=self._token,
+            key=request.key,
+            env_instances=request.env_instances,
+            bundle=request.bundle,
+            bundle_error=request.bundle_error,
+        )
+        return await self._requests.until_answered("submit", message, SubmitAccepted)
+
+    async def results(self, submit_index: int, cursor: int) -> ResultsPage:
+        """What happened to a submit since `cursor`; comes after `RESULTS_WAIT_S` at the latest, empty if need be."""
+        question = ResultsRequest(
+            run=self._run,
+            token=self._token,
+            submit_index=submit_index,
+            cursor=cursor,
+            wait_s=RESULTS_WAIT_S,
+        )
+        return await self._requests.until_answered("results", question, ResultsPage, wait_s=RESULTS_WAIT_S)
+
+    async def fetch(self, ref: BlobRef) -> bytes:
+        """The bytes that `ref` names, checked."""
+        if ref.inline is None:
+            return await self._requests.download(self._run, self._token, ref.digest)
+        if digest_of(ref.inline) != ref.digest:
+            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
+        return ref.inline
+
+    async def close(self, reason: str, agent: dict[str, Any]) -> None:
+        """No more submits: to be called when the agent and all its children are gone."""
+        message = CloseRun(run=self._run, token=self._token, reason=reason, agent=agent)
+        await self._requests.until_answered("close", message, RunClosed)

@@ -1,0 +1,61 @@
+"""Observations as NumPy files: `observations.npy` for one array a step, `observations.npz` for dicts and tuples.
+
+Row t holds what the policy received at step t. The same observations give the same bytes: members have no times.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """One array, format version 1.0 or later, C order."""
+    out = io.BytesIO()
+    np.lib.format.write_array(out, np.ascontiguousarray(array), allow_pickle=False)
+    return out.getvalue()
+
+
+def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
+    """Named arrays, deflated; read them with `numpy.load`."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, array in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980 whatever the clock says
+            member.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(member, npy_bytes(array), compresslevel=1)
+    return out.getvalue()
+
+
+def columns(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Observations of one space as an array a leaf, first axis the step.
+
+    A leaf is named by its path: keys and positions joined by `/`; the only leaf of a plain array is named "".
+    """
+    gathered: dict[str, list[Any]] = {}
+    for observation in observations:
+        for path, leaf in _leaves(observation, ""):
+            gathered.setdefault(path, []).append(leaf)
+    return {path: _stacked(values) for path, values in gathered.items()}
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _leaves(item, f"{path}/{key}" if path else str(key))
+    elif isinstance(value, tuple):
+        for index, item in enumerate(value):
+            yield from _leaves(item, f"{path}/{index}" if path else str(index))
+    else:
+        yield path, value
+
+
+def _stacked(values: list[Any]) -> NDArray[Any]:
+    if isinstance(values[0], str):
+        return np.array(values, dtype=np.str_)
+    return np.stack([np.asarray(value) for value in values])

@@ -1,0 +1,155 @@
+"""The body of `POST /submit`, parsed strictly; pure.
+
+Two statuses, both without charge:
+- `budget_invalid`: the request's form (JSON, keys, type of `env_instances`, size of the body) or how many episodes it
+  asks for (none, too few, too many for one submit, more than remain);
+- `invalid_env_instance`: a single id or range (not an integer, outside the train cases, backwards, not to be read).
+
+Order and repeats are kept. Ranges are checked against the train ids and counted before they are written out, so no text
+makes more ids than a submit may hold.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NoReturn
+
+import msgspec
+import orjson
+
+from evopolicy_common.errors import RequestError
+
+MAX_BODY_BYTES = 1 << 20
+"""A body longer than this is refused unread."""
+
+_FIELD = "env_instances"
+_PART = re.compile(r"\s*([0-9]{1,18})\s*(?:-\s*([0-9]{1,18})\s*)?", re.ASCII)
+_FORM = '{"env_instances": [0, 1, 1, 7]} or {"env_instances": "0-3,7"}'
+
+
+class Bounds(msgspec.Struct, frozen=True, kw_only=True):
+    """What a submit may ask for now."""
+
+    n_env_instances: int
+    """Train ids are 0 … n − 1."""
+    min_episodes: int
+    max_episodes: int
+    remaining_budget: int
+
+
+def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
+    """The train ids that `body` asks for, in order. RequestError with one of the two statuses and what to do."""
+    if len(body) > MAX_BODY_BYTES:
+        refuse_size(len(body))
+    wanted = _field(body)
+    if isinstance(wanted, list):
+        if len(wanted) > bounds.max_episodes:
+            _refuse_count(len(wanted), bounds)
+        ids = tuple(_listed(item, index, bounds) for index, item in enumerate(wanted))
+    elif isinstance(wanted, str):
+        ids = _from_text(wanted, bounds)
+    else:
+        _budget(f"{_FIELD} is {_kind(wanted)}; send a list of train ids or a text of ranges: {_FORM}")
+    _check_count(len(ids), bounds)
+    return ids
+
+
+def refuse_size(n_bytes: int | None) -> NoReturn:
+    """Refuses a body that is too long to be read; `n_bytes` None when its length is not told."""
+    size = f"{n_bytes:,} bytes" if n_bytes is not None else "longer"
+    _budget(f"the request's body is {size}; at most {MAX_BODY_BYTES:,} bytes are read. Send {_FORM}")
+
+
+def _field(body: bytes) -> Any:
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        _budget(f"the body is not JSON ({error}); send {_FORM}")
+    if not isinstance(document, dict):
+        _budget(f"the body is {_kind(document)}; send an object: {_FORM}")
+    if _FIELD not in document:
+        _budget(f"the body has no {_FIELD!r}; send {_FORM}")
+    unknown = sorted(set(document) - {_FIELD})
+    if unknown:
+        _budget(f"the body has a field {unknown[0][:80]!r} that is not known; send {_FORM}")
+    return document[_FIELD]
+
+
+def _listed(item: object, index: int, bounds: Bounds) -> int:
+    where = f"{_FIELD}[{index}]"
+    if isinstance(item, bool) or not isinstance(item, int):
+        _instance(f"{where} is {_kind(item)}; every id is an integer from 0 to {bounds.n_env_instances - 1}")
+    _check_id(item, where, bounds)
+    return item
+
+
+def _from_text(text: str, bounds: Bounds) -> tuple[int, ...]:
+    if not text.strip():
+        return ()
+    ranges: list[range] = []
+    total = 0
+    for part in text.split(","):
+        match = _PART.fullmatch(part)
+        if match is None:
+            _instance(
+                f"{part[:40]!r} in {_FIELD} is neither an id nor a range; write ids and ranges as '0-3,7'"
+            )
+        first = int(match[1])
+        last = int(match[2]) if match[2] is not None else first
+        shown = part.strip()
+        _check_id(first, f"{shown!r} in {_FIELD}", bounds)
+        _check_id(last, f"{shown!r} in {_FIELD}", bounds)
+        if last < first:
+            _instance(
+                f"{shown!r} in {_FIELD} runs backwards; write it '{last}-{first}', or list the ids in order"
+            )
+        total += last - first + 1
+        ranges.append(range(first, last + 1))
+    if total > bounds.max_episodes:
+        _refuse_count(total, bounds)
+    return tuple(number for numbers in ranges for number in numbers)
+
+
+def _check_id(number: int, where: str, bounds: Bounds) -> None:
+    if not 0 <= number < bounds.n_env_instances:
+        value = "" if str(number) in where else f" is {number}, which"
+        _instance(f"{where}{value} is outside the train ids 0 to {bounds.n_env_instances - 1}")
+
+
+def _check_count(n: int, bounds: Bounds) -> None:
+    if bounds.remaining_budget < bounds.min_episodes:
+        _budget(
+            f"{bounds.remaining_budget} episodes remain and a submit needs at least {bounds.min_episodes}:"
+            " the budget is spent, no more submits are taken"
+        )
+    if n < max(1, bounds.min_episodes) or n > min(bounds.max_episodes, bounds.remaining_budget):
+        _refuse_count(n, bounds)
+
+
+def _refuse_count(n: int, bounds: Bounds) -> NoReturn:
+    most = min(bounds.max_episodes, bounds.remaining_budget)
+    _budget(
+        f"{n} episodes asked for; this submit may have {max(1, bounds.min_episodes)} to {most}"
+        f" ({bounds.max_episodes} at once, {bounds.remaining_budget} of the budget remain)"
+    )
+
+
+def _kind(value: object) -> str:
+    names = {
+        dict: "an object",
+        list: "a list",
+        str: "a text",
+        bool: "true or false",
+        int: "a number",
+        float: "a number with a fraction or out of range",
+        type(None): "null",
+    }
+    return names.get(type(value), "something else")
+
+
+def _budget(message: str) -> NoReturn:
+    raise RequestError("budget_invalid", message)
+
+
+def _instance(message: str) -> NoReturn:
+    raise RequestError("invalid_env_instance", message)

@@ -1,0 +1,165 @@
+"""The markdown of `GET /task`: the environment in its own words, then what holds for every run; pure."""
+
+from __future__ import annotations
+
+import orjson
+
+from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_common.messages.gateway import RunOpened
+
+
+def task_markdown(run: RunOpened) -> str:
+    """All that an agent needs to write a policy and to submit it."""
+    parts = [
+        run.env.task_text.strip(),
+        f"This environment is `{run.env.env}`: {run.env.env_version}.",
+        _policy(run),
+        _cases(run),
+        _scope(run),
+        _failures(run),
+        _limits(run),
+        _randomness(run),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _policy(run: RunOpened) -> str:
+    form = (
+        "as numpy arrays, ints, strings, dicts and tuples, as the space says"
+        if run.observations == "arrays"
+        else "as plain numbers, strings, dicts and nested lists"
+    )
+    stored = {
+        "inline": "in the rows of `trajectory.jsonl`",
+        "npy": "in `observations.npy`, one array row a step (`obs` in `trajectory.jsonl` is null)",
+        "npz": "in `observations.npz`, an array for each part of the space (`obs` in `trajectory.jsonl` is null)",
+    }[run.env.obs_storage]
+    return f"""## The policy
+
+`system/policy.py` holds a top-level `class Policy`:
+
+```python
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta): ...
+    def reset(self, episode_index): ...      # before each episode; returns None
+    def act(self, obs): ...                  # once a step; returns an action
+```
+
+`obs_space` and `action_space` are the dicts below. `env_meta` is a dict with `env`, `submit_index`,
+`n_episodes_this_submit`, `remaining_budget_after`, `max_episode_steps`, `obs_space`, `action_space`, `obs_storage`.
+Observations arrive {form}. Other files in `system/` can be imported and read: the working
+directory and `sys.path[0]` are the policy's own copy of `system/`, writable and thrown away afterwards.
+An episode ends by itself or after {run.env.max_episode_steps} steps.
+An action outside the action space is repaired (clipped, broadcast, or the lowest value), and the step's
+`info.action_invalid` is true.
+
+Observation space:
+
+```json
+{_schema(run.env.obs_space)}
+```
+
+Action space:
+
+```json
+{_schema(run.env.action_space)}
+```
+
+Feedback keeps the observations {stored}."""
+
+
+def _cases(run: RunOpened) -> str:
+    most = min(run.max_episodes_per_submit, run.episode_budget)
+    return f"""## Train cases and budget
+
+Visible ids: 0 to {run.n_env_instances - 1}. Each is one fixed initial condition; the same id is the same episode start every time.
+The run's budget is {run.episode_budget} episodes. A submit plays {run.min_episodes_per_submit} to {most} of them, in the order asked for; an id may
+be repeated. Every episode asked for is charged, also where the policy fails.
+The score is the mean return on hidden cases of the submit that does best on other hidden cases. Neither is shown."""
+
+
+def _scope(run: RunOpened) -> str:
+    if run.policy_scope == "episode":
+        text = (
+            "Policy scope `episode`: every episode gets a fresh process and a fresh `Policy`; nothing is kept from one\n"
+            "episode to the next. Episodes of a submit run in parallel."
+        )
+    else:
+        text = (
+            "Policy scope `submit`: one `Policy` plays all episodes of a submit one after another, in the order asked for,\n"
+            "in one process. Hidden cases are played with a new `Policy` every `n_episodes_this_submit` cases."
+        )
+    return f"## Policy scope\n\n{text}"
+
+
+def _failures(run: RunOpened) -> str:
+    return """## A policy that fails
+
+If `reset` or `act` raises, a limit is exceeded, or the process dies, uniform random actions play the rest of that
+episode; the episode's `error.txt` tells step, category and message, and later rows carry `info.policy_failed = true`.
+If the code yields no `Policy` at all (missing file, import error, `__init__` raises), the submit's status says so and its
+episodes are charged."""
+
+
+def _limits(run: RunOpened) -> str:
+    limits = run.limits
+    rows = [
+        ("wall time of the policy in one episode", f"{limits.episode_wall_s:g} s"),
+        ("wall time of one `act` or `reset`", f"{limits.act_wall_s:g} s"),
+        ("wall time of import and `__init__`", f"{limits.init_wall_s:g} s"),
+        ("CPU time in one episode", f"{limits.cpu_s:g} s"),
+        ("memory beside Python and the allowed packages", _size(limits.memory_bytes)),
+        ("threads (no processes may be started)", str(limits.processes)),
+        ("files written", _size(limits.file_bytes)),
+        ("kept of stdout and of stderr", f"{_size(limits.output_bytes)} each"),
+    ]
+    if limits.submit_wall_s is not None:
+        rows.append(("wall time of a whole submit", f"{limits.submit_wall_s:g} s"))
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows)
+    allowed = ", ".join(f"`{name}`" for name in run.allowed_imports) or "none"
+    text = f"""## Limits
+
+| limit | value |
+|---|---|
+{table}
+
+Imports: Python's standard library, your own modules in `system/`, and {allowed}."""
+    if run.denied_imports:
+        text += f" Denied: {', '.join(f'`{name}`' for name in run.denied_imports)}."
+    return text + " There is no network and no view of other files."
+
+
+def _randomness(run: RunOpened) -> str:
+    mark = (
+        "This environment is deterministic: the same case and the same actions give the same episode."
+        if run.env.deterministic
+        else "This environment is **not** deterministic: the same case and the same actions may give another episode."
+    )
+    return f"""## Randomness
+
+{mark}
+The environment is seeded by its case. The policy's `random`, `numpy.random` and an unseeded `numpy.random.default_rng()`
+are seeded too, differently for each submit and episode, and tell nothing of the case. Clocks, `os.urandom`, `secrets` and
+the timing of threads are not seeded: a policy that uses them may play the same case differently."""
+
+
+def _schema(space: SpaceSchema) -> str:
+    return orjson.dumps(space).decode() if len(orjson.dumps(space)) < 100 else _indented(space)
+
+
+def _indented(space: SpaceSchema, depth: int = 0) -> str:
+    """JSON with a line for each field, but lists of numbers on one line."""
+    pad = "  " * (depth + 1)
+    lines = []
+    for key, value in space.items():
+        nested = isinstance(value, dict)
+        text = _indented(value, depth + 1) if nested else orjson.dumps(value).decode()
+        lines.append(f"{pad}{orjson.dumps(key).decode()}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n" + "  " * depth + "}"
+
+
+def _size(n_bytes: int) -> str:
+    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if n_bytes >= factor:
+            return f"{n_bytes / factor:g} {unit}"
+    return f"{n_bytes} bytes"
