@@ -210,7 +210,7 @@ def _finish(core: Core, run: Run, best: SubmitRow | None, turn: Turn, *, cancell
         core.close_group(group, turn, "run cancelled")
     result = _result(run, best, turn.now, cancelled=cancelled)
     turn.persist(FinishedRow(run=run.id, result=result))
-    run.change(turn, phase="finished")
+    run.change(turn, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     core.forget_run(run)
     for poll in core.polls.take_all(run.id):
         turn.add(finished_effect(poll.request, run.id, turn))

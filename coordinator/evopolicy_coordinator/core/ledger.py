@@ -75,8 +75,6 @@ def refusal(
 ) -> Refusal | None:
     """Why these train cases cannot be played, or None. Checked in the order that the protocol names."""
     n = len(env_instances)
-    if n == 0:
-        return Refusal("invalid_env_instance", "env_instances is empty; name at least one train case")
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:
             message = f"env_instances names {case_id}; train cases are 0 to {n_cases - 1}"

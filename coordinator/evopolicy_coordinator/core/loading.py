@@ -39,6 +39,7 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
         if state.phase == "finished":
             core.run_keys[row.key] = row.run
             core.capabilities[row.run] = row.capability
+            core.finished[row.run] = runs.last_state(state)
         else:
             _run(core, runs.enter(core, row, state), submits.get(row.run, []), turn)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+from evopolicy_common.messages.gateway import RunState
 
 from . import evaluations, events, finalisation, invariants, membership, runs, status
 from .effects import Effect
@@ -60,6 +61,8 @@ class Core:
         self.run_keys: dict[str, str] = {}
         self.capabilities: dict[str, str] = {}
         """Of all runs, finished ones too."""
+        self.finished: dict[str, RunState] = {}
+        """What a gateway is still told of a finished run."""
         self.evaluation_keys: dict[str, str] = {}
         self.ended_evaluations: dict[str, Ended] = {}
         self.heads: dict[str, list[OutcomeHead]] = {}
@@ -341,6 +344,7 @@ class Core:
 
     def forget_run(self, run: Run) -> None:
         del self.runs[run.id]
+        self.finished[run.id] = runs.last_state(run.state)
         self.drop_flow(run.flow)
 
     def cancel_evaluation(self, name: str, turn: Turn) -> bool:

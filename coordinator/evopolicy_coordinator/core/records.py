@@ -74,6 +74,10 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     agent: dict[str, Any] = {}
     infrastructure_retries: int = 0
     nondeterministic_results: int = 0
+    remaining_budget: int = 0
+    """Once finished: train episodes that were not spent."""
+    n_submits: int = 0
+    """Once finished: accepted submits."""
 
 
 class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):

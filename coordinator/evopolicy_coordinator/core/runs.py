@@ -169,9 +169,18 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
 
 
 def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> None:
+    last = core.finished.get(event.run)
+    if last is not None:
+        turn.reply(event.request, gateway.StateReply(state=last))
+        return
     run = _live(core, event.request, event.run, turn)
     if run is not None:
         turn.reply(event.request, gateway.StateReply(state=run_state(core, run)))
+
+
+def last_state(row: RunStateRow) -> gateway.RunState:
+    """What the gateway of a finished run is told of it."""
+    return gateway.RunState(remaining_budget=row.remaining_budget, n_submits=row.n_submits, is_finalized=True)
 
 
 def run_state(core: Core, run: Run) -> gateway.RunState:
