@@ -446,8 +446,8 @@ def evolution(generator: random.Random, env: str, skill: float, n_submits: int, 
         if kind != "retest":
             level = min(1.0, max(0.0, level + generator.gauss(0.12 * skill, 0.12)))
         val = low + (high - low) * level * skill
-        if kind == "retest" and history and history[-1].val is not None:
-            val = history[-1].val
+        same = next((v.val for v in history if v.files == files and v.val is not None), None)
+        val = val if same is None else same  # hidden validation of equal bytes is equal
         noise = abs(high - low) * 0.05
         returns = [val + generator.gauss(0.0, noise) for _ in range(per_submit)]
         images = {"probe.png": png(seed=index)} if index == 2 else {}

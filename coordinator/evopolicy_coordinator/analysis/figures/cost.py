@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from statistics import fmean
 
 import matplotlib
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from evopolicy_coordinator.analysis.figures.style import INK, RC, Look, Plot, new_figure
 from evopolicy_coordinator.analysis.records import rows
@@ -15,7 +17,7 @@ from evopolicy_coordinator.analysis.study import Study
 _FEATURE_TITLES = ("Functions", "Branches", "Loops", "Nesting depth", "State attributes")
 _PHASES = (
     ("agent_s", "agent", "#00224e", ""),
-    ("queue_s", "queue", "#f5e2a0", "...."),
+    ("queue_s", "queue", "#f5e2a0", ""),
     ("rollout_s", "rollout", "#7d7c78", ""),
     ("feedback_s", "feedback", "#fdea45", "////"),
     ("finalise_s", "finalise", "#c3b369", "\\\\\\\\"),
@@ -96,6 +98,9 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     mean = fmean(values)
                     panel.vlines(mean, place - 0.3, place + 0.3, color=look.colour, linewidth=2.2)
             panel.set_xscale("log")
+            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if _decades(panel) < 2.2 else (1.0,)))
+            panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            panel.xaxis.set_minor_formatter(NullFormatter())
             panel.grid(axis="y", visible=False)
         axes[0][0].set_yticks(range(len(entries)), entries)
         axes[0][0].set_ylim(len(entries) - 0.5, -0.5)
@@ -110,6 +115,11 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
         figure=figure,
         group="cost",
     )
+
+
+def _decades(panel: matplotlib.axes.Axes) -> float:
+    low, high = panel.get_xlim()
+    return math.log10(high / low) if 0.0 < low < high else 0.0
 
 
 def wall_time(study: Study, looks: Mapping[str, Look]) -> Plot | None:

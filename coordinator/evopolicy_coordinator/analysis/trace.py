@@ -1,0 +1,153 @@
+"""Feedback use, submit by submit (paper, "feedback-utilization traces"): evidence read, change made, outcome seen.
+
+One `TraceRow` a submit: what the agent read and said since the submit before (`agent_log`, where the log tells), how
+the policy changed, and what came of it. Sources and images stay on disk until a page asks for them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_coordinator.analysis.agent_log import Evidence, LogReading, read_agent_log
+from evopolicy_coordinator.analysis.edits import Transition, classify
+from evopolicy_coordinator.analysis.reader import describe_files
+from evopolicy_coordinator.analysis.records import Run, Submit
+from evopolicy_coordinator.analysis.sources import read_python_files
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
+MAX_IMAGE_BYTES = 4 << 20
+MAX_IMAGES = 40
+"""Images that one run's page shows."""
+MAX_DIFF_LINES = 1500
+"""Lines of one diff that are kept; the rest is counted."""
+
+
+class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One accepted submit."""
+
+    submit: Submit
+    transition: Transition | None
+    """None when it bears no score."""
+    evidence: Evidence | None
+    """None when the log does not tell."""
+    images: tuple[Path, ...]
+    """Images that the agent made before this submit."""
+
+
+class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
+    """One file's unified diff, three lines of context."""
+
+    path: str
+    lines: tuple[str, ...]
+    """Without line ends; begin with ` `, `+`, `-` or `@`."""
+    cut: int
+    """Lines left out at the end."""
+
+
+class Trace(msgspec.Struct, frozen=True, kw_only=True):
+    run: Run
+    rows: tuple[TraceRow, ...]
+    unplaced: tuple[str, ...]
+    """Messages of the agent that belong to no known submit."""
+
+
+def trace(run: Run) -> Trace:
+    """Reads the run's log and finds its images."""
+    log = run.record.artifacts.agent_log
+    reading = read_agent_log(run.path / log, run.submits) if log else LogReading()
+    transitions = {t.index: t for t in classify(run.submits)}
+    images = _images(run, reading)
+    rows = [
+        TraceRow(
+            submit=submit,
+            transition=transitions.get(submit.index),
+            evidence=reading.by_submit.get(submit.index),
+            images=tuple(images.get(submit.index, ())),
+        )
+        for submit in run.submits
+    ]
+    return Trace(run=run, rows=tuple(rows), unplaced=reading.unplaced)
+
+
+def sources(run: Run, submit: Submit) -> dict[str, str]:
+    """Text of a checkpoint's source bundle by path: `policy.py` first. All its Python files when none is reachable."""
+    try:
+        files = read_python_files(run.checkpoint(submit.index) / "system")
+    except OSError:
+        return {}
+    reached, _ = describe_files(files)
+    chosen: Mapping[str, bytes] = reached or files
+    ordered = sorted(chosen, key=lambda path: (path != "policy.py", path))
+    return {path: chosen[path].decode("utf-8", "replace") for path in ordered}
+
+
+def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
+    """Diffs of the files that differ, `policy.py` first."""
+    out: list[FileDiff] = []
+    for path in sorted({*before, *after}, key=lambda path: (path != "policy.py", path)):
+        old, new = before.get(path, ""), after.get(path, "")
+        if old == new:
+            continue
+        lines = [
+            line.rstrip("\n")
+            for line in difflib.unified_diff(old.splitlines(), new.splitlines(), lineterm="")
+        ]
+        body = lines[2:]  # without the two file headers
+        out.append(
+            FileDiff(path=path, lines=tuple(body[:MAX_DIFF_LINES]), cut=max(0, len(body) - MAX_DIFF_LINES))
+        )
+    return out
+
+
+def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
+    """Submit index to images: new in that checkpoint's `system/`, or in the final workspace and named in its part of the log.
+
+    Workspace images that the log does not name are shown with the last submit.
+    """
+    if not run.submits:
+        return {}
+    found: dict[int, list[Path]] = {}
+    known: set[tuple[str, int]] = set()
+    total = 0
+    for submit in run.submits:
+        for path in _image_files(run.checkpoint(submit.index) / "system", MAX_IMAGES):
+            key = (path.name, path.stat().st_size)
+            if key not in known and total < MAX_IMAGES:
+                known.add(key)
+                found.setdefault(submit.index, []).append(path)
+                total += 1
+    named = {
+        Path(name).name: index for index, evidence in reading.by_submit.items() for name in evidence.images
+    }
+    workspace = run.path / (run.record.artifacts.workspace or "workspace")
+    for path in _image_files(workspace, MAX_IMAGES, skip="feedback"):
+        key = (path.name, path.stat().st_size)
+        if key not in known and total < MAX_IMAGES:
+            known.add(key)
+            found.setdefault(named.get(path.name, run.submits[-1].index), []).append(path)
+            total += 1
+    return found
+
+
+def _image_files(folder: Path, limit: int, skip: str | None = None) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    out: list[Path] = []
+    for root, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if name != skip and not name.startswith("."))
+        for name in sorted(names):
+            path = Path(root, name)
+            if (
+                path.suffix.lower() in IMAGE_SUFFIXES
+                and not path.is_symlink()
+                and path.stat().st_size <= MAX_IMAGE_BYTES
+            ):
+                out.append(path)
+                if len(out) >= limit:
+                    return out
+    return out
