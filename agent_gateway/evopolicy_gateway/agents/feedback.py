@@ -11,8 +11,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evopolicy_gateway.agents.evolved.controllers import fingerprint
 
 NAMED_NUMBERS = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
@@ -68,18 +66,4 @@ def _numbers(value: Any) -> Any:
 
 def novelty(steps: list[Step]) -> int:
     """How many different observations an episode saw, a measure of how far it got when no reward tells."""
-    return len({fingerprint(_as_tuple(step.obs)) for step in steps if step.obs is not None})
-
-
-def _as_tuple(obs: Any) -> Any:
-    """JSON cannot tell a tuple from an array; lists that hold more than numbers are tuples."""
-    if isinstance(obs, dict):
-        return {key: _as_tuple(item) for key, item in obs.items()}
-    if isinstance(obs, list) and any(isinstance(item, dict | str) for item in obs):
-        return tuple(_as_tuple(item) for item in obs)
-    if isinstance(obs, list):
-        try:
-            return np.asarray(obs)
-        except ValueError:  # parts of different lengths: a tuple of arrays
-            return tuple(_as_tuple(item) for item in obs)
-    return obs
+    return len({fingerprint(step.obs) for step in steps if step.obs is not None})

@@ -90,15 +90,23 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
     share = 0.5 if budget <= 16 else 0.35 if budget <= 64 else 0.28
     n_finals = max(1, min(10, int(budget * share) // per_final))
     searching = budget - n_finals * per_final
+    most = min(24, max_per_submit)
     if searching < max(2, min_per_submit):
         return Plan(opening=0, rounds=(), finals=max(1, budget // per_final), episodes_per_final=per_final)
-    opening = min(max(searching // 3, min(searching, 24)), max_per_submit)
+    first = searching if searching <= 16 else max(searching // 3, min(2 * searching // 3, most))
+    opening = min(max(first, min_per_submit), max_per_submit)
     left = searching - opening
-    n_rounds = -(-left // min(24, max_per_submit)) if left >= max(4, min_per_submit) else 0
-    rounds = tuple(left // n_rounds + (i < left % n_rounds) for i in range(n_rounds))
-    if rounds and min(rounds) < min_per_submit:
-        rounds = (min_per_submit,) * (left // min_per_submit)
-    return Plan(opening=opening, rounds=rounds, finals=n_finals, episodes_per_final=per_final)
+    least = max(4, min_per_submit)
+    n_rounds = min(-(-left // max(most, least)), left // least)
+    rounds = tuple(
+        min(left // n_rounds + (i < left % n_rounds), max_per_submit) for i in range(n_rounds)
+    )
+    return Plan(
+        opening=opening,
+        rounds=tuple(size for size in rounds if size >= min_per_submit),
+        finals=n_finals,
+        episodes_per_final=per_final,
+    )
 
 
 class Search:
@@ -124,9 +132,11 @@ class Search:
         sources = list(self._families)
         while len(drawn) < n and sources:
             for family in list(sources):
-                vectors = list(islice(self._sources[family.name], family.weight))
+                # A small opening shows every family once before any twice.
+                share = family.weight if n > 2 * len(self._families) else 1
+                vectors = list(islice(self._sources[family.name], share))
                 drawn += [Candidate(family=family, vector=v, origin="opening") for v in vectors]
-                if len(vectors) < family.weight:
+                if len(vectors) < share:
                     sources.remove(family)
         return self._joined(drawn[:n])
 
@@ -155,7 +165,7 @@ class Search:
         taken = [c for c in self.candidates if c.is_final]
         left = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
         if not left:
-            left = self.opening(1) or self.ranking()
+            left = self.opening(1) or self.ranking() or self.candidates
         chosen = left[0]
         if len(taken) == MEAN_AFTER:
             chosen = self._mean_of_best() or chosen

@@ -128,8 +128,11 @@ def fingerprint(obs: Any) -> bytes:
         return b"".join(fingerprint(part) for part in obs)
     if isinstance(obs, str):
         return obs.encode()
-    values = np.asarray(obs)
-    return values.tobytes() if values.dtype.kind in "iub" else np.round(values, 2).tobytes()
+    try:
+        values = np.asarray(obs)
+    except ValueError:  # lists of different lengths: a tuple, as JSON has it
+        return b"".join(fingerprint(part) for part in obs)
+    return np.round(values, 2).tobytes() if values.dtype.kind == "f" else values.tobytes()
 
 
 Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher | Carrier

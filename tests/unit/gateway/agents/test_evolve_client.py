@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from agent_fakes import FakeGateway, serving
+
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.staging import stage_code
+
+BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
+
+
+def a_gateway(workspace: Path, **options: Any) -> FakeGateway:
+    (workspace / "system").mkdir()
+    stage_code(workspace / "system")
+    (workspace / "system" / "candidates.json").write_text('{"candidates": [{}], "schedule": [0]}')
+    return FakeGateway(
+        workspace=workspace,
+        obs_space=BOX,
+        action_space=BOX,
+        play=lambda policy, case: (float(case), []),
+        budget=10,
+        **options,
+    )
+
+
+class FakeTime:
+    """A clock that only sleeping moves."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def clock(self) -> float:
+        return self.now
+
+
+def a_client(url: str, **options: Any) -> Client:
+    time = FakeTime()
+    return Client(
+        info_url=f"{url}/info",
+        task_url=f"{url}/task",
+        submit_url=f"{url}/submit",
+        sleep=time.sleep,
+        clock=time.clock,
+        **options,
+    )
+
+
+def zero_policy(workspace: Path) -> None:
+    text = '{"candidates": [{"kind": "constant", "vector": [0.0]}], "schedule": [0]}'
+    (workspace / "system" / "candidates.json").write_text(text)
+
+
+def test_submit_is_asked_for_until_its_summary_is_there(tmp_path: Path) -> None:
+    with serving(a_gateway(tmp_path)) as gateway:
+        zero_policy(tmp_path)
+        verdict = a_client(gateway.url).submit([3, 4])
+        assert isinstance(verdict, Verdict)
+        assert verdict.submit_id == "submit_000"
+        assert verdict.summary["returns"] == [3.0, 4.0]
+        assert gateway.n_asked == 2
+
+
+def test_another_submit_in_flight_is_waited_for(tmp_path: Path) -> None:
+    busy = (409, {"error": {"message": "submit_000 runs"}})
+    with serving(a_gateway(tmp_path, script=[busy, busy])) as gateway:
+        zero_policy(tmp_path)
+        assert isinstance(a_client(gateway.url).submit([0]), Verdict)
+
+
+def test_a_retry_after_a_server_error_costs_no_second_submit(tmp_path: Path) -> None:
+    with serving(a_gateway(tmp_path, script=[(503, {})])) as gateway:
+        zero_policy(tmp_path)
+        assert isinstance(a_client(gateway.url).submit([0]), Verdict)
+        assert len(gateway.submits) == 1
+
+
+def test_refused_submit_tells_status_and_message(tmp_path: Path) -> None:
+    with serving(a_gateway(tmp_path)) as gateway:
+        refusal = a_client(gateway.url).submit(list(range(11)))
+        assert refusal == Refusal(status="budget_invalid", message="11 episodes, 10 left")
+
+
+def test_task_is_read_as_text(tmp_path: Path) -> None:
+    with serving(a_gateway(tmp_path)) as gateway:
+        assert a_client(gateway.url).task() == "# Task"
+
+
+def test_gateway_that_stays_away_is_given_up_after_the_patience() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        client = a_client(f"http://127.0.0.1:{unused.getsockname()[1]}", patience_s=5.0)
+        with pytest.raises(ProtocolError, match="did not answer for 5 s"):
+            client.info()
+
+
+def test_urls_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("INFO", "TASK", "SUBMIT"):
+        monkeypatch.setenv(f"EVOPOLICYGYM_{name}_URL", f"http://127.0.0.1:1/token/{name.lower()}")
+    client = Client.from_environment()
+    assert client.submit_url == "http://127.0.0.1:1/token/submit"
