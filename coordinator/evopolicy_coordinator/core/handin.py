@@ -2,7 +2,8 @@
 
 Rules that this module owns:
 - A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A verdict about a limit
-  counts only from the attempt that is live: a worker that was frozen would blame the policy for it.
+  counts only from the attempt that is live and whose worker was never silent for long: one that was frozen, or cut off
+  while the coordinator restarted, would blame the policy for it. Such an attempt is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
 - An attempt that another worker was given, or that was never given, is ignored and logged.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
@@ -40,10 +41,11 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
+    silent = lease is None or lease.doubtful or turn.now - lease.renewed > core.settings.lease_ttl_s
     if lease is not None:
         core.book.release(worker, lease, turn, f"handed in: {result.kind}")
     if result.kind == "done":
-        _done(core, worker, job, result, turn, live=live)
+        _done(core, worker, job, result, turn, live=live, silent=silent)
     elif result.kind == "slot_died" and job.group.template.bundle is not None:
         _strike(core, worker, job, result, turn, live=live, lease=lease)
     elif live:
@@ -62,7 +64,7 @@ def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, 
         return
     for outcome in result.episodes:
         mark = group.marks.get(outcome.index)
-        if mark is not None and mark != mark_of(outcome) and not _late_verdict(outcome):
+        if mark is not None and mark != mark_of(outcome) and not _limit_verdict(outcome):
             turn.log(
                 "warning",
                 "nondeterministic_result",
@@ -75,7 +77,7 @@ def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, 
             core.nondeterministic(group, turn)
 
 
-def _late_verdict(outcome: EpisodeOutcome) -> bool:
+def _limit_verdict(outcome: EpisodeOutcome) -> bool:
     failure = outcome.failure
     return failure is not None and (failure.category in TIME_LIMITS or failure.limit is not None)
 
@@ -94,7 +96,9 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
     return None
 
 
-def _done(core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool) -> None:
+def _done(
+    core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool, silent: bool
+) -> None:
     fault = _fault(job, result.episodes)
     if fault is not None:
         turn.log("error", "result_refused", job=job.job_id, worker=worker.name, fault=fault)
@@ -102,8 +106,12 @@ def _done(core: Core, worker: Worker, job: JobState, result: JobResult, turn: Tu
             core.fleet.failed(worker, turn)
             core.book.give_back(job, "failed", worker, turn, ran=True, error=fault)
         return
-    if not live and any(_late_verdict(outcome) for outcome in result.episodes):
+    if (silent or not live) and any(_limit_verdict(outcome) for outcome in result.episodes):
         core.chronicle.tell(turn.now, turn.stimulus_id, result.lease_id, "late limit verdict, not counted")
+        if live:
+            core.book.give_back(
+                job, "unlisted", worker, turn, ran=True, error="limit verdict after a silence"
+            )
         return
     worker.failures = 0
     commit(core, worker, job, result, turn)

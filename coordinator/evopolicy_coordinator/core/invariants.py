@@ -125,5 +125,13 @@ def _workers(core: Core) -> None:
         want(core, worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
         timed = ("worker", worker.name) in core.timers or worker.state == "lost"
         want(core, worker.name, timed, "a worker that is there is looked at")
+        live = [lease.job.priority for lease in worker.leases.values() if lease.live]
+        held = [live.count(priority) for priority in range(N_PRIORITIES)]
+        want(
+            core,
+            worker.name,
+            (len(live), held) == (worker.n_live, worker.held),
+            "its live leases are counted",
+        )
         if worker.alone is not None:
             want(core, worker.name, worker.alone.id in worker.leases, "what it plays alone is leased to it")

@@ -53,6 +53,9 @@ class Lease:
     """False once it was given up: preempted, cancelled, expired, or its job is done."""
     orphan_until: float | None = None
     """Its session ended; a heartbeat may claim it until then."""
+    doubtful: bool = False
+    """Its holder was silent for a time to live, or this incarnation did not grant it: a verdict about a limit may be the
+    silence's fault, and does not count."""
     hidden_in: dict[Lease, None] | None = None
     """Where it is listed as one that may be preempted."""
     stopped_for: Lane | None = None
@@ -94,6 +97,8 @@ class LeaseBook:
         job.lease = lease
         job.reserved = None
         worker.leases[name] = lease
+        worker.n_live += 1
+        worker.held[job.priority] += 1
         group = job.group
         group.n_leased += 1
         group.flow.n_leased += 1
@@ -130,6 +135,7 @@ class LeaseBook:
             if lease is None or not lease.live:
                 stop.append(item.lease_id)
                 continue
+            lease.doubtful = lease.doubtful or now - lease.renewed > self._core.settings.lease_ttl_s
             lease.renewed = now
             lease.orphan_until = None
             lease.running = item.running
@@ -158,7 +164,9 @@ class LeaseBook:
         core.adopting.pop(job, None)
         job.holders[item.attempt] = worker.name
         core.chronicle.tell(turn.now, turn.stimulus_id, item.lease_id, f"adopted from {worker.name}")
-        return self._enter(job, worker, item.attempt, turn)
+        lease = self._enter(job, worker, item.attempt, turn)
+        lease.doubtful = True
+        return lease
 
     # ---- giving up ----
 
@@ -172,6 +180,9 @@ class LeaseBook:
         job.group.n_leased -= 1
         job.group.flow.n_leased -= 1
         self.n_live -= 1
+        worker = self._core.fleet.workers[lease.worker]
+        worker.n_live -= 1
+        worker.held[job.priority] -= 1
         if lease.hidden_in is not None:
             lease.hidden_in.pop(lease, None)
         self._core.chronicle.tell(turn.now, turn.stimulus_id, lease.id, why)

@@ -287,6 +287,10 @@ class Core:
         for job in group.jobs.values():
             queued = job.queued
             self.queue.withdraw(job)
+            if job.lease is not None:
+                held = self.fleet.workers[job.lease.worker].held
+                held[job.priority] -= 1
+                held[priority] += 1
             job.priority = priority
             if queued:
                 self.scheduler.queue(job, turn)

@@ -274,6 +274,14 @@ class Queue:
                 return job
         return None
 
+    def leading(self, profile: Profile) -> Flow | None:
+        """The flow that goes first among what the profile can serve, warmth aside; None when nothing waits."""
+        for priority in range(N_PRIORITIES):
+            flow = self._best(profile, priority, ())
+            if flow is not None:
+                return flow
+        return None
+
     def _serve(self, job: JobState) -> None:
         flow, priority = job.group.flow, job.priority
         self.withdraw(job)

@@ -1,9 +1,9 @@
 """Brings waiting jobs and waiting workers together.
 
 Rules that this module owns:
-- Work is pulled: a worker's poll says how many leases it can take and waits until there is some. It gets more than it
-  asked for only of episodes so short that a batch is worth about `batch_s`, and never so many that another idle worker
-  goes without.
+- Work is pulled: a worker's poll says how many leases it can take and waits until there is some. Free slots are filled
+  first. Ahead of them a worker gets only short episodes, worth about `batch_s` a slot, even more of them than it asked
+  for, and never so many that another idle worker goes without.
 - New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
 - A suspect runs alone: on an idle worker, or on one that is emptied for it; nothing else goes there meanwhile.
 - A waiting train job stops hidden jobs: early validation as often as it takes, others a bounded number of times. The
@@ -19,13 +19,16 @@ from typing import TYPE_CHECKING
 from evopolicy_common.messages import worker as wire
 
 from .events import LeaseRequested
-from .jobs import EARLY_VALIDATION, HELDOUT, TRAIN, JobState
-from .queue import Lane, Profile
+from .jobs import EARLY_VALIDATION, HELDOUT, N_PRIORITIES, TRAIN, JobState
+from .queue import Lane
 from .turn import Turn
 from .workers import LeasePoll, Worker
 
 if TYPE_CHECKING:
     from .machine import Core
+
+PREFETCH_BELOW_S = 1.0
+"""Longer episodes are leased to free slots only: fetching them takes no time beside playing them."""
 
 TRIES_MAX = 4
 """Parked workers that are tried for a lane in one step before the rest waits for the next."""
@@ -101,30 +104,40 @@ class Scheduler:
             return [suspect]
         if worker.reserved is not None:
             return []
+        free = worker.slots - worker.n_live
         leases: list[wire.Lease] = []
-        limit, spent_s = poll.n, 0.0
+        limit = self._limit(worker, poll.n, free)
         while len(leases) < limit:
             job = core.queue.take(worker.profile, worker.name, poll.warm, turn.now)
             if job is None:
                 break
-            if not leases:
-                limit = self._batch(job, worker.profile, poll.n)
-            spent_s += job.group.flow.cost_s(job)
             leases.append(core.book.grant(job, worker, turn))
-            if len(leases) >= poll.n and spent_s >= poll.n * core.settings.batch_s:
-                break
         return leases
 
-    def _batch(self, job: JobState, profile: Profile, n: int) -> int:
-        """How many leases a poll for `n` gets at most, the first being of `job`."""
-        flow, settings = job.group.flow, self._core.settings
-        if flow.episode_s is None or flow.lane is None:
-            return n
-        per_slot = min(settings.batch_max, int(settings.batch_s / max(flow.cost_s(job), 1e-4)))
-        if per_slot <= 1:
-            return n
-        share = math.ceil((sum(flow.lane.n_ready) + 1) * n / max(1, flow.lane.slots()))
-        return max(n, min(n * per_slot, share))
+    def _limit(self, worker: Worker, n: int, free: int) -> int:
+        """How many leases a poll for `n` gets at most, `free` of the worker's slots having nothing to play.
+
+        More than the free slots can take only of short episodes, not ahead of what has less right to the slot, and no
+        more than the worker's part of what waits.
+        """
+        settings, profile = self._core.settings, worker.profile
+        flow = self._core.queue.leading(profile)
+        if flow is None or flow.lane is None:
+            return 0
+        at_least = min(n, max(0, free))
+        priority = next(each for each in range(N_PRIORITIES) if flow.n_ready[each])
+        episode_s = flow.episode_s
+        behind_hidden = any(worker.held[priority + 1 :])
+        if (
+            episode_s is None
+            or episode_s >= PREFETCH_BELOW_S
+            or priority == EARLY_VALIDATION
+            or behind_hidden
+        ):
+            return at_least
+        ahead = min(settings.batch_max, 1 + int(settings.batch_s / max(episode_s, 1e-4)))
+        share = math.ceil(sum(flow.lane.n_ready) * worker.slots / max(1, flow.lane.slots()))
+        return max(at_least, min(worker.slots * ahead - worker.n_live, share))
 
     # ---- suspects ----
 

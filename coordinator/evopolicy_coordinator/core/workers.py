@@ -21,7 +21,7 @@ from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.worker import Fingerprint
 
 from .events import RequestId, WorkerRegistered
-from .jobs import JobState
+from .jobs import N_PRIORITIES, JobState
 from .leases import Lease
 from .queue import Flow, Profile, Queue
 from .settings import CoreSettings
@@ -63,6 +63,10 @@ class Worker:
     state: Literal["active", "draining", "lost"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; given-up ones too, until the worker no longer names them."""
+    held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    """Live leases by priority."""
+    n_live: int = 0
+    """Live leases in all."""
     poll: LeasePoll | None = None
     beat: RequestId | None = None
     """A heartbeat whose answer is held back."""
@@ -75,9 +79,6 @@ class Worker:
     failures: int = 0
     """Jobs in a row that failed through its own fault."""
     benched_until: float = 0.0
-
-    def n_live(self) -> int:
-        return len(self.leases)
 
     def running(self) -> list[Lease]:
         """Leases it plays now: as it said, or the oldest, one a slot, as long as it has not said."""
@@ -124,7 +125,7 @@ class Fleet:
         )
         if old is not None:
             self.count_out(old)
-            worker.leases = old.leases
+            worker.leases, worker.held, worker.n_live = old.leases, old.held, old.n_live
             worker.failures, worker.benched_until = old.failures, old.benched_until
             for lease in worker.leases.values():
                 lease.orphan_until = turn.now + self._settings.adoption_s
