@@ -6,7 +6,7 @@ from evopolicy_common import trajectory
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_gateway.formatting import cut_text, failure_line, trajectory_row
-from evopolicy_gateway.storage import columns, npy_bytes, npz_bytes
+from evopolicy_gateway.storage import named_columns, npy_bytes, npz_bytes
 
 
 def episode_files(
@@ -29,7 +29,7 @@ def episode_files(
 
 def trajectory_files(packed: bytes, storage: ObsStorage) -> dict[str, bytes]:
     """`trajectory.jsonl` and, where observations are stored outside it, `observations.npy` or `.npz`."""
-    rows = list(trajectory.decode(packed).rows())
+    episode = trajectory.decode(packed)
     inline = storage == "inline"
     lines = [
         trajectory_row(
@@ -41,11 +41,13 @@ def trajectory_files(packed: bytes, storage: ObsStorage) -> dict[str, bytes]:
             row.truncated,
             row.info,
         )
-        for row in rows
+        for row in episode.rows()
     ]
     files = {"trajectory.jsonl": b"".join(lines)}
-    if storage == "npy" and rows:
-        files["observations.npy"] = npy_bytes(columns([row.obs for row in rows])[""])
-    elif storage == "npz" and rows:
-        files["observations.npz"] = npz_bytes(columns([row.obs for row in rows]))
+    if not inline and episode.obs is not None:
+        named = named_columns(episode.obs)
+        if storage == "npy" and list(named) == [""]:
+            files["observations.npy"] = npy_bytes(named[""])
+        else:
+            files["observations.npz"] = npz_bytes(named)
     return files

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
+
+import structlog
 
 from evopolicy_common import codec, keys
 from evopolicy_common.blobs import digest_of
-from evopolicy_common.errors import ProtocolError, TransportError
+from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import (
     CloseRun,
@@ -28,6 +30,7 @@ from evopolicy_common.messages.gateway import (
     Submit,
     SubmitAccepted,
 )
+from evopolicy_common.messages.worker import Message
 from evopolicy_common.requests import Requester
 from evopolicy_common.transport import Link
 from evopolicy_gateway.journal import Requested
@@ -37,8 +40,19 @@ RESULTS_WAIT_S = 10.0
 STATE_PATIENCE_S = 1.0
 
 
+NOT_NOW = frozenset({"unavailable", "no_worker"})
+"""Refusals that pass: its disk is full, no worker has described the environment yet."""
+NOT_NOW_PAUSE_S = 0.5
+
+NO_MORE = frozenset({"run_closed", "run_finished", "unknown_run", "bad_token"})
+"""Refusals after which nothing more of this run is served."""
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+Wanted = TypeVar("Wanted")
+
+
 class Session:
-    """One run, as its gateway talks about it. RefusedError where the coordinator says no."""
+    """One run, as its gateway talks about it. RefusedError where the coordinator says no, and not just not now."""
 
     def __init__(self, link: Link, run: str) -> None:
         self._run = run
@@ -76,7 +90,7 @@ class Session:
             bundle=request.bundle,
             bundle_error=request.bundle_error,
         )
-        return await self._requests.until_answered("submit", message, SubmitAccepted)
+        return await self._ask("submit", message, SubmitAccepted)
 
     async def results(self, submit_index: int, cursor: int) -> ResultsPage:
         """What happened to a submit since `cursor`; comes after `RESULTS_WAIT_S` at the latest, empty if need be."""
@@ -87,7 +101,7 @@ class Session:
             cursor=cursor,
             wait_s=RESULTS_WAIT_S,
         )
-        return await self._requests.until_answered("results", question, ResultsPage, wait_s=RESULTS_WAIT_S)
+        return await self._ask("results", question, ResultsPage, wait_s=RESULTS_WAIT_S)
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """The bytes that `ref` names, checked."""
@@ -100,4 +114,19 @@ class Session:
     async def close(self, reason: str, agent: dict[str, Any]) -> None:
         """No more submits: to be called when the agent and all its children are gone."""
         message = CloseRun(run=self._run, token=self._token, reason=reason, agent=agent)
-        await self._requests.until_answered("close", message, RunClosed)
+        await self._ask("close", message, RunClosed)
+
+    async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
+        told = ""
+        while True:
+            try:
+                return await self._requests.until_answered(verb, message, wanted, wait_s=wait_s)
+            except RefusedError as error:
+                if error.status not in NOT_NOW:
+                    raise
+                if error.message != told:
+                    log.warning(
+                        "the coordinator cannot serve this now; asking again", verb=verb, why=error.message
+                    )
+                    told = error.message
+            await asyncio.sleep(NOT_NOW_PAUSE_S)

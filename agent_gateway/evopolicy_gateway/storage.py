@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -32,16 +32,12 @@ def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
     return out.getvalue()
 
 
-def columns(observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
-    """Observations of one space as an array a leaf, first axis the step.
+def named_columns(columns: Any) -> dict[str, NDArray[Any]]:
+    """The leaves of `Trajectory.obs` by name, first axis the step; texts become arrays of unicode.
 
     A leaf is named by its path: keys and positions joined by `/`; the only leaf of a plain array is named "".
     """
-    gathered: dict[str, list[Any]] = {}
-    for observation in observations:
-        for path, leaf in _leaves(observation, ""):
-            gathered.setdefault(path, []).append(leaf)
-    return {path: _stacked(values) for path, values in gathered.items()}
+    return {path: _array(leaf) for path, leaf in _leaves(columns, "")}
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
@@ -55,7 +51,7 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _stacked(values: list[Any]) -> NDArray[Any]:
-    if isinstance(values[0], str):
-        return np.array(values, dtype=np.str_)
-    return np.stack([np.asarray(value) for value in values])
+def _array(leaf: Any) -> NDArray[Any]:
+    if isinstance(leaf, np.ndarray):
+        return leaf
+    return np.array(leaf, dtype=np.str_ if all(isinstance(item, str) for item in leaf) else None)

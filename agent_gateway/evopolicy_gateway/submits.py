@@ -20,7 +20,14 @@ import structlog
 
 from evopolicy_common.blobs import BlobStore, digest_of
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
-from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, RunOpened, RunState, SubmitDone
+from evopolicy_common.messages.gateway import (
+    EpisodeFeedback,
+    ResultsPage,
+    RunOpened,
+    RunState,
+    SubmitAccepted,
+    SubmitDone,
+)
 from evopolicy_gateway import formatting, snapshots
 from evopolicy_gateway.episode_files import episode_files
 from evopolicy_gateway.feedback import SubmitTree
@@ -35,7 +42,7 @@ from evopolicy_gateway.journal import (
     Requested,
     Settled,
 )
-from evopolicy_gateway.session import Session
+from evopolicy_gateway.session import NO_MORE, Session
 from evopolicy_gateway.submit_request import Bounds, parse
 from evopolicy_gateway.tickets import ConflictError, Ticket
 
@@ -220,18 +227,22 @@ class Desk:
             self.tickets.remove(ticket)
             ticket.fail(error)
         except RefusedError as error:
+            if error.status not in NO_MORE:
+                self._give_up(ticket, error)
+                return
             self._close(error)
             status = "budget_invalid" if ticket.accepted is None else "closed"
             ticket.fail(RequestError(status, "the run was closed: no more submits are taken"))
-        except asyncio.CancelledError:
-            raise
         except Exception as error:
-            log.exception("submit failed", submit=ticket.submit_id)
-            if not self.fatal.done():
-                self.fatal.set_exception(error)
+            self._give_up(ticket, error)
             return
         self.in_flight = None
         self._on_change()
+
+    def _give_up(self, ticket: Ticket, error: Exception) -> None:
+        log.error("submit failed", submit=ticket.submit_id, exc_info=error)
+        if not self.fatal.done():
+            self.fatal.set_exception(error)
 
     async def _snapshot(self, ticket: Ticket) -> None:
         """Takes the bundle as it is now, and writes the request down."""
@@ -252,15 +263,14 @@ class Desk:
             self._charged(ticket.accepted)
             return
         try:
-            if request.bundle is not None:
-                data = await asyncio.to_thread(self._blobs.read, request.bundle)
-                await self._session.upload(request.bundle, data)
-            reply = await self._session.submit(request)
+            reply = await self._upload_and_submit(request)
         except RefusedError as error:
-            await self._note(Refused(key=request.key, status=error.status, message=error.message))
+            if error.status in NO_MORE or error.status in _REQUEST_STATUSES:
+                await self._note(Refused(key=request.key, status=error.status, message=error.message))
+            if error.status in NO_MORE:
+                self.tickets.remove(ticket)
             if error.status in _REQUEST_STATUSES:
                 raise RequestError(error.status, error.message) from error
-            self.tickets.remove(ticket)
             raise
         accepted = Accepted(
             key=request.key,
@@ -273,6 +283,19 @@ class Desk:
         ticket.accept(accepted)
         log.info("submit accepted", submit=ticket.submit_id, n_episodes=len(request.env_instances))
         self._on_change()
+
+    async def _upload_and_submit(self, request: Requested) -> SubmitAccepted:
+        while True:
+            if request.bundle is not None:
+                data = await asyncio.to_thread(self._blobs.read, request.bundle)
+                await self._session.upload(request.bundle, data)
+            try:
+                return await self._session.submit(request)
+            except RefusedError as error:
+                if error.status != "missing_bundle":
+                    raise
+                log.warning("the coordinator has lost the bundle; sending it again", bundle=request.bundle)
+            await asyncio.sleep(DISK_PAUSE_S)
 
     def _charged(self, accepted: Accepted) -> None:
         self.state = RunState(

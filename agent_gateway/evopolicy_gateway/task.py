@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import orjson
+import json
 
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_common.messages.gateway import RunOpened
@@ -143,18 +143,16 @@ are seeded too, differently for each submit and episode, and tell nothing of the
 the timing of threads are not seeded: a policy that uses them may play the same case differently."""
 
 
-def _schema(space: SpaceSchema) -> str:
-    return orjson.dumps(space).decode() if len(orjson.dumps(space)) < 100 else _indented(space)
-
-
-def _indented(space: SpaceSchema, depth: int = 0) -> str:
-    """JSON with a line for each field, but lists of numbers on one line."""
+def _schema(space: SpaceSchema, depth: int = 0) -> str:
+    """JSON with a line for each field, but lists of numbers and short spaces on one line."""
+    text = json.dumps(space)
+    if len(text) < 90:
+        return text
     pad = "  " * (depth + 1)
-    lines = []
-    for key, value in space.items():
-        nested = isinstance(value, dict)
-        text = _indented(value, depth + 1) if nested else orjson.dumps(value).decode()
-        lines.append(f"{pad}{orjson.dumps(key).decode()}: {text}")
+    lines = [
+        f"{pad}{json.dumps(key)}: {_schema(value, depth + 1) if isinstance(value, dict) else json.dumps(value)}"
+        for key, value in space.items()
+    ]
     return "{\n" + ",\n".join(lines) + "\n" + "  " * depth + "}"
 
 

@@ -69,7 +69,10 @@ class FakeGateway:
         if key not in self.keys:
             n = len(env_instances)
             if not max(1, self.min_per_submit) <= n <= min(self.max_per_submit, self.left):
-                return 400, {"status": "budget_invalid", "error": {"message": f"{n} episodes, {self.left} left"}}
+                return 400, {
+                    "status": "budget_invalid",
+                    "error": {"message": f"{n} episodes, {self.left} left"},
+                }
             self.keys[key] = self._evaluate(env_instances)
         return 202, {"submit_id": self.keys[key], "status": "running"}
 

@@ -72,7 +72,9 @@ def test_last_checkpoints_beat_the_opening_population(
 
 
 @pytest.mark.parametrize("budget", [1, 2, 3, 8, 17, 40, 128])
-def test_whole_budget_is_spent_and_the_last_checkpoint_is_a_single_candidate(tmp_path: Path, budget: int) -> None:
+def test_whole_budget_is_spent_and_the_last_checkpoint_is_a_single_candidate(
+    tmp_path: Path, budget: int
+) -> None:
     with serving(a_run(tmp_path, budget)) as gateway:
         run_agent(gateway)
         assert gateway.left == 0

@@ -32,9 +32,27 @@ MULTI = {"type": "MultiDiscrete", "nvec": [2, 3]}
 GOAL = {
     "type": "Dict",
     "spaces": {
-        "achieved_goal": {"type": "Box", "shape": [3], "dtype": "float64", "low": ["-inf"] * 3, "high": ["inf"] * 3},
-        "desired_goal": {"type": "Box", "shape": [3], "dtype": "float64", "low": ["-inf"] * 3, "high": ["inf"] * 3},
-        "observation": {"type": "Box", "shape": [5], "dtype": "float64", "low": ["-inf"] * 5, "high": ["inf"] * 5},
+        "achieved_goal": {
+            "type": "Box",
+            "shape": [3],
+            "dtype": "float64",
+            "low": ["-inf"] * 3,
+            "high": ["inf"] * 3,
+        },
+        "desired_goal": {
+            "type": "Box",
+            "shape": [3],
+            "dtype": "float64",
+            "low": ["-inf"] * 3,
+            "high": ["inf"] * 3,
+        },
+        "observation": {
+            "type": "Box",
+            "shape": [5],
+            "dtype": "float64",
+            "low": ["-inf"] * 5,
+            "high": ["inf"] * 5,
+        },
     },
 }
 MIXED = {
@@ -143,7 +161,13 @@ def test_nan_and_infinity_do_not_reach_the_outputs() -> None:
 
 
 def test_zero_outputs_are_the_action_nearest_to_zero() -> None:
-    space = {"type": "Box", "shape": [3], "dtype": "float32", "low": [-1.0, 0.5, -4.0], "high": [1.0, 2.0, -1.0]}
+    space = {
+        "type": "Box",
+        "shape": [3],
+        "dtype": "float32",
+        "low": [-1.0, 0.5, -4.0],
+        "high": [1.0, 2.0, -1.0],
+    }
     np.testing.assert_allclose(ActionHead(space).action(np.zeros(3)), [0.0, 0.5, -1.0])
     np.testing.assert_allclose(ActionHead(space).action(np.ones(3)), [1.0, 2.0, -1.0])
     np.testing.assert_allclose(ActionHead(space).action(-np.ones(3)), [-1.0, 0.5, -4.0])

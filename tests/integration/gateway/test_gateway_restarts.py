@@ -1,0 +1,213 @@
+"""A gateway that dies, a coordinator that is away: nothing is lost, nothing charged twice."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import Any
+
+from gateway_double import Double, answering, gateway_on, opened, prepare, served
+
+from evopolicy_common.messages.gateway import CloseRun, Submit
+from evopolicy_common.messages.worker import Refused
+from evopolicy_gateway import submits
+from evopolicy_gateway.feedback import SubmitTree
+
+BODY = {"env_instances": [1, 2, 3]}
+
+
+def tree_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double) as s:
+                urls = s.urls
+                rules = (folder.workspace / "AGENTS.md").read_bytes()
+                double.go.clear()
+                header = {"Idempotency-Key": "mine"}
+                await s.http.post(s.urls.submit + "?wait=false", json=BODY, headers=header)
+                (folder.system / "policy.py").write_text("class Policy: 'edited meanwhile'\n")
+            assert not (folder.feedback / "submit_000").exists()
+            double.go.set()
+            async with gateway_on(folder, double) as s:
+                assert s.urls == urls
+                assert (folder.workspace / "AGENTS.md").read_bytes() == rules
+                again = await s.http.post(s.urls.submit, json=BODY, headers=header)
+                assert again.status_code == 200
+                assert (folder.feedback / "submit_000" / "summary.json").read_bytes() in again.content
+                assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == "submit_001"
+        assert [submit.env_instances for submit in double.submits] == [(1, 2, 3), (1, 2, 3)]
+        assert double.submits[0].bundle != double.submits[1].bundle
+
+    asyncio.run(main())
+
+
+def test_an_answer_survives_the_restart_even_when_the_agent_has_changed_the_file(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double) as s:
+                before = await s.http.post(s.urls.submit, json=BODY)
+            (folder.feedback / "submit_000" / "summary.json").write_text("{}")
+            async with gateway_on(folder, double) as s:
+                after = await s.http.get(f"{s.urls.submit}/submit_000")
+                assert after.content == before.content
+
+    asyncio.run(main())
+
+
+def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with served(tmp_path, double) as s:
+            double.up = False
+            request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+            info = await s.http.get(s.urls.info)
+            assert info.status_code == 200
+            assert info.json()["state"]["n_submits"] == 0
+            await asyncio.sleep(0.3)
+            assert not request.done()
+            double.up = True
+            assert (await request).status_code == 200
+        keys = {message.key for message in double.asked if isinstance(message, Submit)}
+        assert len(keys) == 1
+
+    asyncio.run(main())
+
+
+def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double) as s:
+                double.up = False
+                request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+                while not folder.journal.read_bytes():
+                    await asyncio.sleep(0.01)
+            request.cancel()
+            assert double.submits == []
+            double.up = True
+            async with gateway_on(folder, double) as s:
+                await s.desk.idle()
+                assert (folder.feedback / "submit_000" / "summary.json").is_file()
+
+    asyncio.run(main())
+
+
+def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.01)
+    failures = iter([OSError(28, "No space left on device")] * 3)
+    real = SubmitTree.put_episode
+
+    def put_episode(self: SubmitTree, name: str, files: dict[str, bytes]) -> None:
+        if name == "ep_001" and (error := next(failures, None)):
+            raise error
+        real(self, name, files)
+
+    monkeypatch.setattr(SubmitTree, "put_episode", put_episode)
+
+    async def main() -> None:
+        async with served(tmp_path) as s:
+            assert (await s.http.post(s.urls.submit, json=BODY)).status_code == 200
+            episodes = s.folder.feedback / "submit_000" / "episodes"
+            assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001", "ep_002"]
+
+    asyncio.run(main())
+
+
+def test_feedback_that_the_agent_tampers_with_while_it_is_written_comes_out_whole(tmp_path: Path) -> None:
+    async def main() -> None:
+        outside = tmp_path / "outside"
+        outside.mkdir()
+        async with served(tmp_path) as s:
+            feedback = s.folder.feedback
+            shutil.rmtree(feedback)
+            feedback.symlink_to(outside)
+            await s.http.post(s.urls.submit, json=BODY)
+            assert not feedback.is_symlink()
+            (feedback / "submit_001").mkdir()
+            (feedback / "submit_001" / "forged").write_text("x")
+            (feedback / "submit_001.partial").symlink_to(outside)
+            await s.http.post(s.urls.submit, json=BODY)
+            assert sorted(path.name for path in (feedback / "submit_001").iterdir()) == [
+                "episodes",
+                "summary.json",
+            ]
+        assert list(outside.iterdir()) == []
+
+    asyncio.run(main())
+
+
+def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arrival(tmp_path: Path) -> None:
+    async def main() -> None:
+        trees = []
+        for name, order in (("a", list), ("b", lambda n: list(range(n))[::-1])):
+            double = Double(opened())
+            double.order = lambda n, order=order: list(order(range(n)) if order is list else order(n))
+            (tmp_path / name).mkdir()
+            async with served(tmp_path / name, double) as s:
+                await s.http.post(s.urls.submit, json={"env_instances": "0-5"})
+                trees.append(tree_of(s.folder.feedback))
+        assert trees[0] == trees[1]
+        assert len(trees[0]) == 1 + 6 * 3
+
+    asyncio.run(main())
+
+
+def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.refuse_submit = Refused(status="unavailable", message="disk full")
+        async with served(tmp_path, double) as s:
+            request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+            await asyncio.sleep(0.2)
+            assert not request.done()
+            double.refuse_submit = None
+            assert (await request).status_code == 200
+
+    asyncio.run(main())
+
+
+def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.refuse_submit = Refused(status="run_closed", message="run 'run-1' takes no more submits")
+        async with served(tmp_path, double) as s:
+            for _ in range(2):
+                answer = await s.http.post(s.urls.submit, json=BODY)
+                assert answer.status_code == 400
+                assert "closed" in answer.json()["error"]["message"]
+                assert "run-1" not in answer.text
+            assert s.desk.spent
+            assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
+
+    asyncio.run(main())
+
+
+def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.go.clear()
+        async with served(tmp_path, double) as s:
+            await s.http.post(s.urls.submit + "?wait=false", json=BODY)
+            closing = asyncio.create_task(s.close("wall_limit"))
+            await asyncio.sleep(0.1)
+            assert double.closed is None
+            double.go.set()
+            assert await closing
+            assert double.closed is not None
+            assert double.closed.reason == "wall_limit"
+            assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
+        assert isinstance(double.asked[-1], CloseRun)
+
+    asyncio.run(main())
