@@ -255,7 +255,9 @@ def describe_files(files: Files) -> tuple[Files, Source | None]:
     known = _described.get(digest)
     if known is None:
         topology, features = describe(modules)
-        known = _described[digest] = Source(digest=digest, topology=topology, features=features)
+        known = _described[digest] = Source(
+            digest=digest, topology=topology, features=features, files=tuple(sorted(reached))
+        )
         if len(_described) > _MAX_DESCRIBED:
             _described.popitem(last=False)
     return reached, known

@@ -27,6 +27,8 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     topology: str
     """Hash of the AST with numeric constants stripped; see `topology`."""
     features: Features
+    files: tuple[str, ...]
+    """Paths of the bundle's files under `system/`."""
 
 
 class Submit(msgspec.Struct, frozen=True, kw_only=True):

@@ -15,7 +15,6 @@ import msgspec
 
 from evopolicy_coordinator.analysis.agent_log import Evidence, LogReading, read_agent_log
 from evopolicy_coordinator.analysis.edits import Transition, classify
-from evopolicy_coordinator.analysis.reader import describe_files
 from evopolicy_coordinator.analysis.records import Run, Submit
 from evopolicy_coordinator.analysis.sources import read_python_files
 
@@ -75,15 +74,17 @@ def trace(run: Run) -> Trace:
 
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:
-    """Text of a checkpoint's source bundle by path: `policy.py` first. All its Python files when none is reachable."""
+    """Text of a checkpoint's source bundle by path: `policy.py` first. All its Python files when it has no bundle."""
+    system = run.checkpoint(submit.index) / "system"
     try:
-        files = read_python_files(run.checkpoint(submit.index) / "system")
+        if submit.source is not None:
+            found = {path: (system / path).read_bytes() for path in submit.source.files}
+        else:
+            found = read_python_files(system)
     except OSError:
         return {}
-    reached, _ = describe_files(files)
-    chosen: Mapping[str, bytes] = reached or files
-    ordered = sorted(chosen, key=lambda path: (path != "policy.py", path))
-    return {path: chosen[path].decode("utf-8", "replace") for path in ordered}
+    ordered = sorted(found, key=lambda path: (path != "policy.py", path))
+    return {path: found[path].decode("utf-8", "replace") for path in ordered}
 
 
 def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from evopolicy_coordinator.analysis.figures import cost, edits, scores
-from evopolicy_coordinator.analysis.figures.style import Plot, looks
+from evopolicy_coordinator.analysis.figures.style import Plot
+from evopolicy_coordinator.analysis.palette import looks
 from evopolicy_coordinator.analysis.scores import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
 

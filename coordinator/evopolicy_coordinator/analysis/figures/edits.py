@@ -9,8 +9,10 @@ import matplotlib
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from evopolicy_coordinator.analysis.edits import EditRates, Transition
-from evopolicy_coordinator.analysis.figures.style import EDIT_COLOURS, INK, MUTED, RC, Look, Plot, new_figure
+from evopolicy_coordinator.analysis.edits import EditRates
+from evopolicy_coordinator.analysis.figures.style import INK, MUTED, RC, Plot, new_figure
+from evopolicy_coordinator.analysis.palette import EDIT_COLOURS, Look
+from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.records import rows
 from evopolicy_coordinator.analysis.scores import title_of
 from evopolicy_coordinator.analysis.structure import BINS, bin_label
@@ -25,23 +27,6 @@ _EVENTS = {
     "rollback": ("v", "rollback", 5.0),
     "retest": ("x", "retest", 5.0),
 }
-
-
-def phases(transitions: Sequence[Transition]) -> list[tuple[int, int, str]]:
-    """Bands (from, to, edit type) over consumed episodes: a run of adjacent transitions of one type is one band.
-
-    A submit's band covers its own episodes. Rollbacks and retests are events, not phases: the phase goes on through them.
-    """
-    bands: list[tuple[int, int, str]] = []
-    for transition in transitions:
-        edit = transition.edit
-        if edit in ("rollback", "retest"):
-            edit = bands[-1][2] if bands else "first"  # type: ignore[assignment]
-        if bands and bands[-1][2] == edit:
-            bands[-1] = (bands[-1][0], transition.consumed, edit)
-        else:
-            bands.append((bands[-1][1] if bands else transition.consumed_before, transition.consumed, edit))
-    return bands
 
 
 def timeline(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> Plot | None:
@@ -63,9 +48,13 @@ def timeline(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> 
                 textcoords="offset points", va="center", fontsize=8,
             )  # fmt: skip
         panel.set_yticks(range(len(cut)), [_row_label(line) for line in cut])
-        for label, line in zip(panel.get_yticklabels(), cut, strict=True):
-            label.set_color(looks[line.entry].colour)
-            label.set_fontweight("bold")
+        panel.tick_params(axis="y", length=0, pad=12)
+        for place, line in enumerate(cut):
+            look = looks[line.entry]
+            panel.plot(
+                -0.013, place, look.marker, color=look.colour, markersize=6, clip_on=False,
+                transform=panel.get_yaxis_transform(),
+            )  # fmt: skip
         panel.set_ylim(len(cut) - 0.4, -0.6)
         panel.set_xlim(0, budget)
         panel.set_xlabel("Train episodes consumed")
@@ -106,12 +95,6 @@ def _timeline_row(panel: matplotlib.axes.Axes, place: int, line: Timeline) -> No
                 transition.consumed, place + lift, marker, color=INK, markersize=size, clip_on=False, zorder=3,
                 markerfacecolor="none" if kind == "miss" else INK, markeredgewidth=1.0,
             )  # fmt: skip
-
-
-def events_of(transition: Transition) -> list[str]:
-    """`hit` or `miss`, and `rollback` or `retest` where the submit is one."""
-    outcome = ["hit" if transition.hit else "miss"]
-    return outcome + ([transition.edit] if transition.edit in ("rollback", "retest") else [])
 
 
 def _timeline_handles(lines: Sequence[Timeline]) -> list[Patch | Line2D]:

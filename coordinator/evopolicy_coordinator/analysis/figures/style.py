@@ -1,8 +1,4 @@
-"""How every figure looks, and how it is written: palette, marks, rcParams, SVG and PNG.
-
-An agent has the same colour, marker and dash in every figure of a report, given by its place among the agents' names.
-Colours are Okabe and Ito's colour-blind-safe set (yellow and black left out, too weak on one of the two backgrounds), then
-three of Tol's; after nine agents colours repeat with another dash. The random reference is always grey and dashed.
+"""How every figure is drawn and written: rcParams, SVG and PNG. Agents' looks are in `palette`.
 
 In the page, ink, muted text and grid follow its light or dark theme: `inline_svg` turns their three colours, which
 nothing else uses, into CSS variables.
@@ -13,29 +9,15 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
-import msgspec
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 INK = "#15181d"
 MUTED = "#5c6773"
 GRID = "#d5dae1"
-REFERENCE = "#868b92"
-
-COLOURS = (
-    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
-    "#aa4499", "#999933", "#882255",
-)  # fmt: skip
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
-
-EDIT_COLOURS = {"first": "#b9bec6", "synthesis": "#7b6fd0", "parametric": "#c9a227"}
-"""Bands of the timelines; not used by any agent."""
-
 PNG_DPI = 160
 
 RC: dict[str, Any] = {
@@ -72,16 +54,9 @@ RC: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 5.0,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # an agent's name may hold a dollar sign
     "axes.unicode_minus": True,
 }
-
-
-class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """An agent's identity in figures."""
-
-    colour: str
-    marker: str
-    dash: Any
 
 
 class Plot:
@@ -103,21 +78,6 @@ class Plot:
         self.figure = figure
         self.group = group
         """Section of the report."""
-
-
-def looks(agents: Sequence[str], reference: str | None) -> dict[str, Look]:
-    """Agent to look, by the place of its name among all agents of the report; the reference grey and dashed."""
-    out: dict[str, Look] = {}
-    for place, agent in enumerate(sorted(agents, key=lambda name: (name.casefold(), name))):
-        lap = place // len(COLOURS)
-        out[agent] = Look(
-            colour=COLOURS[place % len(COLOURS)],
-            marker=MARKERS[place % len(MARKERS)],
-            dash=DASHES[lap % len(DASHES)],
-        )
-    if reference is not None:
-        out[reference] = Look(colour=REFERENCE, marker="|", dash=DASHES[1])
-    return out
 
 
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:

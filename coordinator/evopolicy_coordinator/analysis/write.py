@@ -1,0 +1,239 @@
+"""Writes a report folder: pages, figures, tables, data. The only part of the analysis that writes files.
+
+    index.html                self-contained: figures, styles and scripts are in it
+    report.json               every table and every figure's data
+    figures/*.svg, *.png      tables/*.csv, *.md, *.tex
+    traces/*.html             one page a run, images beside it
+    replays/*.html            one page an environment that has recordings, videos beside it
+
+Files of an earlier report in the same folder are overwritten; a folder that holds anything else is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator.analysis.html.pages import (
+    FigureView,
+    PlayedEpisode,
+    default_title,
+    index_page,
+    replays_page,
+    trace_page,
+)
+from evopolicy_coordinator.analysis.palette import Look, looks
+from evopolicy_coordinator.analysis.records import Run
+from evopolicy_coordinator.analysis.report_tables import tables_of
+from evopolicy_coordinator.analysis.scores import ordered_environments
+from evopolicy_coordinator.analysis.study import Study
+from evopolicy_coordinator.analysis.tables import Table, to_csv, to_latex, to_markdown
+from evopolicy_coordinator.analysis.trace import Trace, trace
+
+REPORT_SCHEMA_VERSION = 1
+_OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
+_POINTS_PER_REM = 11.0
+"""Figures are shown a little larger than printed: a rem of the page for that many points."""
+
+Progress = Callable[[str, int, int], None]
+"""Told (what, done, total)."""
+
+
+def write_report(
+    study: Study,
+    out: Path,
+    *,
+    title: str | None = None,
+    traces: bool = True,
+    progress: Progress | None = None,
+) -> Path:
+    """Writes the report of `study` into the folder `out` (made when absent) and returns its `index.html`.
+
+    ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of single runs
+    are left out, which is most of the time and space of a large report.
+    """
+    tell = progress if progress is not None else lambda what, done, total: None
+    _prepare(out)
+    look = looks(study.entries, study.reference)
+    trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
+    tables = tables_of(study, lambda run: trace_links.get(run, ""))
+    for table in tables:
+        for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
+            (out / "tables" / f"{table.name}.{suffix}").write_text(text, encoding="utf-8")
+    figures, figure_data = _write_figures(study, out, tell)
+    if traces:
+        for done, run in enumerate(study.runs, start=1):
+            _write_trace(trace(run), out, look.get(run.entry))
+            tell("run pages", done, len(study.runs))
+    replay_links = _write_replays(study, out, look)
+    page = index_page(
+        study,
+        title=title or default_title(study),
+        looks=look,
+        tables=tables,
+        figures=figures,
+        trace_links=trace_links,
+        replay_links=replay_links,
+    )
+    (out / "report.json").write_bytes(_report_json(study, tables, figure_data))
+    index = out / "index.html"
+    index.write_text(page, encoding="utf-8")
+    return index
+
+
+def slug(run: Run) -> str:
+    """A file name for the run's page: readable, and unique by a hash of its name."""
+    text = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{run.env}-{run.entry}-{run.record.exp_id}").strip("-.")[:90]
+    return f"{text}-{hashlib.sha256(run.name.encode()).hexdigest()[:8]}"
+
+
+def _prepare(out: Path) -> None:
+    if out.exists():
+        if not out.is_dir():
+            raise ConfigError(f"--out {out} is a file; give a folder")
+        others = sorted(child.name for child in out.iterdir() if child.name not in _OURS)
+        if others:
+            raise ConfigError(
+                f"--out {out} holds other files ({', '.join(others[:3])}…); give a new or an earlier report's folder"
+            )
+        for name in ("figures", "tables", "traces", "replays"):
+            shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("figures", "tables"):
+        (out / name).mkdir(parents=True, exist_ok=True)
+
+
+def _write_figures(study: Study, out: Path, tell: Progress) -> tuple[list[FigureView], dict[str, Any]]:
+    from evopolicy_coordinator.analysis.figures import figures_of  # matplotlib: only when figures are wanted
+    from evopolicy_coordinator.analysis.figures.style import inline_svg, png_bytes, svg_text
+
+    views: list[FigureView] = []
+    data: dict[str, Any] = {}
+    for plot in figures_of(study):
+        svg = svg_text(plot.figure, plot.name)
+        (out / "figures" / f"{plot.name}.svg").write_text(svg, encoding="utf-8")
+        (out / "figures" / f"{plot.name}.png").write_bytes(png_bytes(plot.figure))
+        data[plot.name] = {"title": plot.title, "caption": plot.caption, "data": plot.data}
+        views.append(
+            FigureView(
+                name=plot.name,
+                title=plot.title,
+                caption=plot.caption,
+                group=plot.group,
+                svg=_Html(inline_svg(svg, plot.name, plot.alt)),
+                width=round(plot.figure.get_figwidth() * 72.0 / _POINTS_PER_REM, 1),
+                timeline=plot.data[0]["env"] if plot.group == "timelines" else "",
+            )
+        )
+        tell("figures", len(views), len(views))
+    return views, data
+
+
+class _Html(str):
+    """Markup that is already escaped: the SVG of our own figures."""
+
+    __slots__ = ()
+
+    def __html__(self) -> str:
+        return str(self)
+
+
+def _write_trace(found: Trace, out: Path, look: Look | None) -> None:
+    folder = out / "traces"
+    folder.mkdir(exist_ok=True)
+    name = slug(found.run)
+    image_links: dict[int, list[tuple[str, str]]] = {}
+    for row in found.rows:
+        for number, path in enumerate(row.images):
+            target = folder / name / f"{row.submit.label}-{number}{path.suffix.lower()}"
+            if _copy(path, target):
+                image_links.setdefault(row.submit.index, []).append((path.name, f"{name}/{target.name}"))
+    page = trace_page(found, look=look, image_links=image_links)
+    (folder / f"{name}.html").write_text(page, encoding="utf-8", errors="replace")
+
+
+def _copy(path: Path, target: Path) -> bool:
+    """Copies a file; False when it is not there, or a link."""
+    if not path.is_file() or path.is_symlink():
+        return False
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, target)
+    return True
+
+
+def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
+    by_env: dict[str, list[PlayedEpisode]] = {}
+    for run in study.runs:
+        for number, replay in enumerate(run.record.artifacts.replays):
+            stem = f"media/{slug(run)}-{number:03d}"
+            video = _copied(run, replay.path, out / "replays", stem)
+            strip = _copied(run, replay.filmstrip, out / "replays", stem) if replay.filmstrip else None
+            by_env.setdefault(run.env, []).append(
+                PlayedEpisode(
+                    run=run,
+                    split=replay.split,
+                    episode=replay.episode,
+                    submit_index=replay.submit_index,
+                    episode_return=replay.episode_return,
+                    length=replay.length,
+                    video=video,
+                    strip=strip,
+                )
+            )
+    links: dict[str, str] = {}
+    for env in ordered_environments(by_env):
+        name = f"replays/{re.sub(r'[^A-Za-z0-9.-]+', '-', env)}.html"
+        (out / "replays").mkdir(exist_ok=True)
+        (out / name).write_text(replays_page(env, by_env[env], look), encoding="utf-8")
+        links[env] = name
+    return links
+
+
+def _copied(run: Run, path: str, folder: Path, stem: str) -> str | None:
+    """Copies a run's file into the report; None when it is missing or would lead out of the run directory."""
+    source = (run.path / path).resolve()
+    if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in (
+        ".mp4",
+        ".png",
+        ".webm",
+    ):
+        return None
+    target = folder / f"{stem}{source.suffix.lower()}"
+    return f"{stem}{source.suffix.lower()}" if _copy(source, target) else None
+
+
+def _report_json(study: Study, tables: list[Table], figures: dict[str, Any]) -> bytes:
+    content = {
+        "schema_version": REPORT_SCHEMA_VERSION,
+        "runs": [
+            {
+                "name": run.name,
+                "path": str(run.path),
+                "entry": run.entry,
+                "env": run.env,
+                "exp_id": run.record.exp_id,
+                "repeat": run.record.repeat,
+                "score": run.score,
+            }
+            for run in study.runs
+        ],
+        "left_out": [{"path": str(item.path), "reason": item.reason} for item in study.left_out],
+        "mixtures": [str(mixture) for mixture in study.mixtures],
+        "tables": {
+            table.name: {
+                "title": table.title,
+                "caption": table.caption,
+                "columns": [column.key for column in table.columns],
+                "rows": table.rows,
+            }
+            for table in tables
+        },
+        "figures": figures,
+    }
+    return msgspec.json.format(msgspec.json.encode(content, enc_hook=str), indent=1) + b"\n"
