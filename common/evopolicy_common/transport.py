@@ -165,8 +165,10 @@ class Link:
         )
         try:
             await loop.run_in_executor(self._sender, send)
-            # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck.
-            answer = await asyncio.wait_for(future, timeout_s + 2.0)
+            # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck. Not `wait_for`,
+            # which in Python 3.11 swallows a cancellation that comes together with the answer.
+            async with asyncio.timeout(timeout_s + 2.0):
+                answer = await future
         except (zenoh.ZError, TimeoutError, RuntimeError) as error:
             raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
         if answer is None:

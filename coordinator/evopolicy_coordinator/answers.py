@@ -101,7 +101,8 @@ class Answers:
         row = self._reader.submit(effect.run, effect.submit_index)
         if row is None:
             return Refused(status="unknown_submit", message=f"this run has no submit {effect.submit_index}")
-        upto = row.released if effect.upto is None else effect.upto
+        # The row may have moved on since the core asked: an end is told with all that belongs before it.
+        upto = row.released if effect.upto is None or row.status is not None else effect.upto
         group = records.train_group(effect.run, effect.submit_index)
         page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
         return ResultsPage(
@@ -129,7 +130,14 @@ class Answers:
             return Refused(
                 status="bad_blob", message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
             )
-        have = self._blobs.append_chunk(sender, message.digest, message.size, message.offset, message.data)
+        try:
+            have = self._blobs.append_chunk(
+                sender, message.digest, message.size, message.offset, message.data
+            )
+        except StorageError as error:
+            if error.__cause__ is not None:  # the disk's fault, not the sender's
+                raise
+            return Refused(status="bad_blob", message=str(error))
         return BlobAck(have=have)
 
     def _get(self, run: str | None, message: BlobGet) -> Message:

@@ -77,7 +77,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
             allowed_imports=("numpy", *options.allowed_packages),
             denied_imports=SIMULATORS,
         )
-        service = Service(store, Answers(state.database, blobs), blobs, intake, options.core)
+        service = Service(state.identity.cluster, store, Answers(state.database, blobs), intake, options.core)
         try:
             await service.start()
             await _serve(state, listen, service, stop, on_ready)

@@ -14,24 +14,26 @@ Rules that this module owns:
 from __future__ import annotations
 
 import asyncio
+import hmac
 import time
 from collections.abc import Callable, Coroutine
+from importlib import metadata
 from zlib import crc32
 
 import msgspec
 import structlog
 
 from evopolicy_common import bundles, codec
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message, Refused
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answer, Answers
-from evopolicy_coordinator.core import Core
 from evopolicy_coordinator.core.effects import Effect, Log, ReadEvaluation, ReadFinished, ReadResults, Reply
 from evopolicy_coordinator.core.events import AnyEvent, LivenessLost
+from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.workers import Worker
 from evopolicy_coordinator.intake import Intake, Parsed
 from evopolicy_coordinator.store import Store
 from evopolicy_coordinator.watchdog import LoopWatchdog
@@ -43,6 +45,8 @@ MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYT
 MAX_BLOB_BYTES = 1 << 30
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
+_FORGET_S = 120.0
+"""Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _READS_FILES = (operator.CreateRun, operator.Evaluate)
 
 
@@ -51,17 +55,24 @@ class _Pending(msgspec.Struct, frozen=True):
 
     query: IncomingQuery
     asker: str
+    since: float
+    """Loop time at which it came."""
 
 
 class Service:
     """One coordinator's life on an event loop: `start`, then `on_queries` for each batch, at last `stop`."""
 
     def __init__(
-        self, store: Store, answers: Answers, blobs: BlobStore, intake: Intake, settings: CoreSettings
+        self,
+        cluster: str,
+        store: Store,
+        answers: Answers,
+        intake: Intake,
+        settings: CoreSettings,
     ) -> None:
         """To be made on the event loop. The store is the service's from now on; `stop` does not close it."""
+        self._cluster = cluster
         self._answers = answers
-        self._blobs = blobs
         self._intake = intake
         self._settings = settings
         self._loop = asyncio.get_running_loop()
@@ -78,13 +89,16 @@ class Service:
         self._storage_error = ""
         self._stopping = False
         self._unix_offset = time.time() - self._loop.time()
+        self._started_at = self.now()
         self._watchdog: LoopWatchdog | None = None
+        self._sweeper: asyncio.TimerHandle | None = None
         self.n_events = 0
 
     async def start(self) -> None:
         """Loads the core from the store; StorageError when that cannot be read or counted up."""
         await self._load()
         self._watchdog = LoopWatchdog()
+        self._sweep()
 
     async def stop(self) -> None:
         """Takes nothing more, makes durable what was handled, answers it, and ends every other query.
@@ -95,6 +109,8 @@ class Service:
             return
         self._stopping = True
         self._cancel_timer()
+        if self._sweeper is not None:
+            self._sweeper.cancel()
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -151,7 +167,7 @@ class Service:
         elif isinstance(message, BlobGet):
             self._serve_get(core, query, parsed, message)
         elif isinstance(message, operator.StatusRequest):
-            query.reply(codec.encode(core.status(self.now())), _lane(parsed.asker))
+            query.reply(codec.encode(self._status(core)), _lane(parsed.asker))
         elif isinstance(message, _READS_FILES):
             self._spawn(self._serve_from_thread(query, parsed))
         else:
@@ -184,29 +200,39 @@ class Service:
 
     def _admit(self, query: IncomingQuery, parsed: Parsed) -> int:
         self._n_requests += 1
-        self._pending[self._n_requests] = _Pending(query, parsed.asker)
+        self._pending[self._n_requests] = _Pending(query, parsed.asker, self._loop.time())
         return self._n_requests
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
-        if parsed.room == "work" and not core.knows_session(parsed.asker, message.token):
-            raise RefusedError(
-                "unknown_worker", f"worker {parsed.asker!r} has no such session; register again"
-            )
-        most = MAX_BLOB_BYTES if parsed.room == "work" else MAX_BUNDLE_BYTES
+        most = MAX_BUNDLE_BYTES
+        if parsed.room == "work":
+            _check_session(core, parsed.asker, message.token)
+            most = MAX_BLOB_BYTES
         self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, _answer_to(query, parsed.asker))
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":
-            if not core.knows_session(parsed.asker, message.token):
+            worker = _check_session(core, parsed.asker, message.token)
+            held = (lease.job.group.template.bundle for lease in worker.leases.values())
+            if message.digest not in held:
                 raise RefusedError(
-                    "unknown_worker", f"worker {parsed.asker!r} has no such session; register again"
-                )
-            if not core.holds_bundle(parsed.asker, message.digest):
-                raise RefusedError(
-                    "unknown_blob", f"worker {parsed.asker!r} holds no job of {message.digest[:64]!r}"
+                    "unknown_blob", f"worker {parsed.asker!r} holds no job of bundle {message.digest[:64]!r}"
                 )
         run = parsed.asker if parsed.room == "gw" else None
         self._answers.get(run, message, _answer_to(query, parsed.asker))
+
+    def _status(self, core: Core) -> operator.StatusReply:
+        part = core.status(self.now())
+        return operator.StatusReply(
+            cluster=self._cluster,
+            version=metadata.version("evopolicy"),
+            uptime_s=self.now() - self._started_at,
+            episodes_done=part.episodes_done,
+            episodes_per_s=part.episodes_per_s,
+            workers=part.workers,
+            runs=part.runs,
+            stalls=part.stalls,
+        )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
         log.info("refused", key=query.key, status=error.status, why=error.message)
@@ -334,10 +360,27 @@ class Service:
     def _take(self, request: int | str) -> _Pending | None:
         return self._pending.pop(request, None) if isinstance(request, int) else None
 
+    def _sweep(self) -> None:
+        """Lets go of queries that nobody waits for any more: those of lost workers are never answered."""
+        oldest = self._loop.time() - _FORGET_S
+        for request, pending in list(self._pending.items()):
+            if pending.since > oldest:
+                break
+            pending.query.drop()
+            del self._pending[request]
+        self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
+
     def _drop_pending(self) -> None:
         for pending in self._pending.values():
             pending.query.drop()
         self._pending.clear()
+
+
+def _check_session(core: Core, name: str, session: str) -> Worker:
+    worker = core.fleet.workers.get(name)
+    if worker is None or not hmac.compare_digest(worker.session.encode(), session.encode()):
+        raise RefusedError("unknown_worker", f"worker {name[:64]!r} has no such session; register again")
+    return worker
 
 
 def _lane(asker: str) -> int:

@@ -1,0 +1,241 @@
+"""`evopolicy status`, `evopolicy workers …`, `evopolicy runs …`: an operator's look at a cluster, and his word on it.
+
+Exit codes: 0 all well, 1 the coordinator refused or cannot be reached, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import msgspec
+import typer
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from evopolicy_common import codec, credentials, keys, transport
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.messages.operator import (
+    CancelRun,
+    Done,
+    OperatorReply,
+    SetWorker,
+    StatusReply,
+    StatusRequest,
+)
+from evopolicy_common.requests import Requester
+
+T = TypeVar("T")
+
+status_app = typer.Typer(
+    name="status", help="What a cluster is doing.", add_completion=False, rich_markup_mode=None
+)
+workers_app = typer.Typer(
+    name="workers",
+    help="Take workers out of service and back.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+runs_app = typer.Typer(
+    name="runs",
+    help="An operator's word on runs.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(help="Endpoint of the coordinator; default: the one of this machine's state folder."),
+]
+CredentialsFile = Annotated[
+    Path | None, typer.Option("--credentials", help="STATE/credentials/operator.json of the coordinator.")
+]
+
+
+class Operator:
+    """Asks an operator's requests."""
+
+    def __init__(self, link: transport.Link) -> None:
+        self.token = link.credentials.token
+        cluster = link.credentials.cluster
+        self._ask: Requester[OperatorReply] = Requester(
+            link, lambda verb: keys.operator_key(cluster, verb), codec.operator_replies
+        )
+
+    async def status(self) -> StatusReply:
+        return await self._ask.until_answered(
+            "status", StatusRequest(token=self.token), StatusReply, patience_s=10.0
+        )
+
+    async def set_worker(self, worker: str, *, draining: bool) -> None:
+        message = SetWorker(token=self.token, worker=worker, state="draining" if draining else "active")
+        await self._ask.until_answered("worker", message, Done, patience_s=10.0)
+
+    async def cancel_run(self, run: str) -> None:
+        message = CancelRun(token=self.token, run=run)
+        await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
+
+
+def _asking(connect: list[str] | None, file: Path | None, work: Callable[[Operator], Awaitable[T]]) -> T:
+    """`work` with a link to the coordinator; our errors as one line."""
+
+    async def ask() -> T:
+        async with transport.connect(credentials.find("operator", tuple(connect or ()), file)) as link:
+            return await work(Operator(link))
+
+    with fail_on_our_errors():
+        return asyncio.run(ask())
+    raise AssertionError("fail_on_our_errors never swallows")
+
+
+@status_app.callback(
+    invoke_without_command=True, epilog="Example: evopolicy status --watch --connect tcp/10.0.0.5:7447"
+)
+def status(
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Show it anew every second until Ctrl-C.")] = False,
+) -> None:
+    """Workers, runs, and what waits longer than it should, and for what."""
+    if watch and as_json:
+        typer.echo("error: --watch and --json do not go together", err=True)
+        raise typer.Exit(2)
+    if watch:
+        _asking(connect, file, _watch)
+        return
+    reply = _asking(connect, file, Operator.status)
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(reply)).decode())
+    else:
+        _console().print(render(reply))
+
+
+async def _watch(operator: Operator) -> None:
+    with Live(console=_console(), auto_refresh=False) as live:
+        while True:
+            started = time.monotonic()
+            live.update(render(await operator.status()), refresh=True)
+            await asyncio.sleep(max(0.0, 1.0 - (time.monotonic() - started)))
+
+
+@workers_app.command(epilog="Example: evopolicy workers drain lab-3f2a")
+def drain(
+    worker: Annotated[str, typer.Argument(help="The worker's name, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Give a worker no more work: it finishes what runs, then ends."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, draining=True))
+    typer.echo(f"{worker} is draining")
+
+
+@workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
+def resume(
+    worker: Annotated[str, typer.Argument(help="The worker's name.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Take a drained worker back."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, draining=False))
+    typer.echo(f"{worker} is active")
+
+
+@runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
+def cancel(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """End a run without a score; what of it is played stops."""
+    _asking(connect, file, lambda operator: operator.cancel_run(run))
+    typer.echo(f"{run} is cancelled")
+
+
+def render(reply: StatusReply) -> RenderableType:
+    """The status as tables."""
+    slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
+    head = (
+        f"cluster {reply.cluster} · evopolicy {reply.version} · up {_age(reply.uptime_s)} · {slots} slots ·"
+        f" {reply.episodes_done} episodes, {reply.episodes_per_s:.1f}/s over the last minute"
+    )
+    parts: list[RenderableType] = [Text(head), _workers(reply), _runs(reply)]
+    parts += [Text(line, style="yellow") for line in _remarks(reply)]
+    return Group(*parts)
+
+
+def _workers(reply: StatusReply) -> Table:
+    table = _table(
+        "worker", "host", "state", "slots", "running", "held", "environments", "tiers", "class", "seen"
+    )
+    for worker in reply.workers:
+        table.add_row(
+            worker.worker,
+            worker.host,
+            worker.state,
+            str(worker.slots),
+            str(worker.running),
+            str(worker.held),
+            str(len(worker.environments)),
+            " ".join(worker.tiers),
+            worker.fingerprint,
+            f"{_age(worker.last_seen_s)} ago",
+        )
+    return table
+
+
+def _runs(reply: StatusReply) -> Table:
+    table = _table(
+        "run", "entry", "environment", "phase", "budget left", "submits", "queued", "running", "done"
+    )
+    for run in reply.runs:
+        table.add_row(
+            run.run,
+            run.entry,
+            run.env,
+            run.phase,
+            f"{run.remaining_budget}/{run.budget}",
+            str(run.n_submits),
+            str(run.queued),
+            str(run.running),
+            str(run.done),
+        )
+    return table
+
+
+def _remarks(reply: StatusReply) -> Iterator[str]:
+    for run in reply.runs:
+        if run.waits_for:
+            yield f"{run.run} waits for {run.waits_for}"
+    for worker in reply.workers:
+        for run_id, why in worker.refused.items():
+            yield f"{worker.worker} gets no work of {run_id}: {why}"
+    yield from reply.stalls
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in headings:
+        table.add_column(heading, no_wrap=True)
+    return table
+
+
+def _console() -> Console:
+    console = Console()
+    # Where nobody looks at it live, a cut-off table is worse than a long line.
+    return console if console.is_terminal else Console(width=200)
+
+
+def _age(seconds: float) -> str:
+    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

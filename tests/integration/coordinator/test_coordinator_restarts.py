@@ -1,0 +1,211 @@
+"""Killed at any instant and started again on the same folder, a coordinator goes on where it was."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+from coordinator_harness import (
+    Coordinator,
+    GatewayClient,
+    InstantWorker,
+    bundle_of,
+    comparable,
+    gateway_of,
+    operator_of,
+    working,
+)
+
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.transport import connect
+
+SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
+
+
+def run(scenario: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(asyncio.wait_for(scenario(), 120))
+
+
+async def whole_run(coordinator: Coordinator, on_submit: Callable[[int], None]) -> RunFinished:
+    """A run of three submits; `on_submit` is called after each is accepted."""
+    async with operator_of(coordinator) as operator:
+        created = await operator.create()
+        async with gateway_of(coordinator, created) as gateway:
+            for number, (ids, source) in enumerate(SUBMITS):
+                await gateway.submit(bundle_of(source), ids, f"submit-{number}")
+                on_submit(number)
+                episodes, done = await gateway.results(number)
+                assert sorted(episode.index for episode in episodes) == list(range(len(ids)))
+                assert len({episode.index for episode in episodes}) == done.n_kept == len(ids)
+            await gateway.close()
+        return await operator.finished(created.run)
+
+
+def test_coordinator_killed_through_a_whole_run_ends_with_the_same_outcome(tmp_path: Path) -> None:
+    """Killed about every second, by a clock of its own that knows nothing of what the run is at."""
+    outcomes = []
+    for name, kills in (("calm", 0), ("stormy", 6)):
+        state = tmp_path / name
+        state.mkdir(mode=0o700)
+        if name == "stormy":
+            (state / "secret").write_bytes((tmp_path / "calm" / "secret").read_bytes())
+            (state / "secret").chmod(0o600)
+        holder = [Coordinator(state)]
+
+        async def scenario(
+            holder: list[Coordinator] = holder, state: Path = state, kills: int = kills
+        ) -> None:
+            dice = random.Random(7)
+            ended = asyncio.Event()
+
+            async def storm() -> None:
+                for _ in range(kills):
+                    await asyncio.sleep(dice.uniform(0.05, 0.6))
+                    if ended.is_set():
+                        return
+                    await asyncio.to_thread(holder[0].kill)
+                    holder[0] = await asyncio.to_thread(Coordinator, state)
+
+            storming = asyncio.create_task(storm())
+            async with working(holder[0], "w-1"), working(holder[0], "w-2"):
+                outcomes.append(comparable(await whole_run(holder[0], lambda _: None)))
+            ended.set()
+            await storming
+
+        try:
+            run(scenario)
+        finally:
+            holder[0].kill()
+    assert outcomes[0]["budget_used"] == 12
+    assert outcomes[1] == outcomes[0]
+
+
+def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path) -> None:
+    holder = [Coordinator(tmp_path / "state")]
+
+    async def scenario() -> None:
+        async with operator_of(holder[0]) as operator:
+            created = await operator.create()
+            async with gateway_of(holder[0], created) as gateway:
+                accepted = await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+                holder[0].kill()
+                holder[0] = Coordinator(tmp_path / "state")
+                assert await gateway.submit(bundle_of("# policy"), (0, 1), "key") == accepted
+                async with working(holder[0]):
+                    _, done = await gateway.results(0)
+                assert done.status == "ok"
+                assert (await gateway.state()).remaining_budget == 14
+            assert (await operator.create()) == created
+
+    try:
+        run(scenario)
+    finally:
+        holder[0].kill()
+
+
+def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -> None:
+    holder = [Coordinator(tmp_path / "state")]
+
+    async def scenario() -> None:
+        async with operator_of(holder[0]) as operator, connect(holder[0].credentials("worker")) as link:
+            worker = InstantWorker(link)
+            await worker.register()
+            created = await operator.create()
+            async with gateway_of(holder[0], created) as gateway:
+                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+                leases = await worker.lease(2)
+                results = tuple(worker.result(lease) for lease in leases)
+                assert len(results) == 2
+                await worker.hand_in(results)
+                holder[0].kill()
+                holder[0] = Coordinator(tmp_path / "state")
+                await worker.register()
+                await worker.hand_in(results)
+                episodes, _ = await gateway.results(0)
+                assert sorted(episode.index for episode in episodes) == [0, 1]
+
+    try:
+        run(scenario)
+    finally:
+        holder[0].kill()
+
+
+def test_finished_run_is_told_after_a_restart(tmp_path: Path) -> None:
+    holder = [Coordinator(tmp_path / "state")]
+
+    async def scenario() -> None:
+        async with working(holder[0]):
+            finished = await whole_run(holder[0], lambda _: None)
+        assert holder[0].stop() == 0
+        holder[0] = Coordinator(tmp_path / "state")
+        async with operator_of(holder[0]) as operator:
+            created = await operator.create()
+            assert created.run == finished.run
+            assert await operator.finished(created.run) == finished
+            async with gateway_of(holder[0], created) as gateway:
+                episodes, done = await gateway.results(1)
+                assert (len(episodes), done.status) == (2, "ok")
+                assert (await gateway.state()).is_finalized
+
+    try:
+        run(scenario)
+    finally:
+        holder[0].kill()
+
+
+def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Path) -> None:
+    holder = [Coordinator(tmp_path / "state", "--listen", "tcp/127.0.0.1:0")]
+    endpoint = holder[0].ready["endpoints"][-1]
+    assert endpoint.startswith("tcp/127.0.0.1:")
+
+    async def scenario() -> None:
+        async with operator_of(holder[0]) as operator, working(holder[0]) as worker:
+            created = await operator.create()
+            async with gateway_of(holder[0], created) as gateway:
+                worker.hold.clear()
+                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+                while not worker.jobs:
+                    await asyncio.sleep(0.01)
+                assert await asyncio.to_thread(holder[0].stop) == 0
+                holder[0] = await asyncio.to_thread(Coordinator, tmp_path / "state", "--listen", endpoint)
+                worker.hold.set()
+                _, done = await gateway.results(0)
+                assert done.status == "ok"
+
+    try:
+        run(scenario)
+    finally:
+        holder[0].kill()
+
+
+@pytest.mark.parametrize("what", ["close", "results"])
+def test_requests_on_their_way_when_the_coordinator_dies_are_answered_by_the_next(
+    tmp_path: Path, what: str
+) -> None:
+    holder = [Coordinator(tmp_path / "state")]
+
+    async def scenario() -> None:
+        async with operator_of(holder[0]) as operator:
+            created = await operator.create()
+            async with gateway_of(holder[0], created) as gateway:
+                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+                waiting = asyncio.create_task(ask(gateway))
+                await asyncio.sleep(0.2)
+                await asyncio.to_thread(holder[0].kill)
+                holder[0] = await asyncio.to_thread(Coordinator, tmp_path / "state")
+                async with working(holder[0]):
+                    await waiting
+
+    async def ask(gateway: GatewayClient) -> None:
+        if what == "close":
+            await gateway.close()
+        else:
+            await gateway.results(0)
+
+    try:
+        run(scenario)
+    finally:
+        holder[0].kill()
