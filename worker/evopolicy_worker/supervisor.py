@@ -396,7 +396,7 @@ class Supervisor:
 
     async def _stop_when_drained(self, lease: asyncio.Task[None], slots: list[asyncio.Task[None]]) -> None:
         await self._draining.wait()
-        lease.cancel()
+        await self._withdraw_poll(lease)
         while self._queue:
             _, waiting = self._queue.popitem(last=False)
             self._put_result(waiting, "returned")
@@ -408,6 +408,14 @@ class Supervisor:
             _, stuck = await asyncio.wait(late, timeout=2.0)
             for task in stuck:
                 task.cancel()
+
+    async def _withdraw_poll(self, lease: asyncio.Task[None]) -> None:
+        """Takes back the waiting poll, lest it be answered with leases that nobody here will see."""
+        request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
+        with contextlib.suppress(EvopolicyError):
+            await self._ask.once("lease", request, Leases)
+        await asyncio.wait({lease}, timeout=1.0)
+        lease.cancel()
 
 
 def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:

@@ -64,7 +64,7 @@ class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
     worker: str
     session: str
     n: int
-    """How many leases the worker can take."""
+    """How many leases the worker can take; 0 takes back the poll that waits, and is answered at once with none."""
     wait_s: float
     warm_bundles: tuple[str, ...] = ()
     warm_environments: tuple[str, ...] = ()

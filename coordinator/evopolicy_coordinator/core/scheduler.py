@@ -63,6 +63,9 @@ class Scheduler:
         """A worker asks for leases; an older poll of it is answered with none."""
         core = self._core
         self.drop_poll(worker, turn)
+        if event.n < 1:
+            turn.reply(event.request, wire.Leases(leases=()))
+            return
         warm = frozenset(event.warm_bundles) | frozenset(event.warm_environments)
         worker.poll = LeasePoll(event.request, max(1, min(event.n, 2 * worker.slots)), warm)
         if not self._serve(worker, turn):

@@ -1,0 +1,228 @@
+"""The worker's supervisor against a real coordinator process, with slots that answer by script.
+
+The slots are the tests' own so that every way in which a slot can end a job is met; `tests/integration/cluster` has the
+real ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from coordinator_harness import (
+    FINGERPRINT,
+    LINE,
+    Coordinator,
+    bundle_of,
+    comparable,
+    gateway_of,
+    operator_of,
+    play,
+)
+
+from evopolicy_common.blobs import digest_of
+from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
+from evopolicy_common.transport import connect
+from evopolicy_worker.supervisor import Options, Supervisor
+
+
+class ScriptedSlot:
+    """Plays as the harness's `play` does, after what `script` does with the job."""
+
+    def __init__(self, script: Callable[[ScriptedSlot, Job], Awaitable[None]]) -> None:
+        self.script = script
+        self.started = 0
+        self.stopped = asyncio.Event()
+
+    async def start(self) -> None:
+        self.started += 1
+
+    async def play(
+        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]:
+        assert (bundle is None) == (job.bundle is None)
+        assert bundle is None or (bundle / "policy.py").read_text()
+        self.stopped.clear()
+        await self.script(self, job)
+        on_progress(1, 10)
+        return tuple(large(play(job, spec)) for spec in job.episodes)
+
+    async def cancel(self) -> None:
+        self.stopped.set()
+
+    async def close(self) -> None:
+        pass
+
+
+def large(outcome: EpisodeOutcome) -> EpisodeOutcome:
+    """The outcome with a trajectory that is too big to travel inline."""
+    assert outcome.trajectory is not None
+    data = (outcome.trajectory.inline or b"") * 4000
+    blob = BlobRef(digest=digest_of(data), size=len(data), inline=data)
+    return msgspec.structs.replace(outcome, trajectory=blob)
+
+
+def make_data(folder: Path) -> None:
+    """Split files for `toy/line`, so that two coordinators play the same cases."""
+    (folder / "toy_line").mkdir(parents=True)
+    for number, (split, n) in enumerate((("train", 16), ("valid", 16), ("heldout", 32))):
+        cases = [{"seed": 1000 * number + i} for i in range(n)]
+        (folder / "toy_line" / f"{split}.json").write_text(
+            json.dumps({"env": "toy/line", "split": split, "cases": cases})
+        )
+
+
+async def at_once(slot: ScriptedSlot, job: Job) -> None:
+    await asyncio.sleep(0)
+
+
+@contextlib.asynccontextmanager
+async def supervising(
+    coordinator: Coordinator,
+    scratch: Path,
+    script: Callable[[ScriptedSlot, Job], Awaitable[None]] = at_once,
+    *,
+    name: str = "w-1",
+    slots: int = 2,
+) -> AsyncIterator[Supervisor]:
+    """A supervisor that works in the background and is drained at the end."""
+    options = Options(
+        name=name,
+        slots=slots,
+        tiers=("bwrap",),
+        environments=(LINE,),
+        fingerprint=FINGERPRINT,
+        host="test",
+        scratch=scratch / name,
+        grace_s=5.0,
+    )
+
+    def make_slot(index: int, tier: Tier) -> ScriptedSlot:
+        return ScriptedSlot(script)
+
+    async with connect(coordinator.credentials("worker")) as link:
+        supervisor = Supervisor(link, options, make_slot)
+        task = asyncio.create_task(supervisor.run())
+        try:
+            yield supervisor
+        finally:
+            supervisor.drain()
+            await asyncio.wait_for(task, 30)
+
+
+@pytest.fixture
+def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
+    coordinator = Coordinator(tmp_path / "state")
+    yield coordinator
+    coordinator.stop()
+
+
+async def whole_run(coordinator: Coordinator, key: str = "run") -> dict[str, Any]:
+    """Two submits, closed and finished; what must not depend on the workers."""
+    async with operator_of(coordinator) as operator:
+        created = await operator.create(key=key, n_validation=3, n_heldout=4)
+        async with gateway_of(coordinator, created) as gateway:
+            for number in range(2):
+                await gateway.submit(bundle_of(f"policy {number}"), tuple(range(8)), f"k{number}")
+                await gateway.results(number)
+            await gateway.close()
+        return comparable(await operator.finished(created.run))
+
+
+def run(scenario: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(asyncio.wait_for(scenario(), 60))  # type: ignore[arg-type]
+
+
+def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path) as supervisor:
+            finished = await whole_run(coordinator)
+            assert finished["status"] == "completed"
+            assert len(finished["heldout_returns"]) == 4
+            # 16 train, 2 × 3 validation, 4 held-out, 4 random: nothing was played twice.
+            assert supervisor.jobs_done == 30
+
+    run(scenario)
+
+
+def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
+    died: set[str] = set()
+    failed: set[str] = set()
+
+    async def trouble(slot: ScriptedSlot, job: Job) -> None:
+        if job.episodes[0].index % 4 == 1 and job.job_id not in died:
+            died.add(job.job_id)
+            raise SlotDiedError("environment process ended with code 139")
+        if job.episodes[0].index % 4 == 2 and job.job_id not in failed:
+            failed.add(job.job_id)
+            raise SandboxError("no space for the policy's copy")
+
+    make_data(tmp_path / "data")
+
+    async def scenario() -> None:
+        results = []
+        for name, script in (("calm", at_once), ("troubled", trouble)):
+            (tmp_path / name).mkdir()
+            coordinator = Coordinator(tmp_path / name / "state", "--data", str(tmp_path / "data"))
+            try:
+                async with supervising(coordinator, tmp_path / name, script):
+                    results.append(await whole_run(coordinator))
+            finally:
+                coordinator.stop()
+        assert died
+        assert failed
+        assert results[0] == results[1]
+
+    run(scenario)
+
+
+def test_a_restarted_coordinator_is_registered_with_again(tmp_path: Path) -> None:
+    coordinator = Coordinator(tmp_path / "state")
+    reached = asyncio.Event()
+    go_on = asyncio.Event()
+
+    async def wait(slot: ScriptedSlot, job: Job) -> None:
+        reached.set()
+        await go_on.wait()
+
+    async def scenario() -> None:
+        nonlocal coordinator
+        async with supervising(coordinator, tmp_path, wait):
+            run_task = asyncio.create_task(whole_run(coordinator))
+            await reached.wait()
+            coordinator.kill()
+            coordinator = Coordinator(tmp_path / "state")
+            go_on.set()
+            assert (await run_task)["status"] == "completed"
+
+    try:
+        run(scenario)
+    finally:
+        coordinator.stop()
+
+
+def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordinator, tmp_path: Path) -> None:
+    reached = asyncio.Event()
+
+    async def stuck(slot: ScriptedSlot, job: Job) -> None:
+        reached.set()
+        await slot.stopped.wait()
+        raise SandboxError("cancelled")
+
+    async def scenario() -> None:
+        run_task = None
+        async with supervising(coordinator, tmp_path, stuck, name="leaver") as leaver:
+            run_task = asyncio.create_task(whole_run(coordinator))
+            await reached.wait()
+            leaver.drain()
+        async with supervising(coordinator, tmp_path, name="stayer"):
+            assert (await run_task)["status"] == "completed"
+
+    run(scenario)
