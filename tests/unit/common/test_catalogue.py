@@ -1,0 +1,54 @@
+"""The catalogue against itself and the paper's suite."""
+
+from __future__ import annotations
+
+import pytest
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError
+
+
+def test_core16_is_four_families_of_four() -> None:
+    core16 = catalogue.suites()["core16"]
+    families = [catalogue.entry(env_id).family for env_id in core16.environments]
+    assert len(core16.environments) == 16
+    assert {family: families.count(family) for family in families} == {
+        "gym_box2d": 4,
+        "mujoco": 4,
+        "minigrid": 4,
+        "robotics_driving": 4,
+    }
+    assert (core16.budget, core16.n_validation, core16.n_heldout) == (128, 16, 32)
+
+
+def test_the_papers_demand_groups_are_five_and_eleven() -> None:
+    demands = [catalogue.entry(env_id).demand for env_id in catalogue.suites()["core16"].environments]
+    assert (demands.count("synthesis"), demands.count("tuning")) == (5, 11)
+
+
+def test_every_suite_names_known_environments_of_known_families() -> None:
+    for suite in catalogue.suites().values():
+        for env_id in suite.environments:
+            assert catalogue.entry(env_id).family in catalogue.families()
+
+
+@pytest.mark.parametrize(
+    ("patterns", "n"),
+    [(["core16"], 16), (["gym/acrobot"], 1), (["gymnasium/MiniGrid-*"], 4), (["core16", "gym/*", "toy"], 18)],
+)
+def test_patterns_name_environments_without_repeats(patterns: list[str], n: int) -> None:
+    assert len(catalogue.resolve(patterns)) == n
+
+
+@pytest.mark.parametrize(
+    ("pattern", "near"),
+    [
+        ("gym/acrobat", "gym/acrobot"),
+        ("Core16", "core16"),
+        ("minigrid", "MiniGrid-DoorKey"),
+        ("zzz", "suites: core16"),
+    ],
+)
+def test_an_unknown_name_is_refused_naming_what_is_near(pattern: str, near: str) -> None:
+    with pytest.raises(ConfigError, match=near):
+        catalogue.resolve([pattern])
