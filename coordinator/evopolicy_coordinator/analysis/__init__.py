@@ -1,0 +1,72 @@
+"""Post-hoc analysis of runs: every table and figure of the paper, and the diagnostics beyond it.
+
+From a notebook:
+
+    from evopolicy_coordinator.analysis import rows, study
+
+    found = study(["runs"])                     # reads every run below; what is damaged is in found.left_out
+    core16 = found.suites[0]
+    for row in core16.board.standings:          # typed records
+        print(row.entry, row.score, row.wins)
+    rows(found.evolutions)                      # a list of dicts: pandas.DataFrame(rows(...)) takes it
+
+`study` refuses runs that are no fair comparison (MixedRunsError) unless `allow_mixed=True`. `write_report` writes the
+pages that `evopolicy report` writes; `figures_of` draws the figures one by one; `heldout_returns` is the paper's own
+table of scores. Nothing here runs a policy or needs a simulator; matplotlib is imported when a figure is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from evopolicy_coordinator.analysis.comparability import MixedRunsError, mixtures
+from evopolicy_coordinator.analysis.edits import classify, edit_rates
+from evopolicy_coordinator.analysis.paper import heldout_returns
+from evopolicy_coordinator.analysis.ranking import leaderboard
+from evopolicy_coordinator.analysis.reader import load_runs
+from evopolicy_coordinator.analysis.records import Run, Submit, rows
+from evopolicy_coordinator.analysis.report_tables import tables_of
+from evopolicy_coordinator.analysis.scores import score_table
+from evopolicy_coordinator.analysis.study import Study, study, study_of
+from evopolicy_coordinator.analysis.trace import trace
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from evopolicy_coordinator.analysis.figures.style import Plot
+
+__all__ = [
+    "MixedRunsError",
+    "Run",
+    "Study",
+    "Submit",
+    "classify",
+    "edit_rates",
+    "figures_of",
+    "heldout_returns",
+    "leaderboard",
+    "load_runs",
+    "mixtures",
+    "rows",
+    "score_table",
+    "study",
+    "study_of",
+    "tables_of",
+    "trace",
+    "write_report",
+]
+
+
+def figures_of(found: Study) -> Iterator[Plot]:
+    """The report's figures, drawn one after another; see `figures.figures_of`."""
+    from evopolicy_coordinator.analysis.figures import figures_of as draw
+
+    return draw(found)
+
+
+def write_report(found: Study, out: Path, *, title: str | None = None) -> Path:
+    """Writes the report of `found` into the folder `out` and returns its `index.html`; see `write.write_report`."""
+    from evopolicy_coordinator.analysis.write import write_report as write
+
+    return write(found, out, title=title)

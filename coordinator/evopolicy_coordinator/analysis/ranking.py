@@ -137,8 +137,9 @@ def _scores(cells: Mapping[tuple[str, str], CellResult], table: ScoreTable, entr
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
+    """Rounded where floats of equal rank sums differ, so that equal standings stay ties."""
     known = [value for value in values if value is not None]
-    return fmean(known) if known else None
+    return round(fmean(known), 12) if known else None
 
 
 def _standing(

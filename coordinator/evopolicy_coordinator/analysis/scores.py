@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from statistics import fmean
 
 import msgspec
@@ -191,8 +191,3 @@ def _number(value: str, source: str, line: int) -> float:
     if not math.isfinite(number):
         raise ConfigError(f"{source}, line {line}: {value!r} is no score")
     return number
-
-
-def means(table: ScoreTable) -> Mapping[str, dict[str, float | None]]:
-    """Environment to entry to mean."""
-    return {env: table.column(env) for env in table.environments}

@@ -14,6 +14,7 @@ from typing import Any
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 INK = "#15181d"
 MUTED = "#5c6773"
@@ -88,10 +89,19 @@ def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, An
         return figure, figure.subplots(squeeze=False, **subplots)
 
 
+def _settle(figure: Figure) -> None:
+    """Lays the figure out once and for all: every layout pass moves it a little, and both files should show the same."""
+    if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
+        for _ in range(2):
+            figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+
 def svg_text(figure: Figure, name: str) -> str:
     """The figure as a stand-alone SVG: text as text, transparent background, the same bytes for the same figure."""
     out = io.StringIO()
     with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
+        _settle(figure)
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     return out.getvalue()
 
@@ -100,6 +110,7 @@ def png_bytes(figure: Figure) -> bytes:
     """The figure as PNG on white."""
     out = io.BytesIO()
     with matplotlib.rc_context(RC):
+        _settle(figure)
         figure.savefig(out, format="png", dpi=PNG_DPI, facecolor="white")
     return out.getvalue()
 

@@ -130,7 +130,9 @@ def test_edit_sizes_are_binned_with_unchanged_bundles_apart(tmp_path: Path) -> N
     assert bins["unchanged"].n == 2
     assert bins["unchanged"].p_validation == 0.0
     assert bins["unchanged"].visible_improved == 0
-    small = bins["1–5"]  # two constants changed, the integral added (three lines), and taken away with a constant
+    small = bins[
+        "1–5"
+    ]  # two constants changed, the integral added (three lines), and taken away with a constant
     assert (small.n, small.validation_improved, small.visible_improved) == (4, 2, 2)
     assert bins["6–20"].n == 1
     assert sum(row.n for row in bins.values()) == 7

@@ -1,0 +1,234 @@
+"""`evopolicy report` end to end on synthetic run directories: files, refusals, damaged input, hostile input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+from run_dirs import AGENTS, Version, png, policy, write_run, write_suite
+from typer.testing import CliRunner
+
+from evopolicy_coordinator.analysis import figures_of, paper, rows, study, write_report
+from evopolicy_coordinator.report_cli import app
+
+ENVIRONMENTS = ("gym/acrobot", "gym/racing", "gymnasium/MiniGrid-FourRooms-v0", "toy/line")
+MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d703431")
+"""The first box of a video file: enough to be copied and linked."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    write_suite(folder, environments=ENVIRONMENTS, repeats=2, n_submits=6)
+    damaged = folder / "Tern" / "gym_racing" / "exp-1" / "run.json"
+    damaged.write_bytes(damaged.read_bytes()[:300])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out") / "report"
+    result = CliRunner().invoke(app, [str(runs), "--out", str(out), "--jobs", "1", "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["runs"], len(found["left_out"])) == (31, 1)
+    assert found["index"] == str(out / "index.html")
+    return out
+
+
+class Links(HTMLParser):
+    """Ids, links and sources of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.targets: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id" and value:
+                self.ids.append(value)
+            if name in ("href", "src", "xlink:href") and value:
+                self.targets.append(value)
+
+
+def links_of(page: Path) -> Links:
+    parser = Links()
+    parser.feed(page.read_text(encoding="utf-8"))
+    return parser
+
+
+def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
+    tables = {path.stem for path in (report / "tables").glob("*.csv")}
+    assert tables >= {
+        "leaderboard_core16", "heldout_core16", "cells_core16", "normalised_core16", "leaderboard_toy", "evolution",
+        "edit_types", "structure", "edit_sizes", "tokens", "audit", "left_out",
+    }  # fmt: skip
+    for suffix in ("md", "tex"):
+        assert {path.stem for path in (report / "tables").glob(f"*.{suffix}")} == tables
+    figures = {path.stem for path in (report / "figures").glob("*.svg")}
+    assert figures >= {
+        "rank_scores_core16", "score_evolution_core16", "normalised_core16", "edit_hits", "edit_size", "structure", "tokens",
+        "wall_time", "timeline_gym_acrobot", "timeline_toy_line",
+    }  # fmt: skip
+    assert {path.stem for path in (report / "figures").glob("*.png")} == figures
+    data = json.loads((report / "report.json").read_text())
+    assert set(data["figures"]) == figures
+    assert set(data["tables"]) == tables
+    assert len(data["runs"]) == 31
+    assert all(data["figures"][name]["data"] for name in figures)
+
+
+def test_every_link_and_image_of_every_page_resolves(report: Path) -> None:
+    pages = sorted(report.rglob("*.html"))
+    assert len(pages) == 1 + 31
+    ids = {page.resolve(): links_of(page).ids for page in pages}
+    for page in pages:
+        found = links_of(page)
+        assert len(found.ids) == len(set(found.ids)), f"{page} repeats an id"
+        for target in found.targets:
+            assert not re.match(r"(https?:)?//", target), f"{page} reaches out to {target}"
+            if target.startswith("data:"):
+                continue
+            path, _, fragment = unquote(target).partition("#")
+            there = (page.parent / path).resolve() if path else page.resolve()
+            assert there.is_file(), f"{page} links to {target}"
+            if fragment and there.suffix == ".html":
+                assert fragment in ids[there], f"{page} links to {target}"
+
+
+def test_index_is_self_contained(report: Path) -> None:
+    text = (report / "index.html").read_text()
+    assert not re.search(r"<(?:img|script|link|iframe)[^>]+(?:src|href)=\"(?!data:)", text)
+    assert "@import" not in text
+    assert text.count('<svg role="img"') == len(list((report / "figures").glob("*.svg")))
+
+
+def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
+    (row,) = csv.DictReader((report / "tables/left_out.csv").read_text().splitlines())
+    assert row["path"].endswith("Tern/gym_racing/exp-1")
+    assert row["reason"].startswith("run.json")
+    assert row["path"] in (report / "index.html").read_text()
+
+
+def test_report_is_the_same_twice(runs: Path, report: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path / "again"), "--jobs", "1"])
+    assert result.exit_code == 0
+    for page in report.rglob("*"):
+        if page.is_file():
+            assert (tmp_path / "again" / page.relative_to(report)).read_bytes() == page.read_bytes(), page
+
+
+def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None:
+    source = tmp_path / "table.csv"
+    source.write_text(paper.text("table1_heldout_returns"))
+    result = CliRunner().invoke(app, [str(source), "--out", str(tmp_path / "report")])
+    assert result.exit_code == 0, result.output
+    written = list(
+        csv.DictReader((tmp_path / "report/tables/leaderboard_core16.csv").read_text().splitlines())
+    )
+    for row, printed in zip(written, paper.rows("table2_aggregate"), strict=True):
+        assert row["entry"] == printed["entry"]
+        assert f"{float(row['score']):.3f}" == printed["core16"]
+        assert (row["wins"], row["top2"]) == (printed["wins"], printed["top2"])
+
+
+def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> None:
+    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
+    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 2.0)], entry="Other", scope="submit")
+    arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 3
+    assert "policy scope on core16: episode (1 run), submit (1 run)" in refused.output
+    assert not (tmp_path / "report").exists()
+    told = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
+    assert told.exit_code == 0
+    assert "policy scope on core16" in (tmp_path / "report/index.html").read_text()
+
+
+def test_nothing_to_report_writes_nothing_and_says_why(tmp_path: Path) -> None:
+    (tmp_path / "runs/x/workspace").mkdir(parents=True)
+    (tmp_path / "runs/x/logs").mkdir()
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code == 1
+    assert "half-finished" in result.output
+    assert not (tmp_path / "report").exists()
+
+
+def test_folder_with_other_files_is_not_written_to(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    result = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "thesis.txt" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_hostile_names_sources_and_messages_are_shown_as_text(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>"
+    source = {"policy.py": f'"""{evil}</pre>"""\n\n\nclass Policy:\n    pass\n'}
+    versions = [
+        Version(source, (1.0,), 1.0, says=evil),
+        Version({"policy.py": source["policy.py"] + "x = 1\n"}, (1.0,), 2.0, says=f"{evil} again"),
+    ]
+    write_run(tmp_path / "runs", versions, entry="$\\frac{<b>evil</b> & co", exp_id="e")
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code == 0, result.output
+    for page in (tmp_path / "report").rglob("*.html"):
+        text = page.read_text()
+        assert evil not in text
+        assert "<b>evil" not in text
+
+
+def test_replays_are_copied_and_missing_ones_said(tmp_path: Path) -> None:
+    for entry in ("A", "B"):
+        folder = write_run(
+            tmp_path / "runs",
+            [Version(policy(), (1.0,), 1.0)],
+            entry=entry,
+            replays={"heldout_000/video.mp4": MP4, "heldout_001/video.mp4": MP4},
+        )
+    (folder / "replays/heldout_001/video.mp4").unlink()
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code == 0, result.output
+    page = tmp_path / "report/replays/gym-acrobot.html"
+    text = page.read_text()
+    assert text.count("<video") == 3
+    assert "its file is missing" in text
+    assert 'href="replays/gym-acrobot.html"' in (tmp_path / "report/index.html").read_text()
+    assert all(
+        (page.parent / target).exists() for target in links_of(page).targets if target.startswith("media")
+    )
+
+
+def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "secret.png").write_bytes(png())
+    folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], replays={"a.mp4": MP4})
+    record = json.loads((folder / "run.json").read_text())
+    record["artifacts"]["replays"][0]["path"] = "../../../../secret.png"
+    (folder / "run.json").write_text(json.dumps(record))
+    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    assert not list((tmp_path / "report").rglob("*.png.*"))
+    assert "its file is missing" in (tmp_path / "report/replays/gym-acrobot.html").read_text()
+
+
+def test_run_without_any_ok_submit_is_in_the_report(tmp_path: Path) -> None:
+    write_run(tmp_path / "runs", [Version({"policy.py": "import x\n"}, (0.0,), None, "import_error")])
+    write_run(tmp_path / "runs", [], entry="Idle")
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code == 0, result.output
+    board = list(csv.DictReader((tmp_path / "report/tables/heldout_core16.csv").read_text().splitlines()))
+    assert [row["gym/acrobot"] for row in board] == ["-500.0", "", ""]
+
+
+def test_notebook_example_of_the_package_works(runs: Path, tmp_path: Path) -> None:
+    found = study([runs])
+    core16 = next(suite for suite in found.suites if suite.name == "core16")
+    assert [row.entry for row in core16.board.standings][-1] == "Random policy"
+    assert {row["entry"] for row in rows(found.evolutions)} == set(AGENTS)
+    assert next(figures_of(found)).name == "rank_scores_core16"
+    assert write_report(found, tmp_path / "report", title="Mine").is_file()

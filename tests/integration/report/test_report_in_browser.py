@@ -1,0 +1,162 @@
+"""The report in a real headless Chromium: no console errors, images load, sorting, filtering and themes work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from browser import Page
+from run_dirs import write_suite
+from typer.testing import CliRunner
+
+from evopolicy_coordinator.report_cli import app
+
+COLUMN = """(() => {
+  const table = document.getElementById(%r);
+  return [...table.tBodies[0].rows].filter((row) => !row.hidden).map((row) => row.cells[%d].textContent.trim());
+})()"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("browser")
+    write_suite(folder / "runs", environments=("gym/acrobot", "gym/racing", "gym/ant5"), n_submits=6)
+    result = CliRunner().invoke(app, [str(folder / "runs"), "--out", str(folder / "report"), "--jobs", "1"])
+    assert result.exit_code == 0, result.output
+    return folder / "report"
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page() as found:
+        yield found
+
+
+@pytest.fixture
+def index(page: Page, report: Path) -> Page:
+    page.look()
+    page.problems.clear()
+    page.open(report / "index.html")
+    return page
+
+
+def column(page: Page, table: str, place: int) -> list[str]:
+    return page.run(COLUMN % (table, place))
+
+
+def click_header(page: Page, table: str, place: int) -> str:
+    header = f"document.getElementById({table!r}).tHead.rows[0].cells[{place}]"
+    return page.run(f"{header}.querySelector('button').click(), {header}.getAttribute('aria-sort')")
+
+
+def test_every_page_opens_without_console_problems_and_with_its_images(page: Page, report: Path) -> None:
+    page.problems.clear()
+    for path in sorted(report.rglob("*.html")):
+        page.open(path)
+        broken = page.run(
+            "Promise.all([...document.images].map((image) => { image.loading = 'eager'; return image.decode().then(() => null, "
+            "() => image.src); })).then((found) => found.filter(Boolean))"
+        )
+        assert broken == [], path
+        assert page.run("document.querySelector('h1').textContent.length") > 3
+    assert page.problems == []
+
+
+def test_clicking_a_header_sorts_by_numbers_both_ways_with_empty_cells_last(index: Page) -> None:
+    table = "evolution-table"
+    headers = index.run(
+        f"[...document.getElementById('{table}').tHead.rows[0].cells].map((cell) => cell.textContent)"
+    )
+    area, to_80 = headers.index("Area"), headers.index("To 80 % (episodes)")
+    assert click_header(index, table, area) == "descending"
+    values = [float(text) for text in column(index, table, area)]
+    assert values == sorted(values, reverse=True)
+    assert click_header(index, table, area) == "ascending"
+    assert [float(text) for text in column(index, table, area)] == sorted(values)
+    for _ in range(2):
+        click_header(index, table, to_80)
+        dashes = [text == "–" for text in column(index, table, to_80)]
+        assert dashes == sorted(dashes)
+        assert any(dashes)
+    assert index.run("document.querySelectorAll('#evolution-table [aria-sort]').length") == 1
+
+
+def test_clicking_a_text_header_sorts_by_name(index: Page) -> None:
+    click_header(index, "evolution-table", 1)
+    names = column(index, "evolution-table", 1)
+    assert names == sorted(names, key=str.casefold)
+
+
+def test_filter_keeps_rows_with_every_word_and_counts_them(index: Page) -> None:
+    index.run(
+        "(() => { const input = document.querySelector('[data-filter=evolution-table]'); input.value = 'carracing KES'; "
+        "input.dispatchEvent(new Event('input')); })()"
+    )
+    assert column(index, "evolution-table", 0) == ["CarRacing"]
+    assert column(index, "evolution-table", 1) == ["Kestrel"]
+    assert index.run("document.getElementById('evolution-table-count').textContent") == "1 of 12 rows"
+
+
+def test_timeline_picker_shows_one_environment_or_all(index: Page) -> None:
+    shown = "[...document.querySelectorAll('figure[data-timeline]')].filter((f) => !f.hidden).map((f) => f.dataset.timeline)"
+    assert index.run(shown) == ["gym/acrobot"]
+    choose = "(() => {{ const p = document.getElementById('timeline-picker'); p.value = {!r}; p.dispatchEvent(new Event('change')); }})()"
+    index.run(choose.format("gym/ant5"))
+    assert index.run(shown) == ["gym/ant5"]
+    index.run(choose.format(""))
+    assert len(index.run(shown)) == 3
+
+
+def test_dark_theme_follows_the_system_and_the_button(index: Page) -> None:
+    background = "getComputedStyle(document.body).backgroundColor"
+    ink = "getComputedStyle(document.querySelector('figure svg text')).fill"
+    light = index.run(background), index.run(ink)
+    index.look(dark=True)
+    dark = index.run(background), index.run(ink)
+    assert light[0] == "rgb(255, 255, 255)"
+    assert dark[0] != light[0]
+    assert dark[1] != light[1]
+    index.run("document.getElementById('theme').click()")
+    assert index.run("document.documentElement.dataset.theme") == "light"
+    assert (index.run(background), index.run(ink)) == light
+    index.run("document.getElementById('theme').click()")
+    index.run("document.getElementById('theme').click()")
+
+
+def test_page_fits_a_phone_without_sideways_scrolling(page: Page, report: Path) -> None:
+    page.look(width=390, height=800, phone=True)
+    for path in [report / "index.html", *sorted((report / "traces").glob("*.html"))[:2]]:
+        page.open(path)
+        assert page.run("document.documentElement.scrollWidth") <= 390, path
+        assert page.run("window.innerWidth") == 390
+
+
+def test_everything_interactive_has_a_name_and_headings_descend_in_steps(index: Page) -> None:
+    nameless = index.run(
+        "[...document.querySelectorAll('button, input, select, a, figure svg, [role=region]')].filter((e) => "
+        "!(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+    levels = index.run("[...document.querySelectorAll('h1, h2, h3, h4')].map((h) => Number(h.tagName[1]))")
+    assert levels[0] == 1
+    assert all(after - before <= 1 for before, after in pairwise(levels))
+    assert index.run("document.documentElement.lang") == "en"
+
+
+def test_text_has_enough_contrast_in_both_themes(page: Page, report: Path) -> None:
+    script = """(() => {
+      const value = (name) => { const e = document.createElement('i'); e.style.color = `var(--${name})`; document.body.append(e);
+        const rgb = getComputedStyle(e).color.match(/[\\d.]+/g).slice(0, 3).map((c) => c / 255); e.remove();
+        const [r, g, b] = rgb.map((c) => c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+      const ratio = (a, b) => { const [x, y] = [value(a), value(b)].sort((p, q) => q - p); return (x + 0.05) / (y + 0.05); };
+      return [['ink', 'bg'], ['muted', 'bg'], ['link', 'bg'], ['ink', 'panel'], ['muted', 'panel'], ['link', 'panel'],
+        ['ink', 'ins'], ['ink', 'del'], ['muted', 'hunk'], ['ink', 'warn-bg']].map(([a, b]) => [a, b, ratio(a, b)]);
+    })()"""
+    for dark in (False, True):
+        page.look(dark=dark)
+        page.open(report / "index.html")
+        for front, back, ratio in page.run(script):
+            assert ratio >= 4.5, (front, back, ratio, "dark" if dark else "light")

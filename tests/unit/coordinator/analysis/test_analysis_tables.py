@@ -1,0 +1,187 @@
+"""Tables in their written forms, the palette, phases, and the agent's log."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+from run_dirs import Version, png, policy, write_run
+
+from evopolicy_coordinator.analysis.agent_log import read_agent_log
+from evopolicy_coordinator.analysis.edits import classify
+from evopolicy_coordinator.analysis.figures.edits import wilson
+from evopolicy_coordinator.analysis.figures.style import inline_svg, new_figure, svg_text
+from evopolicy_coordinator.analysis.palette import looks
+from evopolicy_coordinator.analysis.phases import events_of, phases
+from evopolicy_coordinator.analysis.reader import read_run
+from evopolicy_coordinator.analysis.tables import Column, Table, best_marks, to_csv, to_latex, to_markdown
+from evopolicy_coordinator.analysis.trace import diff, trace
+
+ROWS = (
+    {"who": "A & B_1", "x": 1.23456, "share": 0.5, "n": 3},
+    {"who": "C|D", "x": None, "share": 0.126, "n": 0},
+    {"who": "E", "x": -0.0001, "share": None, "n": 3},
+)
+TABLE = Table(
+    name="t",
+    title="A table",
+    caption="50 % of it.",
+    columns=(
+        Column(key="who", title="Agent"),
+        Column(key="x", title="Score", kind="number", digits=2),
+        Column(key="share", title="Share", kind="percent"),
+        Column(key="n", title="Runs", kind="integer"),
+    ),
+    rows=ROWS,
+    marks=best_marks(ROWS, ["x", "n"]),
+)
+
+
+def test_csv_keeps_full_precision_and_empty_fields() -> None:
+    found = list(csv.DictReader(io.StringIO(to_csv(TABLE))))
+    assert found[0] == {"who": "A & B_1", "x": "1.23456", "share": "0.5", "n": "3"}
+    assert found[1]["x"] == ""
+
+
+def test_markdown_marks_best_and_second_and_escapes_pipes() -> None:
+    lines = to_markdown(TABLE).splitlines()
+    assert "| A & B_1 | **1.23** | 50 % | **3** |" in lines
+    assert "| C\\|D | – | 13 % | 0 |" in lines
+    assert "| E | *0.00* | – | **3** |" in lines
+
+
+def test_latex_escapes_and_marks() -> None:
+    text = to_latex(TABLE)
+    assert "A \\& B\\_1 & \\textbf{1.23} & 50 \\% & \\textbf{3} \\\\" in text
+    assert "E & \\underline{0.00} & -- & \\textbf{3} \\\\" in text
+    assert "\\begin{tabular}{lrrr}" in text
+    assert "\\caption{50 \\% of it.}" in text
+
+
+def test_equal_best_values_share_the_mark_and_leave_no_second() -> None:
+    assert best_marks([{"x": 1.0}, {"x": 1.0}, {"x": 0.0}], ["x"]) == {(0, "x"): 1, (1, "x"): 1}
+    assert best_marks([{"x": 1.0}], ["x"]) == {}
+
+
+def test_agents_looks_follow_their_names_and_stay_distinct() -> None:
+    many = [f"agent {i:02d}" for i in range(25)]
+    found = looks(many, "Random policy")
+    assert found == looks(list(reversed(many)), "Random policy")
+    assert len({(look.colour, str(look.dash)) for look in found.values()}) == 26
+
+
+def test_phases_join_adjacent_edits_and_pass_over_events(tmp_path: Path) -> None:
+    versions = [
+        Version(policy(gain=1.0), (0.0,) * 4, 1.0),
+        Version(policy(gain=2.0), (0.0,) * 4, 2.0),
+        Version(policy(gain=2.0), (0.0,) * 4, 2.0),  # retest inside the parametric phase
+        Version(policy(gain=3.0), (0.0,) * 4, 1.5),
+        Version(policy(gain=3.0, planner=True), (0.0,) * 4, 3.0),
+        Version(policy(gain=3.0), (0.0,) * 4, 1.5),  # rollback
+    ]
+    found = classify(read_run(write_run(tmp_path, versions)).submits)
+    assert phases(found) == [(0, 4, "first"), (4, 16, "parametric"), (16, 24, "synthesis")]
+    assert [events_of(t) for t in found] == [
+        ["hit"], ["hit"], ["miss", "retest"], ["miss"], ["hit"], ["miss", "rollback"],
+    ]  # fmt: skip
+
+
+def test_wilson_interval_is_the_published_one() -> None:
+    low, high = wilson(10, 20)
+    assert (round(low, 3), round(high, 3)) == (0.299, 0.701)
+    assert wilson(0, 5)[0] == 0.0
+    assert wilson(5, 5)[1] == 1.0
+
+
+def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
+    figure, axes = new_figure(2.0, 1.0)
+    axes[0][0].plot([0, 1], [0, 1])
+    axes[0][0].set_title("cost in $ of a_b$")
+    svg = svg_text(figure, "a")
+    assert svg == svg_text(figure, "a")
+    one, two = inline_svg(svg, "a", 'an "alt" <text>'), inline_svg(svg, "b", "b")
+    assert 'aria-label="an &quot;alt&quot; &lt;text>"' in one
+    assert "var(--ink)" in one
+    assert "cost in $ of a_b$" in one
+    ids = [{part.split('"')[0] for part in text.split(' id="')[1:]} for text in (one, two)]
+    assert ids[0]
+    assert not ids[0] & ids[1]
+
+
+SAID = [
+    Version(policy(gain=1.0), (0.0,) * 4, 1.0, says="I start simple."),
+    Version(policy(gain=2.0), (0.0,) * 4, 2.0, says="It is too slow.", images={"probe.png": png()}),
+    Version({"policy.py": "import nope\n"}, (0.0,), None, "import_error"),
+    Version(policy(gain=2.5), (0.0,) * 4, 3.0, says="Back to work."),
+]
+
+
+@pytest.mark.parametrize("form", ["claude", "codex"])
+def test_log_gives_each_submit_what_was_read_and_said_before_it(tmp_path: Path, form: str) -> None:
+    run = read_run(write_run(tmp_path, SAID, log=form))
+    found = trace(run)
+    evidence = [row.evidence for row in found.rows]
+    assert all(one is not None for one in evidence)
+    assert [one.attribution for one in evidence if one] == [
+        "I start simple.",
+        "It is too slow.",
+        "",
+        "Back to work.",
+    ]
+    assert evidence[0].read == ()
+    assert evidence[1].read[0] == "feedback/submit_000/summary.json"
+    assert [path.name for path in found.rows[1].images] == ["probe.png"]
+    assert found.unplaced == ()
+
+
+def test_log_without_answers_or_times_is_not_guessed_into_place(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, SAID, log="turns"))
+    reading = read_agent_log(run.path / "logs/agent.jsonl", run.submits)
+    assert reading.by_submit == {}
+    assert reading.unplaced == ("I start simple.", "It is too slow.", "submit 2", "Back to work.")
+
+
+def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, SAID[:2], log=None))
+    log = tmp_path / "agent.jsonl"
+    lines = [
+        {"turn": 0, "text": "early", "timestamp": "2020-01-01T00:00:00Z"},
+        {"turn": 1, "text": "between", "timestamp": run.submits[1].started_at},
+        {"turn": 2, "text": "late", "timestamp": "2040-01-01T00:00:00Z"},
+    ]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    reading = read_agent_log(log, run.submits)
+    assert {index: one.messages for index, one in reading.by_submit.items()} == {
+        0: ("early",),
+        1: ("between",),
+    }
+    assert reading.unplaced == ("late",)
+
+
+def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, SAID[:1], log=None))
+    log = tmp_path / "agent.jsonl"
+    strange = [
+        b"\xff\xfe",
+        b"[1, 2]",
+        b'{"type": 7}',
+        b'{"type": "assistant", "message": [1]}',
+        b"[" * 100_000,
+        b'"text"',
+    ]
+    strange.append(b'{"raw": "{\\"turn\\": 1, \\"text\\": \\"hello\\"}"}')
+    strange.append(b'{"type": "item.completed", "item": {"type": "command_execution", "command": null}}')
+    log.write_bytes(b"\n".join(strange))
+    assert read_agent_log(log, run.submits).unplaced == ("hello",)
+    assert read_agent_log(tmp_path / "absent", run.submits).unplaced == ()
+
+
+def test_diff_shows_changed_files_policy_first() -> None:
+    before = {"a.py": "x = 1\n", "policy.py": "import a\n"}
+    after = {"b.py": "y = 1\n", "policy.py": "import b\n"}
+    found = diff(before, after)
+    assert [one.path for one in found] == ["policy.py", "a.py", "b.py"]
+    assert found[0].lines == ("@@ -1 +1 @@", "-import a", "+import b")
