@@ -46,6 +46,10 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     last_mean: float | None = None
     best_mean: float | None = None
     """Highest visible mean return so far."""
+    in_flight_s: float = 0.0
+    """Seconds in which a submit was in flight."""
+    feedback_s: float = 0.0
+    """Of these, from the last result's arrival to the committed feedback."""
     spent: bool = False
     """No further submit can be taken, and none runs."""
 

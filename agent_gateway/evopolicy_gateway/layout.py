@@ -92,12 +92,16 @@ class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):
-    """Hashes (SHA-256, hex) of what a workspace started with."""
+    """What a workspace started with, for `run.json`. Hashes are SHA-256, hex."""
 
     agents_md_hash: str
     """Of the rules, with placeholders for the URLs: equal for runs with equal rules."""
     initial_policy_hash: str
     """Of `system/policy.py`."""
+    n_train: int
+    """Train cases."""
+    min_episodes_per_submit: int
+    max_episodes_per_submit: int
 
 
 def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:

@@ -18,6 +18,7 @@ import typer
 from evopolicy_common.cli import fail_on_our_errors, setup_logging
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
+from evopolicy_gateway.command_line import run_app
 from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed
 from evopolicy_gateway.gateway import Close, Gateway, folder_of
 from evopolicy_gateway.layout import RunFolder
@@ -115,6 +116,8 @@ def progress_of(desk: Desk) -> Progress:
         last_status=settled[-1].status if settled else None,
         last_mean=_mean_of(settled[-1].summary) if settled else None,
         best_mean=max(means, default=None),
+        in_flight_s=round(desk.in_flight_s, 3),
+        feedback_s=round(desk.feedback_s, 3),
         spent=desk.spent,
     )
 
@@ -132,7 +135,7 @@ def _mean_of(summary: bytes | None) -> float | None:
 
 def main() -> None:
     """The console script."""
-    app()
+    run_app(app)
 
 
 if __name__ == "__main__":

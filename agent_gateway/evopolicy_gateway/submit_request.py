@@ -47,7 +47,7 @@ def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
             _refuse_count(len(wanted), bounds)
         ids = tuple(_listed(item, index, bounds) for index, item in enumerate(wanted))
     elif isinstance(wanted, str):
-        ids = _from_text(wanted, bounds)
+        ids = ids_in(wanted, bounds)
     else:
         _budget(f"{_FIELD} is {_kind(wanted)}; send a list of train ids or a text of ranges: {_FORM}")
     _check_count(len(ids), bounds)
@@ -83,7 +83,8 @@ def _listed(item: object, index: int, bounds: Bounds) -> int:
     return item
 
 
-def _from_text(text: str, bounds: Bounds) -> tuple[int, ...]:
+def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
+    """The ids of a text of ids and ranges, at most `bounds.max_episodes`; none for an empty text. RequestError."""
     if not text.strip():
         return ()
     ranges: list[range] = []

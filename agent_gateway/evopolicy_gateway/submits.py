@@ -79,6 +79,10 @@ class Desk:
         self.tickets: list[Ticket] = []
         """Accepted submits by index, then perhaps one that is not yet."""
         self.n_rejected = 0
+        self.in_flight_s = 0.0
+        """Seconds in which a submit was in flight, of this process."""
+        self.feedback_s = 0.0
+        """Of these, from the last result's arrival to the committed feedback."""
         self._session = session
         self._workspace = workspace
         self._journal = journal
@@ -218,6 +222,7 @@ class Desk:
         self._on_change()
 
     async def _carry_out(self, ticket: Ticket, *, fresh: bool) -> None:
+        started = time.monotonic()
         try:
             if fresh:
                 await self._snapshot(ticket)
@@ -236,6 +241,7 @@ class Desk:
         except Exception as error:
             self._give_up(ticket, error)
             return
+        self.in_flight_s += time.monotonic() - started
         self.in_flight = None
         self._on_change()
 
@@ -334,7 +340,10 @@ class Desk:
             await self._write_page(tree, page, first, scores)
             ticket.n_done, ticket.waits_for = len(scores), page.waits_for
             self._on_change()
-        return await asyncio.to_thread(self._commit, tree, index, done, scores)
+        last_result = time.monotonic()
+        committed = await asyncio.to_thread(self._commit, tree, index, done, scores)
+        self.feedback_s += time.monotonic() - last_result
+        return committed
 
     async def _write_page(
         self, tree: SubmitTree, page: ResultsPage, first: int, scores: dict[int, EpisodeScore]

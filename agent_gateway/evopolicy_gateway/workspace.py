@@ -24,7 +24,11 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
     write_atomically(folder.system / "policy.py", policy)
     write_atomically(folder.workspace / "AGENTS.md", agents_md(run, urls).encode(), mode=0o444)
     staged = Staged(
-        agents_md_hash=digest_of(agents_md(run, NO_URLS).encode()), initial_policy_hash=digest_of(policy)
+        agents_md_hash=digest_of(agents_md(run, NO_URLS).encode()),
+        initial_policy_hash=digest_of(policy),
+        n_train=run.n_env_instances,
+        min_episodes_per_submit=run.min_episodes_per_submit,
+        max_episodes_per_submit=run.max_episodes_per_submit,
     )
     save(folder.staged, staged)
     return staged

@@ -1,0 +1,103 @@
+"""Child processes of an operator's command: on a leash, in a session of their own, with their log in a file.
+
+They are in sessions of their own so that Ctrl-C reaches the command alone, which then ends them in order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+
+from evopolicy_gateway.control import AnyEvent, Order, event_of, line
+from evopolicy_gateway.leash import leashed
+
+_LINE_LIMIT = 4 << 20
+
+live: set[int] = set()
+"""Ids of the running children of this process, which its search for orphans leaves alone."""
+
+
+class Child:
+    """A running child. Start it on the main thread: its leash is that thread's life."""
+
+    def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
+        self._process = process
+        self.log = log
+        live.add(process.pid)
+
+    @classmethod
+    async def start(cls, program: Sequence[str], log: Path, *, talks: bool = False) -> Child:
+        """Starts `program` with stderr appended to `log`; `talks`: it speaks the lines of `control.py`."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
+        with log.open("ab") as out:
+            process = await asyncio.create_subprocess_exec(
+                *leashed(program),
+                stdin=pipe,
+                stdout=pipe,
+                stderr=out,
+                start_new_session=True,
+                limit=_LINE_LIMIT,
+                env={
+                    name: value for name, value in os.environ.items() if not name.startswith("EVOPOLICYGYM_")
+                },
+            )
+        return cls(process, log)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.returncode
+
+    async def events(self) -> AsyncIterator[AnyEvent]:
+        """What it says, until it ends."""
+        assert self._process.stdout is not None
+        while data := await self._process.stdout.readline():
+            yield event_of(data)
+
+    async def tell(self, order: Order) -> None:
+        """Gives an order; one to a child that is gone is dropped."""
+        stdin = self._process.stdin
+        assert stdin is not None
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            stdin.write(line(order))
+            await stdin.drain()
+
+    async def ended(self) -> int:
+        """Its exit status."""
+        code = await self._process.wait()
+        live.discard(self.pid)
+        return code
+
+    async def end(self, grace_s: float) -> None:
+        """SIGTERM, and SIGKILL after `grace_s` seconds. Nothing when it is gone already."""
+        if self._process.returncode is None:
+            self._signal(signal.SIGTERM)
+            try:
+                async with asyncio.timeout(grace_s):
+                    await self.ended()
+            except TimeoutError:
+                self._signal(signal.SIGKILL)
+        await self.ended()
+
+    def last_words(self) -> str:
+        """The last line of its log, for a message about why it ended."""
+        try:
+            with self.log.open("rb") as file:
+                file.seek(max(0, self.log.stat().st_size - 4096))
+                lines = file.read().decode("utf-8", "replace").strip().splitlines()
+        except OSError:
+            return ""
+        return lines[-1] if lines else ""
+
+    def _signal(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(number)

@@ -1,0 +1,300 @@
+"""`evopolicy`: the front door. Plays runs, and whole local clusters with them; other rooms add subcommands.
+
+Exit codes: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without an ok submit, 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+
+from evopolicy_common import catalogue
+from evopolicy_common.cli import fail, fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway import harnesses, options, trials
+from evopolicy_gateway.command_line import run_app
+from evopolicy_gateway.options import RunOptions
+from evopolicy_gateway.play import Plan
+from evopolicy_gateway.runs import Cluster, exit_code, play_all
+from evopolicy_gateway.runs import report as report_runs
+
+COMMANDS_GROUP = "evopolicy.commands"
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback()
+def evopolicy() -> None:
+    """Evaluates agents that evolve policies: opens runs, plays them, and tells what they came to."""
+
+
+Entry = Annotated[str | None, typer.Option(help="Name of the leaderboard entry; default: the agent's.")]
+Model = Annotated[str | None, typer.Option(help="Name of the model behind the agent; default: the entry's.")]
+ExpId = Annotated[str | None, typer.Option(help="Name of this experiment; default: the time.")]
+Repeat = Annotated[int, typer.Option(min=0, help="Which repeat of the same agent and environment this is.")]
+Budget = Annotated[int | None, typer.Option(min=1, help="Train episodes; default: the suite's.")]
+MinEpisodes = Annotated[int | None, typer.Option(min=1, help="Fewest episodes of a submit.")]
+MaxEpisodes = Annotated[int | None, typer.Option(min=1, help="Most episodes of a submit.")]
+Validation = Annotated[int | None, typer.Option(min=1, help="Hidden validation cases.")]
+Heldout = Annotated[int | None, typer.Option(min=1, help="Hidden held-out cases.")]
+Scope = Annotated[str, typer.Option(help="episode: a fresh Policy each; submit: one through a submit.")]
+Observations = Annotated[str, typer.Option(help="arrays, or lists as in v2.0-draft.")]
+TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
+Video = Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")]
+Wall = Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")]
+Runs = Annotated[Path, typer.Option(help="Folder of run directories.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")]
+Parallel = Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")]
+WALL_S = 12 * 3600.0
+
+
+@app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --connect tcp/10.0.0.5:7447")
+def run(
+    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
+    agent: options.AgentName,
+    connect: options.Connect = None,
+    credentials_file: options.CredentialsFile = None,
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="Bring up a coordinator and a worker here, as `evopolicy local` does."),
+    ] = False,
+    budget: Budget = None,
+    model: Model = None,
+    entry: Entry = None,
+    exp_id: ExpId = None,
+    repeat: Repeat = 0,
+    min_episodes: MinEpisodes = None,
+    max_episodes: MaxEpisodes = None,
+    validation: Validation = None,
+    heldout: Heldout = None,
+    policy_scope: Scope = "episode",
+    observations: Observations = "arrays",
+    tier: TierName = "bwrap",
+    video: Video = "off",
+    limit: options.Limits = None,
+    agent_wall_s: Wall = WALL_S,
+    runs: Runs = Path("runs"),
+    overwrite: Overwrite = False,
+    slots: options.Slots = 2,
+    as_json: options.Json = False,
+) -> None:
+    """Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json."""
+    with fail_on_our_errors():
+        if local and (connect or credentials_file):
+            raise ConfigError(
+                "--local brings up a cluster of its own; it does not go with --connect or --credentials"
+            )
+        given = RunOptions(
+            agent=agent,
+            entry=entry or harnesses.entry_name(agent),
+            model=model,
+            exp_id=exp_id,
+            repeat=repeat,
+            budget=budget,
+            min_episodes=min_episodes,
+            max_episodes=max_episodes,
+            validation=validation,
+            heldout=heldout,
+            policy_scope=policy_scope,
+            observations=observations,
+            tier=tier,
+            video=video,
+            limits=limit or (),
+        )
+        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, overwrite)
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        if local:
+            where = Cluster(local_slots=slots)
+        _play(plans, where, 1, as_json)
+
+
+@app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
+def local(
+    env: Annotated[
+        list[str],
+        typer.Option(
+            help="Suite (core16), suite id or glob (gymnasium/MiniGrid-*); may be repeated.",
+            show_default=False,
+        ),
+    ],
+    agent: options.AgentName,
+    budget: Budget = None,
+    model: Model = None,
+    entry: Entry = None,
+    exp_id: ExpId = None,
+    repeat: Repeat = 0,
+    min_episodes: MinEpisodes = None,
+    max_episodes: MaxEpisodes = None,
+    validation: Validation = None,
+    heldout: Heldout = None,
+    policy_scope: Scope = "episode",
+    observations: Observations = "arrays",
+    tier: TierName = "bwrap",
+    video: Video = "off",
+    limit: options.Limits = None,
+    agent_wall_s: Wall = WALL_S,
+    runs: Runs = Path("runs"),
+    overwrite: Overwrite = False,
+    parallel: Parallel = 1,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    data: options.DataFolder = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
+    with fail_on_our_errors():
+        given = RunOptions(
+            agent=agent,
+            entry=entry or harnesses.entry_name(agent),
+            model=model,
+            exp_id=exp_id,
+            repeat=repeat,
+            budget=budget,
+            min_episodes=min_episodes,
+            max_episodes=max_episodes,
+            validation=validation,
+            heldout=heldout,
+            policy_scope=policy_scope,
+            observations=observations,
+            tier=tier,
+            video=video,
+            limits=limit or (),
+        )
+        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, overwrite)
+        _play(plans, Cluster(local_slots=slots, state=state, data=data), parallel, as_json)
+
+
+@app.command("try", epilog="Example: evopolicy try examples/policies/acrobot --env gym/acrobot --cases 0-3")
+def try_policy(
+    policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
+    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
+    cases: Annotated[str, typer.Option(help="Train ids and ranges.")] = "0-3",
+    out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
+        "tries"
+    ),
+    connect: options.Connect = None,
+    credentials_file: options.CredentialsFile = None,
+    tier: TierName = "bwrap",
+    limit: options.Limits = None,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    data: options.DataFolder = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays a policy on train cases, without a run, an agent or a budget: a first look at what it does.
+
+    Brings up a local cluster unless --connect or --credentials name one. Exit code 1 when the policy failed.
+    """
+    with fail_on_our_errors():
+        trial = trials.Trial(
+            env=options.one_environment(env),
+            policy=policy_dir,
+            split="train",
+            cases=options.cases_of(cases),
+            out=out,
+            tier=options.tier_of(tier),
+            limits=options.limits_of(limit or ()),
+        )
+        where = _trial_cluster(connect, credentials_file, slots, state, data)
+        _exit(asyncio.run(trials.try_policy(trial, where, as_json=as_json)))
+
+
+@app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
+def play_random(
+    env: Annotated[
+        list[str], typer.Option(help="Suite, suite id or glob; may be repeated.", show_default=False)
+    ],
+    split: Annotated[str, typer.Option(help="train, validation or heldout.")] = "heldout",
+    cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
+    connect: options.Connect = None,
+    credentials_file: options.CredentialsFile = None,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    data: options.DataFolder = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays uniform random actions on a split: the reference that scores are held against."""
+    with fail_on_our_errors():
+        chosen = None if cases is None else options.cases_of(cases)
+        if split not in ("train", "validation", "heldout"):
+            raise ConfigError(f"--split {split!r}: there are train, validation, heldout")
+        where = _trial_cluster(connect, credentials_file, slots, state, data)
+        _exit(asyncio.run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+
+
+def _plans(
+    given: RunOptions, env_ids: list[str], runs: Path, wall_limit_s: float, overwrite: bool
+) -> list[Plan]:
+    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
+    started_in = Path.cwd()
+    harnesses.make(given.agent, started_in)
+    exp_id = given.exp_id or options.default_exp_id()
+    plans = [
+        Plan(
+            settings=given.settings(env_id, exp_id),
+            agent=given.agent,
+            runs=runs,
+            started_in=started_in,
+            wall_limit_s=wall_limit_s,
+            overwrite=overwrite,
+        )
+        for env_id in env_ids
+    ]
+    for plan in plans:
+        plan.check()
+    return plans
+
+
+def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
+    console = Console(stderr=as_json)
+    results = asyncio.run(play_all(plans, where, parallel, console))
+    if as_json:
+        print(msgspec.json.format(msgspec.json.encode(results)).decode())
+    else:
+        report_runs(results, console)
+    _exit(exit_code(results))
+
+
+def _trial_cluster(
+    connect: list[str] | None, file: Path | None, slots: int, state: Path | None, data: Path | None
+) -> Cluster:
+    if connect or file:
+        return Cluster(connect=tuple(connect or ()), file=file)
+    return Cluster(local_slots=slots, state=state, data=data)
+
+
+def _exit(code: int) -> None:
+    if code:
+        raise typer.Exit(code)
+
+
+def _add_commands_of_other_rooms(arguments: list[str]) -> None:
+    """Loads a subcommand when it is named, and all of them for the help: what they import may be large, or missing."""
+    found: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=COMMANDS_GROUP)}
+    named = arguments[0] if arguments else "--help"
+    wanted = [found[named]] if named in found else list(found.values()) if named == "--help" else []
+    for point in wanted:
+        try:
+            app.add_typer(point.load(), name=point.name)
+        except ImportError as error:
+            if named == point.name:
+                fail(
+                    f"evopolicy {named} is not installed here ({error}): pip install 'evopolicy[coordinator]'"
+                )
+
+
+def main() -> None:
+    """The console script."""
+    _add_commands_of_other_rooms(sys.argv[1:])
+    run_app(app)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""What an operator's command asks the coordinator: opening and following runs, playing cases outside any run."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from functools import partial
+from pathlib import Path
+
+from evopolicy_common import codec, credentials, keys
+from evopolicy_common.blobs import digest_of
+from evopolicy_common.bundles import Bundle
+from evopolicy_common.credentials import Credentials
+from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.operator import (
+    CancelRun,
+    CreateRun,
+    Done,
+    Evaluate,
+    EvaluationPage,
+    EvaluationPoll,
+    EvaluationStarted,
+    OperatorReply,
+    RunCreated,
+    RunProgress,
+    RunSettings,
+    WaitRun,
+)
+from evopolicy_common.requests import Requester
+from evopolicy_common.transport import Link
+
+WAIT_S = 5.0
+_PATIENCE_S = 10.0
+_SENDER = "operator"
+_WRONG_SETTINGS = frozenset({"invalid_settings", "bad_settings", "invalid_env_instance", "bad_request"})
+_UNAVAILABLE_PAUSE_S = 1.0
+
+
+class Operations:
+    """One operator's link. RefusedError where the coordinator says no, ConfigError where the settings are why."""
+
+    def __init__(self, link: Link) -> None:
+        self._token = link.credentials.token
+        self._requests: Requester[OperatorReply] = Requester(
+            link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
+        )
+
+    async def create(self, settings: RunSettings, key: str) -> RunCreated:
+        """Opens a run; the same key gives the same run."""
+        message = CreateRun(token=self._token, key=key, settings=settings)
+        while True:
+            try:
+                return await self._requests.until_answered(
+                    "create", message, RunCreated, patience_s=_PATIENCE_S
+                )
+            except RefusedError as error:
+                if error.status != "unavailable":
+                    raise _settings_error(error) from error
+            await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
+
+    async def wait(self, run: str) -> AsyncIterator[RunProgress]:
+        """How far the run is, every few seconds; the last one holds the finished run."""
+        while True:
+            message = WaitRun(token=self._token, run=run, wait_s=WAIT_S)
+            progress = await self._requests.until_answered("wait", message, RunProgress, wait_s=WAIT_S)
+            yield progress
+            if progress.finished is not None:
+                return
+
+    async def cancel(self, run: str) -> None:
+        """Ends a run as it is. TransportError when nobody answers soon."""
+        message = CancelRun(token=self._token, run=run)
+        await self._requests.until_answered("cancel", message, Done, patience_s=_PATIENCE_S)
+
+    async def upload(self, bundle: Bundle) -> None:
+        """Brings a bundle to the coordinator."""
+        await self._requests.upload(_SENDER, self._token, bundle.digest, bundle.packed)
+
+    async def fetch(self, ref: BlobRef) -> bytes:
+        """The bytes that `ref` names, checked."""
+        if ref.inline is None:
+            return await self._requests.download(_SENDER, self._token, ref.digest)
+        if digest_of(ref.inline) != ref.digest:
+            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
+        return ref.inline
+
+    async def download(self, digest: str) -> bytes:
+        """A blob by its digest, checked."""
+        return await self._requests.download(_SENDER, self._token, digest)
+
+    async def evaluate(self, message: Evaluate) -> AsyncIterator[tuple[EpisodeOutcome, int, str]]:
+        """Each outcome as it comes, with the number of episodes in all; waiting shows as words in its stead.
+
+        Yields `(outcome, total, "")`. `message.token` may be empty; it is filled in.
+        """
+        asked = Evaluate(
+            **{name: getattr(message, name) for name in message.__struct_fields__} | {"token": self._token}
+        )
+        try:
+            started = await self._requests.until_answered(
+                "evaluate", asked, EvaluationStarted, patience_s=_PATIENCE_S
+            )
+        except RefusedError as error:
+            raise _settings_error(error) from error
+        cursor = 0
+        while True:
+            poll = EvaluationPoll(
+                token=self._token, evaluation=started.evaluation, cursor=cursor, wait_s=WAIT_S
+            )
+            page = await self._requests.until_answered("poll", poll, EvaluationPage, wait_s=WAIT_S)
+            cursor = page.cursor
+            for outcome in page.outcomes:
+                yield outcome, page.total, page.waits_for
+            if page.finished:
+                return
+
+
+def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Credentials, Credentials]:
+    """The operator's credentials, and the gateways' that lie beside them. ConfigError says where it looked."""
+    operator = credentials.find("operator", connect, file)
+    beside = None if file is None else file.parent / "gateway.json"
+    return operator, credentials.find("gateway", connect, beside)
+
+
+def _settings_error(error: RefusedError) -> Exception:
+    return ConfigError(error.message) if error.status in _WRONG_SETTINGS else error

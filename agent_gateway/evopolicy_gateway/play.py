@@ -1,0 +1,248 @@
+"""One run from its opening to `run.json`, as the operator's process sees it.
+
+Order is what counts here: the run is opened, the gateway serves, the agent starts; the agent and all that it started are
+gone before the run is closed; only then hidden cases are scored, and only this process is told. A gateway that dies is
+started again on the same port while the agent goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import sys
+import time
+import uuid
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common import credentials
+from evopolicy_common.credentials import Credentials
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.run_record import RunRecord
+from evopolicy_gateway import children, control, processes, record
+from evopolicy_gateway.children import Child
+from evopolicy_gateway.control import AgentEnded, AgentTurn, CloseRun, Progress, Ready, RunClosed, StartAgent
+from evopolicy_gateway.layout import OpenedRun, RunFolder, run_folder, save
+from evopolicy_gateway.operations import Operations
+from evopolicy_gateway.watch import Watch
+
+LAST_WORDS_S = 10.0
+"""What an agent gets to end by itself once its budget is spent."""
+END_GRACE_S = 15.0
+_QUICK_DEATH_S = 5.0
+_MAX_QUICK_DEATHS = 5
+_USAGE_ERROR = 2
+
+
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """A run to be played."""
+
+    settings: RunSettings
+    agent: str
+    """As `--agent` takes it."""
+    runs: Path
+    started_in: Path
+    wall_limit_s: float
+    """The agent's time, seconds."""
+    overwrite: bool = False
+
+    @property
+    def folder(self) -> RunFolder:
+        return run_folder(self.runs, self.settings.entry, self.settings.env, self.settings.exp_id)
+
+    def check(self) -> None:
+        """ConfigError when the run's folder cannot be had: there is one already that may not be overwritten."""
+        folder = self.folder
+        if not folder.root.exists():
+            return
+        if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):
+            raise ConfigError(f"{folder.root} is not a run's folder; choose another --runs or --exp-id")
+        if not self.overwrite:
+            kind = "a finished" if folder.run_json.exists() else "an unfinished"
+            raise ConfigError(
+                f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite"
+            )
+
+    def claim(self) -> None:
+        """Makes the run's folder, empty. ConfigError as `check`."""
+        self.check()
+        if self.folder.root.exists():
+            shutil.rmtree(self.folder.root)
+        self.folder.root.mkdir(parents=True)
+
+
+class RunError(EvopolicyError):
+    """The run could not be played to its end; its folder and the message tell how far it came."""
+
+
+class RunPlay:
+    """Plays one plan once."""
+
+    def __init__(self, plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> None:
+        """`gateway`: credentials of the gateway role, without a run's capability."""
+        self._plan = plan
+        self._folder = plan.folder
+        self._operations = operations
+        self._credentials = gateway
+        self._watch = watch
+        self._name = plan.settings.env
+        self._ready: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
+        self._spent = asyncio.Event()
+        self._closed = asyncio.Event()
+        self._order: CloseRun | None = None
+        self._gateway: Child | None = None
+        self._keeper: Child | None = None
+        self.last: Progress | None = None
+
+    async def play(self) -> RunRecord:
+        """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
+        plan = self._plan
+        plan.claim()
+        created = await self._operations.create(plan.settings, uuid.uuid4().hex)
+        self._folder.state.mkdir(mode=0o700)
+        found = msgspec.structs.replace(self._credentials, token=created.capability)
+        credentials.write(found, self._folder.credentials)
+        save(self._folder.opened, OpenedRun(run=created.run))
+        self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
+        try:
+            agent_s = await self._agents_side()
+            finished = await self._finish(created.run)
+        except BaseException:
+            await self._give_up(created.run)
+            raise
+        return await record.write(self._folder, plan, finished, self._operations, self.last, agent_s)
+
+    async def _agents_side(self) -> float:
+        """Until the run is closed; returns the seconds that it took."""
+        started = time.monotonic()
+        serving = asyncio.create_task(self._keep_gateway())
+        keeping: asyncio.Task[AgentEnded] | None = None
+        try:
+            up: list[asyncio.Future[Any]] = [serving, self._ready]
+            await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
+            if serving.done():
+                serving.result()
+            keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
+            spent = asyncio.create_task(self._spent.wait())
+            going: list[asyncio.Future[Any]] = [serving, keeping, spent]
+            await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
+            spent.cancel()
+            if not serving.done() and not keeping.done():
+                await asyncio.wait(
+                    [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
+                )
+            if serving.done() and not self._closed.is_set():
+                serving.result()
+            if self._keeper is not None and not keeping.done():
+                await self._keeper.tell(control.StopAgent())
+            ended = await keeping
+            await self._close(ended)
+            await serving
+        finally:
+            tasks = [task for task in (serving, keeping) if task is not None]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            for child in (self._keeper, self._gateway):
+                if child is not None:
+                    await child.end(END_GRACE_S)
+            await asyncio.to_thread(processes.end_descendants, 0.0, spare=frozenset(children.live))
+        return time.monotonic() - started
+
+    async def _close(self, ended: AgentEnded) -> None:
+        reason = "budget_spent" if self._spent.is_set() else ended.reason
+        how = f"agent ended: {reason.replace('_', ' ')}"
+        self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
+        about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
+        self._order = CloseRun(reason=reason, agent=about)
+        if self._gateway is not None:
+            await self._gateway.tell(self._order)
+
+    async def _keep_gateway(self) -> None:
+        """Runs the gateway, again when it dies, until it has closed the run."""
+        program = [
+            sys.executable,
+            "-P",
+            "-m",
+            "evopolicy_gateway.serve_cli",
+            str(self._folder.root),
+            "--controlled",
+        ]
+        quick_deaths = 0
+        while not self._closed.is_set():
+            started = time.monotonic()
+            self._gateway = await Child.start(program, self._folder.harness_log, talks=True)
+            async for event in self._gateway.events():
+                await self._on_gateway_event(event)
+            code = await self._gateway.ended()
+            if self._closed.is_set():
+                return
+            quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
+            if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
+                raise RunError(
+                    f"the gateway cannot serve (exit status {code}): {self._gateway.last_words()};"
+                    f" see {self._folder.harness_log}"
+                )
+            self._watch.note(self._name, f"the gateway ended with status {code}; starting it again")
+            await asyncio.sleep(0.1 * 2**quick_deaths)
+
+    async def _on_gateway_event(self, event: object) -> None:
+        if isinstance(event, Ready):
+            if not self._ready.done():
+                self._ready.set_result(event)
+            if self._order is not None and self._gateway is not None:
+                await self._gateway.tell(self._order)
+        elif isinstance(event, Progress):
+            self.last = event
+            self._watch.progress(self._name, event)
+            if event.spent:
+                self._spent.set()
+        elif isinstance(event, RunClosed):
+            self._closed.set()
+
+    async def _keep_agent(self, ready: Ready) -> AgentEnded:
+        program = [sys.executable, "-P", "-m", "evopolicy_gateway.harnesses.keeper"]
+        self._keeper = await Child.start(program, self._folder.harness_log, talks=True)
+        await self._keeper.tell(
+            StartAgent(
+                agent=self._plan.agent,
+                workspace=str(self._folder.workspace),
+                agent_log=str(self._folder.agent_log),
+                urls={
+                    "EVOPOLICYGYM_INFO_URL": ready.info_url,
+                    "EVOPOLICYGYM_TASK_URL": ready.task_url,
+                    "EVOPOLICYGYM_SUBMIT_URL": ready.submit_url,
+                },
+                started_in=str(self._plan.started_in),
+                wall_limit_s=self._plan.wall_limit_s,
+            )
+        )
+        ended = AgentEnded(reason="agent_failed", detail="its keeper died")
+        async for event in self._keeper.events():
+            if isinstance(event, AgentTurn):
+                self._watch.turn(self._name, event.turn, event.text)
+            elif isinstance(event, AgentEnded):
+                ended = event
+        await self._keeper.ended()
+        # What a keeper that died has left behind has become ours.
+        await asyncio.to_thread(processes.end_descendants, 0.0, spare=frozenset(children.live))
+        return ended
+
+    async def _finish(self, run: str) -> RunFinished:
+        async for progress in self._operations.wait(run):
+            self._watch.phase(self._name, progress)
+            if progress.finished is not None:
+                return progress.finished
+        raise AssertionError("waiting ends with the finished run")
+
+    async def _give_up(self, run: str) -> None:
+        """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""
+        with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
+            async with asyncio.timeout(10.0):
+                await self._operations.cancel(run)
+                finished = await self._finish(run)
+                await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0)

@@ -1,0 +1,181 @@
+"""Several runs on one cluster: an operator's cluster, or one of this machine brought up for them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from evopolicy_common import transport
+from evopolicy_common.credentials import Credentials
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.run_record import RunRecord
+from evopolicy_gateway import processes
+from evopolicy_gateway.local_cluster import local_cluster
+from evopolicy_gateway.operations import Operations, find_credentials
+from evopolicy_gateway.play import Plan, RunPlay
+from evopolicy_gateway.watch import Watch, watching
+
+NO_OK_SUBMIT = 3
+
+
+class Cluster(msgspec.Struct, frozen=True, kw_only=True):
+    """Which cluster a command uses: a local one with so many slots, or the one that is named (or this machine's own)."""
+
+    connect: tuple[str, ...] = ()
+    file: Path | None = None
+    """The operator's credentials."""
+    local_slots: int | None = None
+    state: Path | None = None
+    data: Path | None = None
+
+
+class RunResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run came to, for people and scripts."""
+
+    env: str
+    run_directory: str
+    status: str
+    """`completed`, `no_ok_submit`, `error`."""
+    error: str | None = None
+    final_score: float | None = None
+    """Held-out mean return."""
+    random_score: float | None = None
+    """Of uniform random actions on the same cases."""
+    best_submit_index: int | None = None
+    n_submits: int = 0
+    budget_used: int = 0
+    closed_reason: str = ""
+    wall_s: float = 0.0
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    where: Cluster, env_ids: Sequence[str]
+) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Task[None] | None]]:
+    """A link to the cluster, the gateways' credentials, and the task that fails when a local cluster cannot be kept up."""
+    processes.become_subreaper()
+    _end_on_sigterm()
+    async with contextlib.AsyncExitStack() as stack:
+        failed: asyncio.Task[None] | None = None
+        file = where.file
+        if where.local_slots is not None:
+            cluster, failed = await stack.enter_async_context(
+                local_cluster(env_ids, slots=where.local_slots, state=where.state, data=where.data)
+            )
+            file = cluster.operator_file
+        operator, gateway = find_credentials(where.connect, file)
+        link = await stack.enter_async_context(transport.connect(operator))
+        yield Operations(link), gateway, failed
+
+
+async def unless_failed(work: asyncio.Task[None], failed: asyncio.Task[None] | None) -> None:
+    """Waits for `work`; when the local cluster fails first, its error."""
+    try:
+        await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
+        if failed is not None and failed.done() and not work.done():
+            failed.result()
+        await work
+    finally:
+        if not work.done():
+            work.cancel()
+            await asyncio.gather(work, return_exceptions=True)
+
+
+async def play_all(plans: Sequence[Plan], where: Cluster, parallel: int, console: Console) -> list[RunResult]:
+    """Plays all plans, so many at once; one that fails does not stop the others."""
+    results: dict[int, RunResult] = {}
+    with watching(console) as watch:
+        async with connected(where, [plan.settings.env for plan in plans]) as (operations, gateway, failed):
+            gate = asyncio.Semaphore(parallel)
+
+            async def one(index: int, plan: Plan) -> None:
+                async with gate:
+                    results[index] = await _play(plan, operations, gateway, watch)
+
+            async def everything() -> None:
+                async with asyncio.TaskGroup() as group:
+                    for index, plan in enumerate(plans):
+                        group.create_task(one(index, plan))
+
+            await unless_failed(asyncio.create_task(everything()), failed)
+    return [results[index] for index in range(len(plans))]
+
+
+def exit_code(results: Sequence[RunResult]) -> int:
+    """0 when every run completed, 1 when one failed, else 3."""
+    if any(result.status == "error" for result in results):
+        return 1
+    return 0 if all(result.status == "completed" for result in results) else NO_OK_SUBMIT
+
+
+def report(results: Sequence[RunResult], console: Console) -> None:
+    """A table of what the runs came to, and where each of them is."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("environment", "score", "random", "best submit", "budget used", "ended"):
+        table.add_column(title, justify="right" if title in ("score", "random") else "left")
+    for result in results:
+        best = "" if result.best_submit_index is None else f"submit {result.best_submit_index}"
+        shown = result.closed_reason.replace("_", " ") if result.status == "completed" else result.status
+        table.add_row(
+            result.env,
+            _number(result.final_score),
+            _number(result.random_score),
+            best,
+            str(result.budget_used),
+            shown,
+        )
+    console.print(table)
+    for result in results:
+        if result.error:
+            console.print(f"{result.env}: {result.error}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"run directory: {result.run_directory}", markup=False, highlight=False, soft_wrap=True)
+
+
+async def _play(plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> RunResult:
+    play = RunPlay(plan, operations, gateway, watch)
+    try:
+        return _result(plan, await play.play())
+    except EvopolicyError as error:
+        watch.note(plan.settings.env, f"failed: {error}")
+        return RunResult(
+            env=plan.settings.env, run_directory=str(plan.folder.root), status="error", error=str(error)
+        )
+
+
+def _result(plan: Plan, record: RunRecord) -> RunResult:
+    outcome = record.outcome
+    reference = outcome.random_reference
+    return RunResult(
+        env=record.env,
+        run_directory=str(plan.folder.root),
+        status=outcome.status,
+        error=outcome.error,
+        final_score=outcome.final_score,
+        random_score=None if reference is None else reference.mean_return,
+        best_submit_index=outcome.best_submit_index,
+        n_submits=len(list(plan.folder.checkpoints.glob("submit_*"))),
+        budget_used=outcome.budget_used,
+        closed_reason=outcome.closed_reason,
+        wall_s=record.timing.wall_s,
+    )
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _end_on_sigterm() -> None:
+    """SIGTERM ends a command as Ctrl-C does: in order."""
+    main = asyncio.current_task()
+    if main is not None:
+        with contextlib.suppress(
+            RuntimeError, ValueError
+        ):  # not on the main thread: there are no signals here
+            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
