@@ -6,7 +6,7 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterator
-from typing import NoReturn
+from typing import NoReturn, TextIO, cast
 
 import structlog
 
@@ -14,6 +14,19 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 
 USAGE_ERROR = 2
 FAILURE = 1
+
+
+class _Stderr:
+    """Where log lines go. One that cannot be written (disk full, reader gone) is lost, and stops nothing."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
 
 
 def setup_logging(level: str = "info") -> None:
@@ -28,7 +41,7 @@ def setup_logging(level: str = "info") -> None:
             structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(file=sys.stderr),
+        logger_factory=structlog.PrintLoggerFactory(file=cast(TextIO, _Stderr())),
         cache_logger_on_first_use=True,
     )
 

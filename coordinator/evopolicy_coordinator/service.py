@@ -313,9 +313,9 @@ class Service:
         self._flush()
 
     def _on_storage_failure(self, error: StorageError) -> None:
-        log.error("the store refused to write; nothing is taken until it does", error=str(error))
         self._storage_error = str(error)
         self._drop_core()
+        log.error("the store refused to write; nothing is taken until it does", error=str(error))
 
     def _drop_core(self) -> None:
         """Forgets all that is not on disk, and begins to load what is."""

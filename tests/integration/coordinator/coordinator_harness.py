@@ -113,11 +113,14 @@ class InstantWorker:
         name: str = "w-1",
         slots: int = 4,
         play: Callable[[Job, EpisodeSpec], EpisodeOutcome] = play,
+        pause_s: float = 0.0,
     ) -> None:
         self.name = name
         self.link = link
         self.slots = slots
         self.play = play
+        self.pause_s = pause_s
+        """How long a batch takes."""
         self.session = ""
         self.jobs: list[Job] = []
         self.hold = asyncio.Event()
@@ -137,6 +140,9 @@ class InstantWorker:
             fingerprint=FINGERPRINT,
         )
         self.session = (await self.ask.until_answered("register", message, worker.Registered)).session
+
+    def declare_alive(self) -> None:
+        self.link.declare_alive(keys.liveliness_key(self.link.credentials.cluster, self.name))
 
     async def lease(self, n: int, wait_s: float = 1.0) -> tuple[worker.Lease, ...]:
         request = worker.LeaseRequest(worker=self.name, session=self.session, n=n, wait_s=wait_s)
@@ -165,6 +171,7 @@ class InstantWorker:
                     leases = await self.lease(self.slots)
                     self.jobs.extend(lease.job for lease in leases)
                 await self.hold.wait()
+                await asyncio.sleep(self.pause_s)
                 if leases:
                     await self.hand_in(tuple(self.result(lease) for lease in leases))
                 leases = ()

@@ -123,12 +123,12 @@ def test_rejected_requests_cost_no_budget(coordinator: Coordinator) -> None:
                 bundle = bundle_of("# policy")
                 for ids, status in (
                     ((0,) * 17, "budget_invalid"),
-                    ((), "invalid_env_instance"),
+                    ((), "budget_invalid"),
                     ((64,), "invalid_env_instance"),
                 ):
                     with pytest.raises(RefusedError) as refused:
                         await gateway.submit(bundle, ids, f"key-{ids}")
-                    assert refused.value.status == status
+                    assert refused.value.status == status, (ids, refused.value)
                 with pytest.raises(RefusedError) as refused:
                     await gateway.submit_digest("0" * 64, (0,), "nothing")
                 assert refused.value.status == "missing_bundle"
