@@ -149,6 +149,11 @@ def resume(
     typer.echo(f"{worker} is active")
 
 
+@runs_app.callback()
+def runs() -> None:
+    """An operator's word on runs."""
+
+
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
 def cancel(
     run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],

@@ -1,0 +1,139 @@
+"""`evopolicy status`, `workers` and `runs` against a real coordinator."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from coordinator_harness import Coordinator, bundle_of, gateway_of, operator_of, working
+from typer.testing import CliRunner, Result
+
+from evopolicy_coordinator.status_cli import runs_app, status_app, workers_app
+
+APPS = {"status": status_app, "workers": workers_app, "runs": runs_app}
+
+
+@pytest.fixture(scope="module")
+def coordinator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Coordinator]:
+    coordinator = Coordinator(tmp_path_factory.mktemp("status") / "state")
+    yield coordinator
+    coordinator.kill()
+
+
+def call(coordinator: Coordinator, name: str, *args: str) -> Result:
+    file = coordinator.ready["credentials"]["operator"]
+    return CliRunner().invoke(APPS[name], [*args, "--credentials", file])
+
+
+async def called(coordinator: Coordinator, name: str, *args: str) -> Result:
+    """`call` beside a loop that clients live on."""
+    return await asyncio.to_thread(call, coordinator, name, *args)
+
+
+def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create("status")
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+                text = (await called(coordinator, "status")).stdout
+                assert f"{created.run} waits for" in text
+                async with working(coordinator, "w-shown"):
+                    await gateway.results(0)
+                    result = await called(coordinator, "status")
+                    assert result.exit_code == 0
+                    for shown in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
+                        assert shown in result.stdout
+                    reply = json.loads((await called(coordinator, "status", "--json")).stdout)
+                    assert reply["cluster"] == "local"
+                    assert created.run in [run["run"] for run in reply["runs"]]
+
+    asyncio.run(asyncio.wait_for(scenario(), 60))
+
+
+def test_drained_worker_gets_no_work_until_it_is_taken_back(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator, working(coordinator, "w-drained") as worker:
+            while "w-drained" not in [found.worker for found in (await operator.status()).workers]:
+                await asyncio.sleep(0.02)
+            assert (await called(coordinator, "workers", "drain", "w-drained")).exit_code == 0
+            created = await operator.create("drain")
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("# policy"), (0,), "key")
+                await asyncio.sleep(0.3)
+                assert not [job for job in worker.jobs if created.run in job.job_id]
+                states = {found.worker: found.state for found in (await operator.status()).workers}
+                assert states["w-drained"] == "draining"
+                assert (await called(coordinator, "workers", "resume", "w-drained")).exit_code == 0
+                await gateway.results(0)
+                assert [job for job in worker.jobs if created.run in job.job_id]
+
+    asyncio.run(asyncio.wait_for(scenario(), 60))
+
+
+def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create("cancel")
+            assert (await called(coordinator, "runs", "cancel", created.run)).exit_code == 0
+            finished = await operator.finished(created.run)
+            assert finished.status == "cancelled"
+            assert finished.final_score is None
+
+    asyncio.run(asyncio.wait_for(scenario(), 60))
+
+
+def test_refusals_are_told_in_a_line_and_exit_1(coordinator: Coordinator) -> None:
+    result = call(coordinator, "runs", "cancel", "r-nowhere")
+    assert result.exit_code == 1
+    assert "r-nowhere" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_wrong_usage_exits_2(coordinator: Coordinator, tmp_path: Path) -> None:
+    assert call(coordinator, "status", "--watch", "--json").exit_code == 2
+    result = CliRunner().invoke(status_app, ["--credentials", str(tmp_path / "none.json")])
+    assert result.exit_code == 2
+    assert "none.json" in result.stderr
+
+
+def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> None:
+    code = "from evopolicy_coordinator.status_cli import status_app; status_app()"
+    file = coordinator.ready["credentials"]["operator"]
+    controller, terminal = pty.openpty()
+    watching = subprocess.Popen(
+        [sys.executable, "-c", code, "--watch", "--credentials", file],
+        stdout=terminal,
+        stderr=terminal,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "150"},
+        start_new_session=True,
+    )
+    os.close(terminal)
+    try:
+        seen = b""
+        while seen.count(b"cluster local") < 2:
+            seen += os.read(controller, 65536)
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(20) == 130
+    finally:
+        watching.kill()
+        watching.wait()
+        os.close(controller)
+
+
+@pytest.mark.parametrize(
+    ("name", "args"),
+    [("status", ()), ("workers", ("drain",)), ("workers", ("resume",)), ("runs", ("cancel",))],
+)
+def test_every_command_has_help_with_an_example(name: str, args: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(APPS[name], [*args, "--help"])
+    assert result.exit_code == 0
+    assert f"Example: evopolicy {' '.join((name, *args))}" in result.stdout
