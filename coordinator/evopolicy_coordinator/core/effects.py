@@ -39,9 +39,10 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     """Answer `request` with a `ResultsPage` made from the store.
 
-    The page holds the outcomes of `train_group(run, submit_index)` with `cursor <= seq < upto`, in that order, as many as
-    fit; its cursor is one past the last `seq` it holds. It has `done = submit_done(row)` only when it reaches `upto` and
-    the row's status is set.
+    When the row's status is set by the time it is read, `upto` is the row's `released`, whatever the effect says: the submit
+    may have ended since. The page holds the outcomes of `train_group(run, submit_index)` with `cursor <= seq < upto`, in
+    that order, as many as fit; its cursor is one past the last `seq` it holds. It has `done = submit_done(row)` only when
+    it reaches `upto`.
     """
 
     request: RequestId

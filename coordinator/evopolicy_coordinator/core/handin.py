@@ -2,12 +2,13 @@
 
 Rules that this module owns:
 - A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A verdict about a limit
-  counts only from the attempt that is live and whose worker was never silent for long: one that was frozen, or cut off
-  while the coordinator restarted, would blame the policy for it. Such an attempt is played again.
+  counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
+  stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
 - An attempt that another worker was given, or that was never given, is ignored and logged.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
-- A strike is counted once per lease.
+- A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
+  that.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
-    silent = lease is None or lease.doubtful or turn.now - lease.renewed > core.settings.lease_ttl_s
+    silent = lease is None or _silent(core, lease, turn.now)
     if lease is not None:
         core.book.release(worker, lease, turn, f"handed in: {result.kind}")
     if result.kind == "done":
         _done(core, worker, job, result, turn, live=live, silent=silent)
     elif result.kind == "slot_died" and job.group.template.bundle is not None:
-        _strike(core, worker, job, result, turn, live=live, lease=lease)
+        _strike(core, worker, job, result, turn, live=live, silent=silent)
     elif live:
         if result.kind != "returned":
             core.fleet.failed(worker, turn)
@@ -75,6 +76,12 @@ def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, 
                 later=tuple(mark_of(outcome)),
             )
             core.nondeterministic(group, turn)
+
+
+def _silent(core: Core, lease: Lease, now: float) -> bool:
+    """Whether the holder of a lease may have stood still during it."""
+    unheard_s = now - lease.renewed
+    return lease.doubtful or lease.granted_at <= core.stalled_at or unheard_s > core.settings.lease_ttl_s
 
 
 def _limit_verdict(outcome: EpisodeOutcome) -> bool:
@@ -144,40 +151,22 @@ def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: T
 
 
 def _strike(
-    core: Core,
-    worker: Worker,
-    job: JobState,
-    result: JobResult,
-    turn: Turn,
-    *,
-    live: bool,
-    lease: Lease | None,
+    core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool, silent: bool
 ) -> None:
     """A living supervisor says that the bundle brought its slot down."""
     group = job.group
-    if result.lease_id in group.strikes:
-        return
-    if not live and lease is None and result.attempt > core.first_attempt:
-        return  # given up in this incarnation, and blamed on whom it was then
-    group.strikes[result.lease_id] = None
-    turn.persist(
-        StrikeRow(
-            group=group.id,
-            lease_id=result.lease_id,
-            worker=worker.name,
-            error=result.error[:4096],
-            at=turn.now,
+    if live and not silent:
+        group.strikes[result.lease_id] = None
+        error = result.error[:4096]
+        row = StrikeRow(
+            group=group.id, lease_id=result.lease_id, worker=worker.name, error=error, at=turn.now
         )
-    )
-    turn.log(
-        "warning",
-        "strike",
-        group=group.id,
-        lease=result.lease_id,
-        worker=worker.name,
-        error=result.error[:2000],
-    )
-    if len(group.strikes) >= core.settings.strikes:
-        core.quarantined(group, turn)
-    elif live:
+        turn.persist(row)
+        turn.log("warning", "strike", group=group.id, lease=result.lease_id, worker=worker.name, error=error)
+        if len(group.strikes) >= core.settings.strikes:
+            core.quarantined(group, turn)
+            return
+    else:
+        turn.log("info", "strike_not_counted", lease=result.lease_id, worker=worker.name)
+    if live:
         core.book.give_back(job, "slot_died", worker, turn, ran=True, error=result.error)

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
 
+MISSING_BEATS = 3
+"""A lease that its worker has not named for so many heartbeats since it was granted never arrived."""
+
 FORGET_S = 3600.0
 """A lost worker is listed for so long."""
 
@@ -43,6 +46,8 @@ class Lease:
     granted_at: float
     renewed: float
     """When its holder last named it, or was given it."""
+    named: bool = False
+    """Whether its holder ever named it: if not, it may never have arrived."""
     running: bool = False
     started_at: float | None = None
     """When it was first said to run."""
@@ -137,14 +142,20 @@ class LeaseBook:
                 continue
             lease.doubtful = lease.doubtful or now - lease.renewed > self._core.settings.lease_ttl_s
             lease.renewed = now
+            lease.named = True
             lease.orphan_until = None
             lease.running = item.running
             if item.running and lease.started_at is None:
                 lease.started_at = now
             if (item.episodes_done, item.steps) != (lease.episodes_done, lease.steps):
                 lease.episodes_done, lease.steps, lease.progress_at = item.episodes_done, item.steps, now
-        for lease in [each for each in worker.leases.values() if not each.live and each.id not in named]:
-            self._leave(worker, lease)
+        missing_since = now - MISSING_BEATS * self._core.settings.heartbeat_s
+        for lease in [each for each in worker.leases.values() if each.id not in named]:
+            if not lease.live:
+                self._leave(worker, lease)
+            elif not lease.named and lease.granted_at < missing_since and now >= self._core.hold_until:
+                self.release(worker, lease, turn, "it never arrived")
+                self.give_back(lease.job, "unlisted", worker, turn, ran=False)
         return tuple(stop)
 
     def _adopt(self, worker: Worker, item: wire.HeldLease, turn: Turn) -> Lease | None:

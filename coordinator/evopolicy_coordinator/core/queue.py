@@ -320,13 +320,25 @@ class Queue:
         ready.extendleft(reversed(skipped))
         return found
 
+    def head(self, lane: Lane, priority: int) -> JobState | None:
+        """What goes first in the lane at one priority, whoever asks; None when nothing waits."""
+        flow = lane.top(priority) if lane.n_ready[priority] else None
+        if flow is None:
+            return None
+        ready = flow.ready[priority]
+        while ready[0][1].ticket != ready[0][0]:
+            ready.popleft()
+        return ready[0][1]
+
+    def avoided(self, lane: Lane, priority: int, now: float) -> str | None:
+        """The worker that the lane's next job is kept from."""
+        job = self.head(lane, priority)
+        return job.avoid if job is not None and now < job.avoid_until and lane.workers() > 1 else None
+
     def next_bundle(self, lane: Lane) -> tuple[str | None, str] | None:
         """Bundle and environment of what goes next in the lane; None when nothing waits."""
         for priority in range(N_PRIORITIES):
-            flow = lane.top(priority) if lane.n_ready[priority] else None
-            if flow is not None:
-                ready = flow.ready[priority]
-                while ready and ready[0][1].ticket != ready[0][0]:
-                    ready.popleft()
-                return (ready[0][1].group.template.bundle if ready else None, flow.env)
+            job = self.head(lane, priority)
+            if job is not None:
+                return job.group.template.bundle, job.group.template.env
         return None

@@ -36,6 +36,9 @@ TRIES_MAX = 4
 LOOK_AGAIN_S = 1.0
 """What waits although someone waits for it (they avoid each other) is looked at again after so long."""
 
+VICTIMS_MAX = 256
+"""Hidden leases looked at for a lane in one step."""
+
 SUSPECTS_MAX = 16
 """Suspects looked at in one step."""
 
@@ -261,12 +264,16 @@ class Scheduler:
         """Stop hidden jobs for the train jobs that wait in the lane."""
         core = self._core
         wanted = lane.n_ready[TRAIN] - lane.stopping
+        avoided = core.queue.avoided(lane, TRAIN, turn.now)
         for priority in (EARLY_VALIDATION, HELDOUT):
             for profile in lane.profiles:
                 hidden = profile.hidden[priority]
-                while wanted > 0 and hidden:
-                    lease = next(iter(hidden))
+                for lease in list(islice(hidden, VICTIMS_MAX)):
                     job = lease.job
+                    if wanted <= 0:
+                        return
+                    if lease.worker == avoided:
+                        continue
                     if priority == HELDOUT and job.preemptions >= core.settings.preemptions_max:
                         del hidden[lease]
                         continue

@@ -21,7 +21,7 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     retry_base_s: float = 0.5
     """First back-off after an infrastructure failure; doubles with each."""
     retry_max_s: float = 60.0
-    avoid_s: float = 20.0
+    avoid_s: float = 5.0
     """How long a retried job is kept from the worker it failed on, so that another may take it."""
     strikes: int = 3
     """Slots brought down by a bundle before it is quarantined."""

@@ -1,0 +1,364 @@
+"""What must never happen, and what must have happened in the end; apart from how scenarios are made.
+
+Everything here is judged from outside: rows as they are committed, requests and their answers, what workers play; and, after
+every few steps, the core's own invariants.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sim_oracle import ExpectedRun, PlannedRun, expect
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages import worker as wire
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import Log
+from evopolicy_coordinator.core.jobs import EARLY_VALIDATION, TRAIN
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import OutcomeRow, Row, RunStateRow, StrikeRow, SubmitRow, train_group
+
+if TYPE_CHECKING:
+    from sim_scenario import Simulation
+
+VALIDATE_EVERY = 7
+"""Steps between looks at the core's invariants, which are costly."""
+PREEMPT_S = 15.0
+"""A train job may wait so long while hidden jobs run in its lane; messages may be late and lost."""
+
+
+class ViolationError(AssertionError):
+    """Something that must not happen did."""
+
+
+def want(holds: bool, what: str, *about: Any) -> None:
+    if not holds:
+        raise ViolationError(f"{what}: {'; '.join(str(each)[:600] for each in about)}")
+
+
+class Checkers:
+    """Watches one simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._disk = simulation.disk
+        self._plans: dict[str, PlannedRun] = {plan.name: plan for plan in simulation.plans}
+        self._expected: dict[str, ExpectedRun] = {plan.name: expect(plan) for plan in simulation.plans}
+        self._granted: dict[str, tuple[str, int]] = {}
+        """Lease to worker and incarnation it was granted in."""
+        self._attempts: dict[str, int] = {}
+        """Job to its highest attempt."""
+        self._strikes: dict[str, int] = {}
+        self._steps = 0
+        self._core: Core | None = None
+        self._early_since: dict[str, float] = {}
+        self.not_counted: set[str] = set()
+        """Leases whose slot died, by a report that came after they were given up or after a silence."""
+        self.drained_at: dict[str, float] = {}
+        self.retries = 0
+        self.unreasoned = 0
+        """Retries that no fault accounts for, in scenarios whose faults must cost none."""
+        self.finished_runs: set[str] = set()
+
+    # ---- rows ----
+
+    def committing(self, rows: tuple[Row, ...]) -> None:
+        """A transaction is about to be written: may it?"""
+        for row in rows:
+            if isinstance(row, OutcomeRow):
+                self._outcome(row)
+            elif isinstance(row, SubmitRow):
+                self._submit(row, rows)
+            elif isinstance(row, StrikeRow):
+                self._strikes[row.group] = self._strikes.get(row.group, 0) + 1
+                known = self._disk.strikes.get((row.group, row.lease_id))
+                want(known is None, "a strike is counted once a lease", row)
+            elif isinstance(row, RunStateRow):
+                old = self._disk.states.get(row.run)
+                order = ("open", "closed", "finished")
+                forward = old is None or order.index(row.phase) >= order.index(old.phase)
+                want(forward, "a run's phase goes forward only", old, row)
+                pinned = old is None or old.fingerprint_class in (None, row.fingerprint_class)
+                want(pinned, "a run keeps its fingerprint class", old, row)
+
+    def _outcome(self, row: OutcomeRow) -> None:
+        group = self._disk.outcomes.get(row.group, {})
+        want(row.index not in group, "an episode is committed once", row)
+        taken = [each.seq for each in group.values()]
+        want(
+            row.seq not in taken and row.seq <= len(taken) + 8,
+            "arrivals are numbered one by one",
+            row,
+            sorted(taken),
+        )
+        granted = self._granted.get(f"{row.job_id}#{row.attempt}")
+        want(
+            granted is not None and granted[0] == row.worker,
+            "what is committed was leased to its player",
+            row,
+            granted,
+        )
+        parts = row.group.split("/")
+        if len(parts) == 3:
+            submit = self._disk.submits.get((parts[0], int(parts[1][1:])))
+            want(submit is not None, "an outcome belongs to a durable submit", row)
+            if parts[2] == "train" and submit is not None:
+                want(submit.status is None, "nothing is committed to a submit that has ended", row, submit)
+        late = row.outcome.failure is not None and row.outcome.failure.category == "act_timeout"
+        want(not late, "a limit verdict of a worker that stood still is not counted", row)
+
+    def _submit(self, row: SubmitRow, rows: tuple[Row, ...]) -> None:
+        plan = self._plans[row.run]
+        old = self._disk.submits.get((row.run, row.submit_index))
+        before = [
+            each
+            for (run, index), each in self._disk.submits.items()
+            if run == row.run and index < row.submit_index
+        ]
+        want(len(before) == row.submit_index, "submits are numbered without gaps", row)
+        spent = sum(len(each.env_instances) for each in before)
+        want(row.first_global_episode == spent, "episodes are numbered through the run", row, spent)
+        left = plan.budget - spent - len(row.env_instances)
+        want(left == row.remaining_budget >= 0, "the budget is conserved", row, left)
+        same_key = [each for each in before if each.key == row.key]
+        want(not same_key, "one submit a key", row, same_key)
+        if old is None:
+            want(all(each.status is not None for each in before), "one submit at a time", row)
+            state = self._disk.states.get(row.run)
+            want(state is not None and state.phase == "open", "a closed run takes no submit", row)
+        else:
+            want(old.status in (None, row.status), "a verdict is final", old, row)
+            want(
+                (old.key, old.env_instances) == (row.key, row.env_instances),
+                "a submit stays what it was",
+                old,
+                row,
+            )
+        if row.status == "ok":
+            group = train_group(row.run, row.submit_index)
+            new = {each.index for each in rows if isinstance(each, OutcomeRow) and each.group == group}
+            have = new | set(self._disk.outcomes.get(group, {}))
+            want(
+                have == set(range(len(row.env_instances))),
+                "an ok submit has all its outcomes",
+                row,
+                sorted(have),
+            )
+
+    # ---- answers ----
+
+    def answering(self, event: events.AnyEvent, message: Any) -> None:
+        """An answer is about to be sent: is what it tells durable, and may it be told?"""
+        disk = self._disk
+        if isinstance(message, gateway.SubmitAccepted) and isinstance(event, events.SubmitRequested):
+            row = disk.submits.get((event.run, message.submit_index))
+            want(row is not None and row.key == event.key, "an accepted submit is durable", event, row)
+        elif isinstance(message, wire.Refused) and isinstance(event, events.SubmitRequested):
+            running = [
+                row for (run, _), row in disk.submits.items() if run == event.run and row.status is None
+            ]
+            gone = message.status in ("run_finished", "run_closed")
+            want(
+                gone or (message.status == "busy") == bool(running), "one submit at a time", message, running
+            )
+        elif isinstance(message, operator.RunCreated):
+            want(message.run in disk.runs, "a created run is durable", message)
+        elif isinstance(message, gateway.RunClosed) and isinstance(event, events.RunClosed):
+            want(disk.states[event.run].phase != "open", "a closed run is durably closed", event)
+        elif isinstance(message, wire.HandInReply) and isinstance(event, events.ResultsHandedIn):
+            for result in event.results:
+                self._taken(result)
+        elif isinstance(message, wire.Leases) and isinstance(event, events.LeaseRequested):
+            for lease in message.leases:
+                self._leased(event.worker, lease)
+
+    def _taken(self, result: wire.JobResult) -> None:
+        """A result was acknowledged, so the worker forgets it."""
+        group, _, first = result.job_id.rpartition("/")
+        parts = group.split("/")
+        state = self._disk.states.get(parts[0])
+        if state is None or state.phase == "finished":
+            return
+        if parts[-1] == "train" and self._disk.submits[parts[0], int(parts[1][1:])].status is not None:
+            return
+        if (
+            parts[-1] in ("validation", "heldout")
+            and self._disk.submits[parts[0], int(parts[1][1:])].ineligible
+        ):
+            return
+        if result.kind == "slot_died":
+            struck = (group, result.lease_id) in self._disk.strikes
+            stored = self._disk.outcome(group, int(first)) is not None
+            want(
+                struck or stored or result.lease_id in self.not_counted,
+                "an acknowledged strike is durable",
+                result,
+            )
+        elif result.kind == "done":
+            late = any(
+                each.failure is not None and each.failure.category == "act_timeout"
+                for each in result.episodes
+            )
+            for each in result.episodes:
+                stored = self._disk.outcome(group, each.index) is not None
+                want(stored or late, "an acknowledged outcome is durable", result)
+
+    def _leased(self, worker: str, lease: wire.Lease) -> None:
+        core, disk, job = self._core, self._disk, lease.job
+        group = job.job_id.rpartition("/")[0]
+        known = self._granted.get(lease.lease_id)
+        want(known is None, "an attempt is leased once", lease, known)
+        highest = self._attempts.get(job.job_id, 0)
+        want(lease.attempt > highest, "attempts grow, over restarts too", lease, highest)
+        self._attempts[job.job_id] = lease.attempt
+        self._granted[lease.lease_id] = (worker, disk.incarnation)
+        for spec in job.episodes:
+            want(disk.outcome(group, spec.index) is None, "what is done is not played again", lease)
+        able = self._simulation.workers[worker]
+        want(job.env in able.envs, "a worker gets what it can play", worker, job.env)
+        run = group.split("/")[0]
+        pin = disk.states[run].fingerprint_class
+        mine = None if core is None else core.fleet.workers[worker].profile.fingerprint_class
+        want(
+            mine in (None, pin),
+            "a run's episodes are played by its fingerprint class",
+            worker,
+            lease.lease_id,
+        )
+
+    def refused(self, message: Any) -> None:
+        """The answer to a submit that must be refused."""
+        want(isinstance(message, wire.Refused), "a wrong submit is refused", message)
+
+    def submit_refused(self, plan: PlannedRun, position: int, message: wire.Refused) -> None:
+        planned = plan.submits[position]
+        if plan.cancel_at is None:
+            want(planned not in plan.admitted(), "a right submit is accepted", message, planned)
+
+    def submit_seen(
+        self, plan: PlannedRun, index: int, rows: list[OutcomeRow], done: gateway.SubmitDone
+    ) -> None:
+        """A gateway has read a submit to its end."""
+        if plan.cancel_at is not None:
+            return
+        expected = self._expected[plan.name].submits[index]
+        want(
+            done.status == expected.status,
+            "a verdict is what it must be",
+            plan.name,
+            index,
+            done,
+            expected.status,
+        )
+        indexes = [row.index for row in rows]
+        want(len(set(indexes)) == len(indexes), "an episode is shown once", indexes)
+        if expected.status == "ok":
+            seen = {row.index: row.outcome.episode_return for row in rows}
+            wanted = {place: each.episode_return for place, each in enumerate(expected.episodes)}
+            want(
+                seen == wanted,
+                "a gateway sees each episode as without faults",
+                plan.name,
+                index,
+                seen,
+                wanted,
+            )
+        if expected.status == "init_error":
+            want(not rows, "nothing is shown of a bundle without a Policy", indexes)
+
+    def finished(self, plan: PlannedRun, result: operator.RunFinished) -> None:
+        """An operator has got a run's result."""
+        self.finished_runs.add(plan.name)
+        if plan.cancel_at is not None and result.status == "cancelled":
+            return
+        expected = self._expected[plan.name]
+        statuses = [each.status for each in result.submits]
+        want(statuses == [each.status for each in expected.submits], "verdicts", plan.name, statuses)
+        used = sum(len(each.episodes) for each in expected.submits)
+        want(result.budget_used == used, "each episode is charged once", plan.name, result.budget_used, used)
+        for index, each in enumerate(expected.submits):
+            told = result.submits[index]
+            want(
+                (told.mean_return, told.val_mean) == (each.mean, each.val_mean),
+                "means",
+                plan.name,
+                told,
+                each,
+            )
+            want(
+                (index in result.validation_ineligible) >= each.ineligible,
+                "ineligible ones are told",
+                plan.name,
+                index,
+            )
+        got = (result.status, result.best_submit_index, result.heldout_returns, result.random_heldout_returns)
+        wanted = (expected.status, expected.best, expected.heldout, expected.random)
+        want(got == wanted, "a run comes to what it does without faults", plan.name, got, wanted)
+
+    # ---- the core ----
+
+    def loaded(self, core: Core) -> None:
+        self._core = core
+        self._early_since = {}
+        core.validate()
+
+    def stepped(self, core: Core) -> None:
+        self._steps += 1
+        if self._steps % VALIDATE_EVERY == 0:
+            core.validate()
+            self._preempted(core)
+            self._drained(core)
+
+    def _preempted(self, core: Core) -> None:
+        """No early validation goes on for long while train jobs wait in its lane."""
+        now = self._simulation.world.now
+        for lane in core.queue.lanes.values():
+            name = str(lane.key)
+            leases = [lease for profile in lane.profiles for lease in profile.hidden[EARLY_VALIDATION]]
+            if lane.n_ready[TRAIN] and leases:
+                since = self._early_since.setdefault(name, now)
+                want(now - since < PREEMPT_S, "a waiting train job stops hidden ones", name, leases[0].id)
+            else:
+                self._early_since.pop(name, None)
+
+    def _drained(self, core: Core) -> None:
+        for name in core.fleet.draining:
+            worker = core.fleet.workers.get(name)
+            if worker is not None:
+                late = [
+                    lease.id
+                    for lease in worker.leases.values()
+                    if lease.granted_at > self.drained_at.get(name, 1e18) and not lease.doubtful
+                ]
+                want(not late, "a draining worker gets no work", name, late)
+
+    def logged(self, log: Log) -> None:
+        if log.event == "job_retried":
+            self.retries += 1
+            # An answer to a poll that was given up while the loop stood still goes nowhere, and its leases with it.
+            stalled = self._simulation.faults.coordinator_stall > 0.0
+            self.unreasoned += not (stalled and log.fields["mishap"] == "unlisted")
+        elif log.event == "strike_not_counted":
+            self.not_counted.add(log.fields["lease"])
+
+    def playing(self, worker: str, lease: wire.Lease) -> None:
+        """A worker begins to play what it was leased."""
+        granted = self._granted.get(lease.lease_id)
+        want(
+            granted is not None and granted[0] == worker,
+            "a worker plays what is leased to it",
+            worker,
+            lease.lease_id,
+        )
+
+    # ---- the end ----
+
+    def ended(self, core: Core | None) -> None:
+        """All runs are over: nothing may be left of them in memory, and nothing was retried without a reason."""
+        want(core is not None, "the coordinator is there in the end")
+        assert core is not None
+        core.validate()
+        left = (len(core.groups), len(core.jobs), len(core.polls), len(core.runs))
+        want(left == (0, 0, 0, 0), "nothing is left in memory", left)
+        if self._simulation.harmless:
+            want(self.unreasoned == 0, "nothing is retried without a fault", self.unreasoned)

@@ -1,0 +1,172 @@
+"""Those who ask for runs: an operator who creates them and waits, a gateway that plays its plan and may die on the way."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sim_coordinator import Page
+from sim_oracle import PlannedRun
+from sim_worker import Asker
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_coordinator.core import events
+
+if TYPE_CHECKING:
+    from sim_scenario import Simulation
+
+
+class SimOperator(Asker):
+    """Creates one run, waits until it is finished, perhaps cancels it."""
+
+    def __init__(self, simulation: Simulation, plan: PlannedRun, start_s: float) -> None:
+        super().__init__(simulation, f"operator-{plan.name}")
+        self.plan = plan
+        self.result: operator.RunFinished | None = None
+        self.later(start_s, self._create)
+        if plan.cancel_at is not None:
+            self.later(start_s + plan.cancel_at, self._cancel)
+
+    def _create(self) -> None:
+        plan = self.plan
+        cases = {
+            split: tuple(Case(seed=seed) for seed in plan.cases(split))
+            for split in ("train", "validation", "heldout")
+        }
+        fields = {
+            "run": plan.name,
+            "key": f"key-{plan.name}",
+            "capability": "cap",
+            "secret": plan.secret,
+            "settings": RunSettings(
+                env=plan.env,
+                entry="e",
+                model="m",
+                exp_id="x",
+                policy_scope="submit" if plan.scope == "submit" else "episode",
+            ),
+            "budget": plan.budget,
+            "min_episodes_per_submit": 1,
+            "max_episodes_per_submit": plan.budget,
+            "split_hashes": {},
+            "split_secret": True,
+            **cases,
+        }
+        self.ask(events.RunCreated, fields, self._created)
+
+    def _created(self, message: Any) -> None:
+        assert isinstance(message, operator.RunCreated), message
+        self.simulation.gateways.append(SimGateway(self.simulation, self.plan))
+        self._wait()
+
+    def _wait(self) -> None:
+        self.ask(events.RunWaited, {"run": self.plan.name, "wait_s": 10.0}, self._waited, 10.0)
+
+    def _waited(self, message: Any) -> None:
+        if isinstance(message, operator.RunFinished):
+            self.result = message
+            self.simulation.checkers.finished(self.plan, message)
+        else:
+            self._wait()
+
+    def _cancel(self) -> None:
+        self.ask(events.RunCancelled, {"run": self.plan.name}, lambda message: None)
+
+
+class SimGateway(Asker):
+    """Plays a run's plan, submit after submit. What it wrote down survives its death: keys, and what it has seen finished."""
+
+    def __init__(self, simulation: Simulation, plan: PlannedRun) -> None:
+        super().__init__(simulation, f"gateway-{plan.name}")
+        self.plan = plan
+        self.position = 0
+        """Submits of the plan that are over; durable."""
+        self.closed = False
+        self._open()
+
+    def crash(self) -> None:
+        self.world.note(f"{self.name} dies")
+        self.life += 1
+        life = self.life
+
+        def back() -> None:
+            if life == self.life and not self.closed:
+                self._open()
+
+        self.world.after(self.world.chance.random() * 5.0, back)
+
+    def _open(self) -> None:
+        self.ask(events.RunOpened, {"run": self.plan.name}, self._opened)
+
+    def _opened(self, message: Any) -> None:
+        if isinstance(message, wire.Refused):
+            if message.status == "no_worker":
+                self.later(1.0, self._open)
+                return
+            self.closed = True  # finished, or cancelled
+            return
+        self._next()
+
+    def _next(self) -> None:
+        if self.position == len(self.plan.submits):
+            self.ask(events.RunClosed, {"run": self.plan.name, "reason": "done"}, self._run_closed)
+            return
+        submit = self.plan.submits[self.position]
+        fields = self._fields(self.position)
+        self.ask(events.SubmitRequested, fields, self._submitted)
+        if self.world.chance.random() < 0.2 and submit.ids:
+            other = {
+                **fields,
+                "key": f"other-{self.position}-{self.world.chance.random()}",
+                "env_instances": (999,),
+            }
+            self.ask(events.SubmitRequested, other, self.simulation.checkers.refused)
+
+    def _fields(self, position: int) -> dict[str, Any]:
+        submit = self.plan.submits[position]
+        return {
+            "run": self.plan.name,
+            "key": f"submit-{position}",
+            "env_instances": submit.ids,
+            "bundle": submit.bundle,
+        }
+
+    def _run_closed(self, message: Any) -> None:
+        self.closed = True
+        if self.world.chance.random() < 0.3:
+            late = {**self._fields(0), "key": "too-late"}
+            self.ask(events.SubmitRequested, late, self.simulation.checkers.refused)
+
+    def _submitted(self, message: Any) -> None:
+        if isinstance(message, wire.Refused):
+            self.simulation.checkers.submit_refused(self.plan, self.position, message)
+            self._after_submit()
+            return
+        assert isinstance(message, gateway.SubmitAccepted)
+        if self.world.chance.random() < 0.2:
+            second = {
+                **self._fields(self.position),
+                "key": f"second-{self.position}",
+                "env_instances": (999,),
+            }
+            self.ask(events.SubmitRequested, second, self.simulation.checkers.refused)
+        self._read(message.submit_index, 0, [])
+
+    def _read(self, index: int, cursor: int, seen: list[Any]) -> None:
+        fields = {"run": self.plan.name, "submit_index": index, "cursor": cursor, "wait_s": 8.0}
+        self.ask(events.ResultsRequested, fields, lambda message: self._page(index, seen, message), 8.0)
+
+    def _page(self, index: int, seen: list[Any], message: Any) -> None:
+        assert isinstance(message, Page), message
+        seen = [*seen, *message.rows]
+        if message.done is None:
+            self._read(index, message.cursor, seen)
+            return
+        self.simulation.checkers.submit_seen(self.plan, index, seen, message.done)
+        self._after_submit()
+
+    def _after_submit(self) -> None:
+        self.position += 1
+        self.later(self.world.chance.random(), self._next)

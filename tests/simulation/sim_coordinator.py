@@ -1,0 +1,197 @@
+"""The coordinator as simulated: the production core, a loop that can stall, a disk that can fail, a process that can die.
+
+Effects are carried out as the contract says, in order and a little later than the core asks for them, while it takes in
+more events: it runs ahead of its disk. The process may die before any transaction and after any effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from sim_checkers import Checkers
+from sim_store import Disk
+from sim_world import World
+
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import (
+    Effect,
+    Log,
+    Persist,
+    ReadEvaluation,
+    ReadFinished,
+    ReadResults,
+    Reply,
+)
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import evaluation_group, submit_done, train_group
+from evopolicy_coordinator.core.settings import CoreSettings
+
+PAGE = 5
+"""Episodes in a page, at most."""
+FLUSH_S = 0.004
+
+
+class Page:
+    """A results or evaluation page, as read from the disk."""
+
+    def __init__(self, rows: list[Any], cursor: int, done: Any) -> None:
+        self.rows, self.cursor, self.done = rows, cursor, done
+
+
+class SimCoordinator:
+    """Executes a core's effects in the simulated world."""
+
+    def __init__(self, world: World, disk: Disk, checkers: Checkers, settings: CoreSettings) -> None:
+        self.world, self.disk, self.checkers, self.settings = world, disk, checkers, settings
+        self.core: Core | None = None
+        self.life = 0
+        self._asks: dict[int, tuple[str, Callable[[Any], None], events.AnyEvent]] = {}
+        self._handles = 0
+        self._queue: list[Effect] = []
+        self._flushing = False
+        self._stalled_until = 0.0
+        self._woken_at: float | None = None
+        self.start()
+
+    # ---- life ----
+
+    def start(self) -> None:
+        self.life += 1
+        self.disk.incarnation += 1
+        self._asks.clear()
+        self._queue = []
+        self._flushing = False
+        self._woken_at = None
+        core, effects = Core.load(self.settings, self.disk.snapshot(), self.world.now)
+        self.core = core
+        self.checkers.loaded(core)
+        self._take(effects)
+
+    def crash(self, why: str) -> None:
+        """Die with all that is not on disk; another process takes over later."""
+        if self.core is None:
+            return
+        self.world.note(f"coordinator dies: {why}")
+        self.core = None
+        self.life += 1
+        self._queue = []
+        self.world.after(0.5 + self.world.chance.random() * 5.0, self.start)
+
+    def stall(self, seconds: float) -> None:
+        self.world.note(f"coordinator stands still for {seconds:.1f} s")
+        self._stalled_until = self.world.now + seconds
+
+    def _later(self, call: Callable[..., None], *args: Any) -> bool:
+        """While the loop stands still everything waits for it."""
+        if self.world.now < self._stalled_until:
+            self.world.after(self._stalled_until - self.world.now, call, *args)
+            return True
+        return False
+
+    # ---- in ----
+
+    def receive(
+        self, endpoint: str, kind: type[events.Event], fields: dict[str, Any], answer: Callable[[Any], None]
+    ) -> None:
+        """A request arrives; `answer` carries its reply back."""
+        if self._later(self.receive, endpoint, kind, fields, answer):
+            return
+        if self.core is None:
+            return
+        self._handles += 1
+        stimulus = f"{kind.__name__}-{self._handles}"
+        if kind is events.LivenessLost:
+            event = kind(stimulus_id=stimulus, **fields)
+        else:
+            event = kind(request=self._handles, stimulus_id=stimulus, **fields)  # type: ignore[call-arg]
+            self._asks[self._handles] = (endpoint, answer, event)  # type: ignore[assignment]
+        self.world.note(f"{endpoint} → {event}")
+        self._take(self.core.handle(event, self.world.now))  # type: ignore[arg-type]
+        self.checkers.stepped(self.core)
+
+    def _wake(self, life: int) -> None:
+        if life != self.life or self.core is None or self._later(self._wake, life):
+            return
+        self._woken_at = None
+        due = self.core.next_deadline()
+        if due is not None and due <= self.world.now:
+            self._take(self.core.handle_deadline(self.world.now))
+            self.checkers.stepped(self.core)
+        self._set_alarm()
+
+    def _set_alarm(self) -> None:
+        assert self.core is not None
+        due = self.core.next_deadline()
+        if due is not None and (self._woken_at is None or due < self._woken_at):
+            self._woken_at = due
+            self.world.after(max(0.0, due - self.world.now), self._wake, self.life)
+
+    # ---- out ----
+
+    def _take(self, effects: list[Effect]) -> None:
+        self._queue += effects
+        if self._queue and not self._flushing:
+            self._flushing = True
+            self.world.after(FLUSH_S * self.world.chance.random(), self._flush, self.life)
+        self._set_alarm()
+
+    def _flush(self, life: int) -> None:
+        """Carry out what waits, in order; it may be cut short anywhere."""
+        if life != self.life or self._later(self._flush, life):
+            return
+        world, faults = self.world, self.world.faults
+        stormy = world.now < world.calm_at
+        self._flushing = False
+        effects, self._queue = self._queue, []
+        for effect in effects:
+            if isinstance(effect, Log):
+                world.note(f"log {effect.event} {effect.fields}")
+                self.checkers.logged(effect)
+            elif isinstance(effect, Persist):
+                if stormy and world.chance.random() < faults.crash_before_persist:
+                    self.crash("before a transaction")
+                    return
+                if stormy and world.chance.random() < faults.disk_error:
+                    self._reload()
+                    return
+                self.checkers.committing(effect.rows)
+                self.disk.write(effect.rows)
+            else:
+                self._carry_out(effect)
+                if stormy and world.chance.random() < faults.coordinator_crash:
+                    self.crash("after an effect")
+                    return
+
+    def _reload(self) -> None:
+        self.world.note("the disk refuses; the core is discarded")
+        self.core = None
+        self.life += 1
+        self.world.after(0.2, self.start)
+
+    def _carry_out(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> None:
+        asked = self._asks.pop(int(effect.request), None)
+        if asked is None:
+            return
+        endpoint, answer, event = asked
+        message = self._message(effect)
+        self.world.note(f"{endpoint} ← {message}")
+        self.checkers.answering(event, message)
+        self.world.send(endpoint, answer, message)
+
+    def _message(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> Any:
+        match effect:
+            case Reply():
+                return effect.message
+            case ReadFinished():
+                return self.disk.finished[effect.run].result
+            case ReadResults():
+                row = self.disk.submits[effect.run, effect.submit_index]
+                upto = row.released if effect.upto is None or row.status is not None else effect.upto
+                rows = self.disk.page(train_group(effect.run, effect.submit_index), effect.cursor, upto, PAGE)
+                cursor = rows[-1].seq + 1 if rows else effect.cursor
+                return Page(rows, cursor, submit_done(row) if cursor >= upto else None)
+            case ReadEvaluation():
+                rows = self.disk.page(evaluation_group(effect.evaluation), effect.cursor, effect.upto, PAGE)
+                cursor = rows[-1].seq + 1 if rows else effect.cursor
+                return Page(rows, cursor, effect.finished and cursor >= effect.upto)

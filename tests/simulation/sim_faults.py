@@ -1,0 +1,89 @@
+"""Every fault the simulation knows, as one record: named, with its rate, off by default, drawn from the seed."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, fields, replace
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Rates are probabilities per message, per effect, or events per simulated minute, as said."""
+
+    loss: float = 0.0
+    """Per message: it never arrives."""
+    delay: float = 0.0
+    """Per message: it takes up to `delay_s` longer; messages overtake each other then."""
+    delay_s: float = 3.0
+    duplicate: float = 0.0
+    """Per message: it arrives twice."""
+    partition: float = 0.0
+    """Per minute: one endpoint is cut off for up to 30 s."""
+    worker_crash: float = 0.0
+    """Per minute: a worker dies with all it holds, and comes back."""
+    worker_freeze: float = 0.0
+    """Per minute: a worker stands still for up to 40 s."""
+    slow_worker: float = 0.0
+    """Probability that a worker plays four times slower."""
+    worker_trouble: float = 0.0
+    """Per job: the worker fails by itself (disk full, environment crashed)."""
+    gateway_crash: float = 0.0
+    """Per minute: a gateway dies and comes back with what it had written down."""
+    coordinator_crash: float = 0.0
+    """Per carried-out effect: the coordinator dies right after it."""
+    crash_before_persist: float = 0.0
+    """Per transaction: the coordinator dies just before it."""
+    coordinator_stall: float = 0.0
+    """Per minute: the coordinator's loop stands still for up to 40 s."""
+    disk_error: float = 0.0
+    """Per transaction: it fails."""
+    liveness_flap: float = 0.0
+    """Per minute: a worker's liveliness token goes although the worker is well."""
+    until_s: float = 80.0
+    """No fault begins later than this."""
+
+    def named(self) -> str:
+        """What is switched on, for the summary of a failure."""
+        default = Faults()
+        on = [
+            f"{each.name}={getattr(self, each.name):.3g}"
+            for each in fields(self)
+            if getattr(self, each.name) != getattr(default, each.name)
+        ]
+        return ", ".join(on) or "none"
+
+
+RATES: dict[str, float] = {
+    "loss": 0.15,
+    "delay": 0.3,
+    "duplicate": 0.15,
+    "partition": 3.0,
+    "worker_crash": 3.0,
+    "worker_freeze": 3.0,
+    "slow_worker": 0.3,
+    "worker_trouble": 0.2,
+    "gateway_crash": 2.0,
+    "coordinator_crash": 0.03,
+    "crash_before_persist": 0.05,
+    "coordinator_stall": 1.5,
+    "disk_error": 0.05,
+    "liveness_flap": 3.0,
+}
+"""The worst that a seed may draw of each."""
+
+HARMLESS = ("liveness_flap", "coordinator_stall")
+"""Faults that must not cost a single retry."""
+
+
+def draw(chance: random.Random) -> Faults:
+    """The faults of a seed: one in eight has none, one in eight harmless ones, one in four a single kind; else several."""
+    kind = chance.random()
+    if kind < 0.125:
+        return Faults()
+    if kind < 0.25:
+        chosen = [name for name in HARMLESS if chance.random() < 0.7]
+    elif kind < 0.5:
+        chosen = [chance.choice(list(RATES))]
+    else:
+        chosen = [name for name in RATES if chance.random() < 0.35]
+    return replace(Faults(), **{name: RATES[name] * chance.uniform(0.2, 1.0) for name in chosen})

@@ -1,0 +1,202 @@
+"""What must come out, worked out from the scenario alone: no core, no faults, no time.
+
+Policies here are names that say how they behave, so what an episode comes to follows from its case, its policy, its policy
+seed and what the policy is told:
+  good-N       plays
+  raises-N     fails in every episode at `act`, which is a result
+  none-N       yields no Policy, in any episode
+  late-N       yields no Policy in the episodes after request index 0, which is those episodes' failure
+  kills-N      brings its slot down every time
+  twice-N      brings its slot down on its first two attempts, then plays
+  hides-N      brings its slot down on hidden validation cases
+  holds-N      brings its slot down on held-out cases
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+from evopolicy_common.messages.episode import FailureCategory
+
+VALIDATION_SEEDS = range(10_000, 20_000)
+HELDOUT_SEEDS = range(20_000, 30_000)
+
+
+@dataclass(frozen=True)
+class PlannedSubmit:
+    ids: tuple[int, ...]
+    bundle: str
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run as its gateway will play it, and the cases it is given."""
+
+    name: str
+    env: str
+    budget: int
+    n_validation: int
+    n_heldout: int
+    scope: str
+    submits: tuple[PlannedSubmit, ...]
+    cancel_at: float | None = None
+    """When an operator cancels it, seconds after the start; None for never."""
+
+    @property
+    def secret(self) -> bytes:
+        return hashlib.sha256(self.name.encode()).digest()
+
+    def cases(self, split: str) -> list[int]:
+        """The seeds of a split's cases."""
+        salt = zlib.crc32(self.name.encode()) % 50
+        if split == "train":
+            return [salt + index for index in range(64)]
+        if split == "validation":
+            return [VALIDATION_SEEDS[salt + index] for index in range(self.n_validation)]
+        return [HELDOUT_SEEDS[salt + index] for index in range(self.n_heldout)]
+
+    def admitted(self) -> list[PlannedSubmit]:
+        """The submits that fit the budget, in order: the others are refused."""
+        left, taken = self.budget, []
+        for submit in self.submits:
+            if 1 <= len(submit.ids) <= left and all(0 <= case_id < 64 for case_id in submit.ids):
+                taken.append(submit)
+                left -= len(submit.ids)
+        return taken
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What must be stored of one episode."""
+
+    episode_return: float
+    failure: FailureCategory | None
+
+
+@dataclass(frozen=True)
+class ExpectedSubmit:
+    status: str
+    episodes: tuple[Expected, ...]
+    mean: float | None
+    val_mean: float | None
+    ineligible: bool
+
+
+@dataclass(frozen=True)
+class ExpectedRun:
+    submits: tuple[ExpectedSubmit, ...]
+    status: str
+    best: int | None
+    heldout: tuple[float, ...]
+    random: tuple[float, ...]
+
+
+def failure_of(bundle: str | None, index: int) -> FailureCategory | None:
+    """How the policy fails in the episode at `index`, when it does."""
+    kind = "" if bundle is None else bundle.split("-")[0]
+    if kind == "none" or (kind == "late" and index > 0):
+        return "init_error"
+    return "act_error" if kind == "raises" else None
+
+
+def kills(bundle: str | None, case_seed: int) -> bool:
+    """Whether the policy brings its slot down in this episode, each time it is played."""
+    kind = "" if bundle is None else bundle.split("-")[0]
+    return (
+        kind == "kills"
+        or (kind == "hides" and case_seed in VALIDATION_SEEDS)
+        or (kind == "holds" and case_seed in HELDOUT_SEEDS)
+    )
+
+
+def return_of(
+    case_seed: int, bundle: str | None, policy_seed: bytes, episode_index: int, told: dict[str, Any]
+) -> float:
+    """An episode's return: depends on all that an episode may depend on, and on nothing else."""
+    meta = sorted(
+        (name, value) for name, value in told.items() if name not in ("obs_storage", "max_episode_steps")
+    )
+    text = repr((case_seed, bundle, policy_seed, episode_index, meta))
+    return zlib.crc32(text.encode()) % 16 / 4.0
+
+
+def _seed(run: PlannedRun, submit_index: int, split: str, case_id: int, occurrence: int) -> bytes:
+    text = f"{submit_index}|{split}|{case_id}|{occurrence}"
+    return hmac.new(run.secret, text.encode(), "sha256").digest()[:16]
+
+
+def _played(
+    run: PlannedRun,
+    split: str,
+    ids: list[int],
+    bundle: str | None,
+    submit_index: int,
+    modulo: int,
+    told: dict[str, Any],
+) -> tuple[Expected, ...]:
+    seeds = run.cases("heldout" if split == "random" else split)
+    played = []
+    for index, case_id in enumerate(ids):
+        seed = _seed(run, submit_index, split, case_id, ids[:index].count(case_id))
+        value = return_of(seeds[case_id], bundle, seed, index % modulo, told)
+        played.append(Expected(value, failure_of(bundle, index)))
+    return tuple(played)
+
+
+def _mean(episodes: tuple[Expected, ...]) -> float:
+    return sum(each.episode_return for each in episodes) / len(episodes)
+
+
+def expect(run: PlannedRun) -> ExpectedRun:
+    """What a run must come to when it is not cancelled."""
+    submits: list[ExpectedSubmit] = []
+    heldout_of: dict[int, tuple[float, ...] | None] = {}
+    left = run.budget
+    for index, submit in enumerate(run.admitted()):
+        n = len(submit.ids)
+        left -= n
+        told = {
+            "env": run.env,
+            "submit_index": index,
+            "n_episodes_this_submit": n,
+            "remaining_budget_after": left,
+        }
+        episodes = _played(run, "train", list(submit.ids), submit.bundle, index, n, told)
+        seeds = run.cases("train")
+        status = "ok"
+        if any(kills(submit.bundle, seeds[case_id]) for case_id in submit.ids):
+            status = "quarantined"
+        elif failure_of(submit.bundle, 0) == "init_error":
+            status = "init_error"
+        if status != "ok":
+            submits.append(ExpectedSubmit(status, episodes, None, None, ineligible=False))
+            continue
+        hidden = _played(run, "validation", list(range(run.n_validation)), submit.bundle, index, n, told)
+        ineligible = any(kills(submit.bundle, seed) for seed in run.cases("validation"))
+        heldout = _played(run, "heldout", list(range(run.n_heldout)), submit.bundle, index, n, told)
+        killed = any(kills(submit.bundle, seed) for seed in run.cases("heldout"))
+        heldout_of[index] = None if killed else tuple(each.episode_return for each in heldout)
+        submits.append(
+            ExpectedSubmit("ok", episodes, _mean(episodes), None if ineligible else _mean(hidden), ineligible)
+        )
+    best = None
+    eligible = {index: each.val_mean for index, each in enumerate(submits) if each.val_mean is not None}
+    while eligible:
+        best = max(eligible, key=lambda index: (eligible[index], index))
+        if heldout_of[best] is not None:
+            break
+        del eligible[best]
+        best = None
+    random = _played(run, "random", list(range(run.n_heldout)), None, -1, run.n_heldout, {"env": run.env})
+    ok = any(each.status == "ok" for each in submits)
+    return ExpectedRun(
+        submits=tuple(submits),
+        status="completed" if best is not None else ("error" if ok else "no_ok_submit"),
+        best=best,
+        heldout=() if best is None else heldout_of[best] or (),
+        random=tuple(each.episode_return for each in random),
+    )

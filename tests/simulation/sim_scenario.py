@@ -1,0 +1,184 @@
+"""From a seed to a scenario: which workers, runs, policies and faults; and its run, watched by the checkers."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from dataclasses import dataclass
+
+from sim_checkers import Checkers, ViolationError
+from sim_clients import SimGateway, SimOperator
+from sim_coordinator import SimCoordinator
+from sim_faults import HARMLESS, Faults, draw
+from sim_oracle import PlannedRun, PlannedSubmit, kills
+from sim_store import Disk
+from sim_worker import SimWorker
+from sim_world import World
+
+from evopolicy_common.messages.episode import EpisodeSpec, Job
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.settings import CoreSettings
+
+HORIZON_S = 1500.0
+"""Simulated seconds after which what is not finished never will be."""
+ENVS = ("toy/line", "toy/maze")
+KINDS = ("good", "good", "good", "good", "raises", "none", "late", "kills", "twice", "hides", "holds")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much there is to play."""
+
+    runs: int = 2
+    submits: int = 3
+    episodes: int = 4
+    hidden: int = 2
+    workers: int = 3
+
+
+class Simulation:
+    """One seed."""
+
+    def __init__(
+        self, seed: int, size: Size = Size(), faults: Faults | None = None, *, trace: bool = False
+    ) -> None:
+        chance = random.Random(seed * 7919 + 1)
+        faults = draw(chance) if faults is None else faults
+        self.faults = faults
+        self.harmless = faults == Faults() or all(
+            getattr(faults, name) == getattr(Faults(), name)
+            for name in Faults.__dataclass_fields__
+            if name not in HARMLESS
+        )
+        self.world = World(seed, faults)
+        if trace:
+            self.world.trace = []
+        self.disk = Disk()
+        self.plans = [_plan(f"r{index}", size, chance) for index in range(chance.randint(1, size.runs))]
+        if any("twice" in submit.bundle or kills_any(plan) for plan in self.plans for submit in plan.submits):
+            self.harmless = False
+        self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
+        self._attempts: dict[str, int] = {}
+        self.checkers = Checkers(self)
+        self.workers: dict[str, SimWorker] = {}
+        self.gateways: list[SimGateway] = []
+        self.coordinator = SimCoordinator(self.world, self.disk, self.checkers, CoreSettings())
+        for index in range(chance.randint(1, size.workers)):
+            envs = ENVS if index == 0 or chance.random() < 0.6 else ENVS[:1]
+            version = "1" if index == 0 or chance.random() < 0.8 else "2"
+            name = f"w{index}"
+            self.workers[name] = SimWorker(self, name, chance.randint(1, 3), envs, version)
+        self.operators = [SimOperator(self, plan, chance.random() * 3.0) for plan in self.plans]
+        self._plan_faults()
+
+    # ---- how long, and how ----
+
+    def seconds_of(self, job: Job, spec: EpisodeSpec) -> float:
+        """How long an episode takes: by its case and policy, so the same in every attempt."""
+        part = zlib.crc32(f"{spec.case.seed} {job.bundle}".encode()) % 100 / 100.0
+        hidden = 4.0 if "validation" in job.job_id else 1.0
+        return self.lengths * (0.5 + part) * hidden
+
+    def dies(self, job: Job) -> bool:
+        """Whether the policy brings its slot down in this attempt."""
+        bundle = job.bundle or ""
+        if bundle.startswith("twice"):
+            count = self._attempts[bundle] = self._attempts.get(bundle, 0) + 1
+            return count <= 2
+        return any(kills(bundle, spec.case.seed) for spec in job.episodes)
+
+    # ---- faults that come by themselves ----
+
+    def _plan_faults(self) -> None:
+        faults, chance, world = self.faults, self.world.chance, self.world
+
+        def times(per_minute: float) -> list[float]:
+            n = int(per_minute * faults.until_s / 60.0 + chance.random())
+            return [chance.random() * faults.until_s for _ in range(n)]
+
+        for at in times(faults.worker_crash):
+            world.after(at, lambda: self._some_worker().crash())
+        for at in times(faults.worker_freeze):
+            world.after(at, lambda: self._some_worker().freeze(chance.random() * 40.0))
+        for at in times(faults.partition):
+            world.after(at, lambda: world.cut(self._some_endpoint(), chance.random() * 30.0))
+        for at in times(faults.gateway_crash):
+            world.after(at, self._crash_gateway)
+        for at in times(faults.coordinator_stall):
+            world.after(at, lambda: self.coordinator.stall(chance.random() * 40.0))
+        for at in times(faults.liveness_flap):
+            world.after(at, self._flap)
+        if not self.harmless and chance.random() < 0.3:
+            world.after(chance.random() * faults.until_s, self._drain)
+
+    def _some_worker(self) -> SimWorker:
+        return self.world.chance.choice(list(self.workers.values()))
+
+    def _some_endpoint(self) -> str:
+        names = [*self.workers, *(f"gateway-{plan.name}" for plan in self.plans)]
+        return self.world.chance.choice(names)
+
+    def _crash_gateway(self) -> None:
+        if self.gateways:
+            self.world.chance.choice(self.gateways).crash()
+
+    def _flap(self) -> None:
+        name = self._some_worker().name
+        self.coordinator.receive(name, events.LivenessLost, {"worker": name}, lambda message: None)
+
+    def _drain(self) -> None:
+        """An operator drains a worker and takes it back later."""
+        name = self._some_worker().name
+        operator = self.operators[0]
+
+        def drained(message: object) -> None:
+            self.checkers.drained_at[name] = self.world.now
+            operator.later(20.0, back)
+
+        def back() -> None:
+            self.checkers.drained_at.pop(name, None)
+            operator.ask(events.WorkerStateSet, {"worker": name, "state": "active"}, lambda message: None)
+
+        operator.ask(events.WorkerStateSet, {"worker": name, "state": "draining"}, drained)
+
+    # ---- running ----
+
+    def run(self) -> None:
+        """Play the seed to its end; raises what the checkers or the core raise."""
+        finished = self.world.run(self.world.now + HORIZON_S, self._all_done)
+        if not finished:
+            missing = {plan.name for plan in self.plans} - self.checkers.finished_runs
+            core = self.coordinator.core
+            status = None if core is None else core.status(self.world.now)
+            raise ViolationError(f"runs that never finish: {sorted(missing)}; {status}")
+        self.world.calm_at = self.world.now
+        self.world.run(self.world.now + 20.0, lambda: False)
+        self.checkers.ended(self.coordinator.core)
+
+    def _all_done(self) -> bool:
+        return len(self.checkers.finished_runs) == len(self.plans) and all(
+            each.closed for each in self.gateways
+        )
+
+
+def kills_any(plan: PlannedRun) -> bool:
+    """Whether any policy of the plan brings a slot down, which is retried without a fault of ours."""
+    return any(submit.bundle.split("-")[0] in ("kills", "hides", "holds") for submit in plan.submits)
+
+
+def _plan(name: str, size: Size, chance: random.Random) -> PlannedRun:
+    submits = []
+    for index in range(chance.randint(1, size.submits)):
+        ids = tuple(chance.randrange(4) for _ in range(chance.randint(1, size.episodes)))
+        submits.append(PlannedSubmit(ids, f"{chance.choice(KINDS)}-{name}-{index}"))
+    total = sum(len(submit.ids) for submit in submits)
+    return PlannedRun(
+        name=name,
+        env=chance.choice(ENVS),
+        budget=max(1, total - chance.choice((0, 0, 0, 1))),
+        n_validation=chance.randint(1, size.hidden),
+        n_heldout=chance.randint(1, size.hidden),
+        scope=chance.choice(("episode", "episode", "submit")),
+        submits=tuple(submits),
+        cancel_at=chance.random() * 60.0 if chance.random() < 0.08 else None,
+    )

@@ -1,0 +1,87 @@
+"""A disk: rows under their keys, transactions that happen as a whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from evopolicy_coordinator.core.records import (
+    EvaluationRow,
+    FinishedRow,
+    OutcomeHead,
+    OutcomeRow,
+    Row,
+    RunRow,
+    RunStateRow,
+    Snapshot,
+    StrikeRow,
+    SubmitRow,
+    WorkerRow,
+    evaluation_group,
+    head_of,
+)
+
+
+class Disk:
+    """What survives the coordinator."""
+
+    def __init__(self) -> None:
+        self.incarnation = 0
+        self.runs: dict[str, RunRow] = {}
+        self.states: dict[str, RunStateRow] = {}
+        self.submits: dict[tuple[str, int], SubmitRow] = {}
+        self.outcomes: dict[str, dict[int, OutcomeRow]] = {}
+        self.strikes: dict[tuple[str, str], StrikeRow] = {}
+        self.evaluations: dict[str, EvaluationRow] = {}
+        self.finished: dict[str, FinishedRow] = {}
+        self.workers: dict[str, WorkerRow] = {}
+
+    def write(self, rows: Iterable[Row]) -> None:
+        for row in rows:
+            match row:
+                case OutcomeRow():
+                    self.outcomes.setdefault(row.group, {})[row.index] = row
+                case SubmitRow():
+                    self.submits[row.run, row.submit_index] = row
+                case RunStateRow():
+                    self.states[row.run] = row
+                case RunRow():
+                    self.runs[row.run] = row
+                case StrikeRow():
+                    self.strikes[row.group, row.lease_id] = row
+                case EvaluationRow():
+                    self.evaluations[row.evaluation] = row
+                case FinishedRow():
+                    self.finished[row.run] = row
+                case WorkerRow():
+                    self.workers[row.worker] = row
+
+    def outcome(self, group: str, index: int) -> OutcomeRow | None:
+        return self.outcomes.get(group, {}).get(index)
+
+    def page(self, group: str, cursor: int, upto: int, most: int) -> list[OutcomeRow]:
+        rows = sorted(self.outcomes.get(group, {}).values(), key=lambda row: row.seq)
+        return [row for row in rows if cursor <= row.seq < upto][:most]
+
+    def snapshot(self) -> Snapshot:
+        """What a core is loaded from: heads of unfinished runs and evaluations only, as the contract asks."""
+        live = {name for name, state in self.states.items() if state.phase != "finished"}
+        groups = {
+            evaluation_group(name) for name, evaluation in self.evaluations.items() if not evaluation.finished
+        }
+
+        def wanted(group: str) -> bool:
+            return group in groups or group.split("/")[0] in live
+
+        heads: list[OutcomeHead] = [
+            head_of(row) for group, rows in self.outcomes.items() if wanted(group) for row in rows.values()
+        ]
+        return Snapshot(
+            incarnation=self.incarnation,
+            runs=tuple(self.runs.values()),
+            states=tuple(self.states.values()),
+            submits=tuple(row for row in self.submits.values() if row.run in live),
+            outcomes=tuple(heads),
+            strikes=tuple(row for row in self.strikes.values() if wanted(row.group)),
+            evaluations=tuple(self.evaluations.values()),
+            workers=tuple(self.workers.values()),
+        )

@@ -1,0 +1,299 @@
+"""A worker as simulated: registers, polls, beats, plays, hands in; it can die, stand still, be slow, and be in trouble.
+
+What it plays depends on the job alone, as with the real one; only its faults come from chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from sim_oracle import failure_of, return_of
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job, PolicyFailure
+from evopolicy_coordinator.core import events
+
+if TYPE_CHECKING:
+    from sim_scenario import Simulation
+
+POLL_S = 5.0
+BEAT_S = 2.0
+FROZEN_LIMIT_S = 18.0
+"""An episode during which the worker stood still for so long ends with a false verdict about a time limit."""
+
+
+class Asker:
+    """Someone who asks the coordinator, again and again until there is an answer; can die and stand still."""
+
+    def __init__(self, simulation: Simulation, name: str) -> None:
+        self.simulation, self.world, self.name = simulation, simulation.world, name
+        self.life = 0
+        self.frozen_until = 0.0
+
+    def ask(
+        self,
+        kind: type[events.Event],
+        fields: dict[str, Any],
+        then: Callable[[Any], None],
+        wait_s: float = 0.0,
+    ) -> None:
+        """Ask, and ask again after a while without an answer; `then` is called once, by an answer to the latest."""
+        life = self.life
+        current = [0]
+        """The latest sending; -1 once it was answered."""
+
+        def answer(serial: int, message: Any) -> None:
+            if life != self.life or serial != current[0]:
+                return
+            if self.world.now < self.frozen_until:
+                self.world.after(self.frozen_until - self.world.now, answer, serial, message)
+                return
+            current[0] = -1
+            then(message)
+
+        def send(serial: int) -> None:
+            if life != self.life or current[0] != serial - 1:
+                return
+            if self.world.now < self.frozen_until:
+                self.world.after(self.frozen_until - self.world.now, send, serial)
+                return
+            current[0] = serial
+            coordinator = self.simulation.coordinator
+            self.world.send(self.name, coordinator.receive, self.name, kind, fields, partial(answer, serial))
+            self.world.after(wait_s + 3.0 + self.world.chance.random(), send, serial + 1)
+
+        send(1)
+
+    def later(self, delay_s: float, call: Callable[..., None], *args: Any) -> None:
+        """As `World.after`, but not past a death, and not while it stands still."""
+        life = self.life
+
+        def due() -> None:
+            if life != self.life:
+                return
+            if self.world.now < self.frozen_until:
+                self.world.after(self.frozen_until - self.world.now, due)
+                return
+            call(*args)
+
+        self.world.after(delay_s, due)
+
+    def freeze(self, seconds: float) -> None:
+        self.frozen_until = self.world.now + seconds
+        self.world.note(f"{self.name} stands still for {seconds:.1f} s")
+
+
+class SimWorker(Asker):
+    """One supervisor with its slots."""
+
+    def __init__(
+        self, simulation: Simulation, name: str, slots: int, envs: tuple[str, ...], version: str
+    ) -> None:
+        super().__init__(simulation, name)
+        self.slots, self.envs, self.version = slots, envs, version
+        faults = self.world.faults
+        self._reset()
+        self.slowness = 4.0 if self.world.chance.random() < faults.slow_worker else 1.0
+        self.later(self.world.chance.random(), self._register)
+
+    def _reset(self) -> None:
+        self.session = ""
+        self.queue: dict[str, wire.Lease] = {}
+        self.running: dict[str, wire.Lease] = {}
+        self.outbox: list[wire.JobResult] = []
+        self.stopped: set[str] = set()
+        self.polling = self.handing = False
+
+    def crash(self) -> None:
+        self.world.note(f"{self.name} dies holding {list(self.running)}")
+        self.life += 1
+        life = self.life
+
+        def back() -> None:
+            if life == self.life:
+                self._register()
+
+        self.world.after(1.0 + self.world.chance.random() * 25.0, back)
+
+    # ---- talk ----
+
+    def _register(self) -> None:
+        self._reset()
+        self._introduce(first=True)
+
+    def _introduce(self, *, first: bool = False) -> None:
+        descriptions = tuple(
+            EnvironmentDescription(
+                env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
+            )
+            for env in self.envs
+        )
+        print_of = wire.Fingerprint(code_version=self.version, python="3", packages={}, cpu="")
+        session = f"{self.name}-{self.world.chance.randrange(1 << 30)}"
+        fields = {
+            "worker": self.name,
+            "session": session,
+            "slots": self.slots,
+            "tiers": ("bwrap",),
+            "environments": descriptions,
+            "fingerprint": print_of,
+        }
+
+        def registered(message: Any) -> None:
+            self.session = message.session
+            if first:
+                self._beat()
+            self._poll()
+            self._hand_in()
+
+        self.ask(events.WorkerRegistered, fields, registered)
+
+    def _lost_session(self, message: Any) -> bool:
+        if isinstance(message, wire.Refused):
+            self.polling = self.handing = False
+            if self.session:
+                self.session = ""
+                self._introduce()
+            return True
+        return False
+
+    def _beat(self) -> None:
+        """Beat, whatever became of the last one."""
+        self.later(BEAT_S, self._beat)
+        if not self.session:
+            return
+        held = [
+            wire.HeldLease(
+                lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, running=running
+            )
+            for running, leases in ((True, self.running), (False, self.queue))
+            for lease in leases.values()
+        ]
+        held += [
+            wire.HeldLease(lease_id=each.lease_id, job_id=each.job_id, attempt=each.attempt, running=False)
+            for each in self.outbox
+        ]
+        life = self.life
+
+        def answered(message: Any) -> None:
+            if life == self.life and isinstance(message, wire.HeartbeatReply):
+                if self.world.now < self.frozen_until:
+                    self.world.after(self.frozen_until - self.world.now, answered, message)
+                    return
+                for lease_id in message.cancelled:
+                    self._stop(lease_id)
+
+        fields = {"worker": self.name, "session": self.session, "held": tuple(held), "wait_s": 1.5}
+        self.world.send(
+            self.name,
+            self.simulation.coordinator.receive,
+            self.name,
+            events.HeartbeatReceived,
+            fields,
+            answered,
+        )
+
+    def _stop(self, lease_id: str) -> None:
+        lease = self.queue.pop(lease_id, None) or self.running.pop(lease_id, None)
+        if lease is not None:
+            self._put(lease, "returned")
+            self._start()
+
+    def _poll(self) -> None:
+        wanted = self.slots - len(self.running) - len(self.queue)
+        if self.polling or wanted <= 0 or not self.session:
+            return
+        self.polling = True
+        fields = {"worker": self.name, "session": self.session, "n": wanted, "wait_s": POLL_S}
+
+        def answered(message: Any) -> None:
+            self.polling = False
+            if self._lost_session(message):
+                return
+            for lease in message.leases:
+                self.queue[lease.lease_id] = lease
+            self._start()
+            self._poll()
+
+        self.ask(events.LeaseRequested, fields, answered, POLL_S)
+
+    def _put(
+        self, lease: wire.Lease, kind: wire.ResultKind, episodes: tuple[EpisodeOutcome, ...] = ()
+    ) -> None:
+        self.outbox.append(
+            wire.JobResult(
+                lease_id=lease.lease_id,
+                job_id=lease.job.job_id,
+                attempt=lease.attempt,
+                kind=kind,
+                episodes=episodes,
+            )
+        )
+        self._hand_in()
+
+    def _hand_in(self) -> None:
+        if self.handing or not self.outbox or not self.session:
+            return
+        self.handing = True
+        batch = tuple(self.outbox)
+        fields = {"worker": self.name, "session": self.session, "results": batch}
+
+        def answered(message: Any) -> None:
+            self.handing = False
+            if self._lost_session(message):
+                return
+            self.outbox = [each for each in self.outbox if each not in batch]
+            self._hand_in()
+            self._poll()
+
+        self.ask(events.ResultsHandedIn, fields, answered)
+
+    # ---- play ----
+
+    def _start(self) -> None:
+        while self.queue and len(self.running) < self.slots:
+            lease = self.queue.pop(next(iter(self.queue)))
+            self.running[lease.lease_id] = lease
+            seconds = sum(self.simulation.seconds_of(lease.job, spec) for spec in lease.job.episodes)
+            self.simulation.checkers.playing(self.name, lease)
+            self.later(seconds * self.slowness, self._played, lease, self.world.now)
+
+    def _played(self, lease: wire.Lease, started: float) -> None:
+        if self.running.pop(lease.lease_id, None) is None:
+            return
+        job, chance = lease.job, self.world.chance
+        stormy = self.world.now < self.world.calm_at
+        frozen_s = (
+            self.world.now
+            - started
+            - self.slowness * sum(self.simulation.seconds_of(job, spec) for spec in job.episodes)
+        )
+        if stormy and chance.random() < self.world.faults.worker_trouble:
+            self._put(lease, "failed")
+        elif self.simulation.dies(job):
+            self._put(lease, "slot_died")
+        else:
+            self._put(lease, "done", tuple(_outcome(job, spec, frozen_s) for spec in job.episodes))
+        self._start()
+        self._poll()
+
+
+def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float) -> EpisodeOutcome:
+    category = failure_of(job.bundle, spec.index)
+    failure = None if category is None else PolicyFailure(category=category, step_index=0, message="")
+    value = return_of(spec.case.seed, job.bundle, spec.policy_seed, spec.episode_index, job.env_meta)
+    if frozen_s > FROZEN_LIMIT_S:
+        failure = PolicyFailure(category="act_timeout", step_index=0, message="", limit=1.0, used=frozen_s)
+        value = -99.0
+    return EpisodeOutcome(
+        index=spec.index,
+        episode_return=value,
+        length=1,
+        terminated=True,
+        truncated=False,
+        failure=failure,
+        wall_s=1.0,
+    )
