@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.evolved.spaces import goal_keys
-from evopolicy_gateway.agents.families import families_for, moving_families
+from evopolicy_gateway.agents.families import families_for
 from evopolicy_gateway.agents.feedback import Step, episode_folders, novelty, read_steps
-from evopolicy_gateway.agents.plant import find_plant
+from evopolicy_gateway.agents.lessons import Lessons
 from evopolicy_gateway.agents.search import Candidate, Episode, Search, make_plan
 from evopolicy_gateway.agents.staging import stage_candidates, stage_code
 
-MAX_ROWS_READ = 1000
+MAX_ROWS_READ = 3000
 """Rows of one trajectory that the agent reads at most."""
 MAX_REFUSALS = 3
 
@@ -45,7 +44,7 @@ class Agent:
         self._bounds = int(info["min_episodes_per_submit"]), int(info["max_episodes_per_submit"])
         self._search = Search(families_for(*self._spaces), np.random.default_rng(seed))
         self._next_case = 0
-        self._wants_plant = goal_keys(self._spaces[0])
+        self._lessons = Lessons(*self._spaces)
         self._n_refusals = 0
 
     def run(self) -> None:
@@ -112,18 +111,15 @@ class Agent:
             if index not in failed and value is not None and np.isfinite(value):
                 new = float(novelty(episodes[index])) if index < len(episodes) else 0.0
                 candidates[turn].episodes.append(Episode(case=case, episode_return=float(value), novelty=new))
-        if episodes and self._wants_plant:
-            settings = find_plant(*self._spaces, episodes)
-            if settings is not None:
-                self._wants_plant = False
-                for family in moving_families(settings, *self._spaces):
-                    self._search.add_family(family)
+        if episodes:
+            for family in self._lessons.learn(episodes):
+                self._search.add_family(family)
 
     def _trajectories(self, verdict: Verdict, n_episodes: int) -> list[list[Step]]:
         """Trajectories of a population's episodes, where something is to be had from them; else none."""
         returns = verdict.summary["returns"]
         tells_apart = len(set(returns)) > len(returns) // 2
-        if tells_apart and not self._wants_plant:
+        if tells_apart and not self._lessons.wanted:
             return []
         first = int(verdict.summary["first_global_episode"])
         folders = episode_folders(self._workspace, verdict.submit_id, n_episodes, first)

@@ -95,6 +95,20 @@ def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: S
     return families
 
 
+def seeking_family(settings: dict[str, Any]) -> Family:
+    """The family that plans in a view whose motion was found from trajectories."""
+    first = tuple(np.array(v, dtype=float) for v in ((0, 0, 0), (2, 0, -1), (0, 1, -1), (-2, 1, 0)))
+    return Family(
+        name="seeker",
+        kind="seeker",
+        settings=settings,
+        first=first,
+        centre=np.zeros(3),
+        spread=np.array([1.5, 0.7, 1.0]),
+        scale=np.array([1.0, 0.5, 0.7]),
+    )
+
+
 def _constant(action_space: Schema, n_outputs: int) -> Family:
     zero = np.zeros(n_outputs)
     axes = np.eye(n_outputs)

@@ -121,7 +121,15 @@ class Search:
         self.candidates: list[Candidate] = []
 
     def add_family(self, family: Family) -> None:
-        """A family that feedback made possible: its first candidates join the next round."""
+        """A family that feedback made possible: its first candidates join the next round.
+
+        Of one known by that name only the settings are taken over, for all of its candidates: what is known of the
+        world has grown, and is not what the search is about.
+        """
+        for known in self._families:
+            if known.name == family.name:
+                known.settings.update(family.settings)
+                return
         self._families.append(family)
         self._sources[family.name] = family.sample(self._rng)
         self._newcomers.append(family)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .grids import GridSeeker
 from .pushing import Carrier, Pusher
 from .spaces import ActionHead, Features, Schema, Vector, as_image
 
@@ -31,6 +32,7 @@ def parameter_count(kind: str, settings: dict[str, Any], obs_space: Schema, acti
         "saliency": 3 + SALIENCY_FEATURES * outputs,
         "pusher": Pusher.PARAMETERS + outputs,
         "carrier": Carrier.PARAMETERS + outputs,
+        "seeker": GridSeeker.PARAMETERS,
     }[kind]
 
 
@@ -135,7 +137,7 @@ def fingerprint(obs: Any) -> bytes:
     return np.round(values, 2).tobytes() if values.dtype.kind == "f" else values.tobytes()
 
 
-Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher | Carrier
+Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher | Carrier | GridSeeker
 
 
 def build(
@@ -162,4 +164,6 @@ def build(
         return Pusher(head, vector, settings)
     if kind == "carrier":
         return Carrier(head, vector, settings)
+    if kind == "seeker":
+        return GridSeeker(head, vector, settings, rng)
     raise ValueError(f"no controller of kind {kind!r}")

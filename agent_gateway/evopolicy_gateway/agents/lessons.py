@@ -1,0 +1,42 @@
+"""What trajectories teach beyond their returns: families of controllers that need to know how the world reacts."""
+
+from __future__ import annotations
+
+from evopolicy_gateway.agents.evolved.grids import find_grid
+from evopolicy_gateway.agents.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.families import Family, moving_families, seeking_family
+from evopolicy_gateway.agents.feedback import Step
+from evopolicy_gateway.agents.plant import find_plant
+from evopolicy_gateway.agents.views import ViewLog, find_views, view_logs
+
+MAX_VIEW_LOGS = 96
+
+
+class Lessons:
+    """Collects trajectories for as long as there is something to be learnt from them."""
+
+    def __init__(self, obs_space: Schema, action_space: Schema) -> None:
+        self._spaces = obs_space, action_space
+        self._wants_plant = goal_keys(obs_space)
+        self._wants_views = find_grid(obs_space)[0] and action_space["type"] == "Discrete"
+        self._logs: list[ViewLog] = []
+
+    @property
+    def wanted(self) -> bool:
+        """Whether more trajectories could teach anything."""
+        return self._wants_plant or self._wants_views
+
+    def learn(self, episodes: list[list[Step]]) -> list[Family]:
+        """Families that these trajectories, with the earlier ones, make possible; a known one's settings may be newer."""
+        families: list[Family] = []
+        if self._wants_plant:
+            plant = find_plant(*self._spaces, episodes)
+            if plant is not None:
+                self._wants_plant = False
+                families += moving_families(plant, *self._spaces)
+        if self._wants_views:
+            self._logs = (self._logs + view_logs(*self._spaces, episodes))[-MAX_VIEW_LOGS:]
+            views = find_views(*self._spaces, self._logs)
+            if views is not None:
+                families.append(seeking_family(views))
+        return families

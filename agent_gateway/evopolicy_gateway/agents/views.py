@@ -1,0 +1,186 @@
+"""Finds out from trajectories how a grid of symbols moves with the actions: what the seeker needs to plan in its view.
+
+- A cell's symbol comes from the cell where, before the action, symbols agreed with it most, rare symbols counting more.
+- Advancing is the action of which a cell's symbol tells best whether it moves the view or is stopped.
+- Turns leave one cell in its place: where the agent stands. The cell from which advancing would bring a symbol there is
+  the one that advancing enters; where turns leave none, the cell that told best.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_gateway.agents.evolved.grids import find_grid, read_symbols
+from evopolicy_gateway.agents.evolved.spaces import Schema
+from evopolicy_gateway.agents.feedback import Step
+
+MIN_MOVES = 25
+"""Transitions of an action that changed the view, to learn its map from."""
+MAX_MOVES = 1500
+MIN_AGREEMENT = 0.7
+MIN_MAPPED_SHARE = 0.3
+MIN_SEEN = 8
+"""How often a symbol must have been met under the touch to be judged blocking by experience."""
+RARE_FRAMES = 0.3
+"""A symbol is rare when fewer than this share of the frames show it."""
+
+Symbols = NDArray[np.int32]
+
+
+class ViewLog:
+    """One episode as arrays: `frames` (steps, cells) of symbols, `actions` (steps,) from 0, `rewards` (steps,)."""
+
+    def __init__(self, steps: list[Step], key: str | None, first_action: int) -> None:
+        self.frames: Symbols = np.array([read_symbols(step.obs, key) for step in steps])
+        self.actions = np.array([int(step.action) - first_action for step in steps])
+        self.rewards = np.array([step.reward for step in steps])
+
+
+def view_logs(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> list[ViewLog]:
+    """The episodes as logs of the grid in their observations; none where there is no grid or nothing to choose."""
+    exists, key = find_grid(obs_space)
+    if not exists or action_space["type"] != "Discrete":
+        return []
+    first = int(action_space.get("start", 0))
+    return [ViewLog(steps, key, first) for steps in episodes if len(steps) > 1 and steps[0].obs is not None]
+
+
+def find_views(obs_space: Schema, action_space: Schema, runs: list[ViewLog]) -> dict[str, Any] | None:
+    """Settings for the `seeker` controller, or None where the logs do not give any."""
+    if not runs:
+        return None
+    frames = np.concatenate([run.frames for run in runs])
+    before = np.concatenate([run.frames[:-1] for run in runs])
+    after = np.concatenate([run.frames[1:] for run in runs])
+    actions = np.concatenate([run.actions[:-1] for run in runs])
+    changed_cells = (before != after).sum(axis=1)
+    maps = {}
+    for action in range(action_space["n"]):
+        moved = np.flatnonzero((actions == action) & (changed_cells > 1))[:MAX_MOVES]
+        if len(moved) >= MIN_MOVES and len(moved) > 0.1 * np.count_nonzero(actions == action):
+            cells = _source_cells(before[moved], after[moved], _rarity(frames))
+            if np.mean(cells >= 0) > MIN_MAPPED_SHARE and not _is_still(cells):
+                maps[action] = cells
+    found = _advance_and_touch(before, actions, changed_cells > 1, maps)
+    if found is None:
+        return None
+    advance, touch = found
+    blocked, passed = _barriers(before[:, touch], actions == advance, changed_cells > 1)
+    return {
+        "key": find_grid(obs_space)[1],
+        "maps": {str(action): cells.tolist() for action, cells in maps.items()},
+        "advance": advance,
+        "touch": touch,
+        "blocked": sorted(blocked),
+        "rare": sorted(_rare(frames) - passed),
+        "prizes": _prizes(runs, touch),
+    }
+
+
+def _rarity(frames: Symbols) -> dict[int, float]:
+    """-log of each symbol's share of all cells."""
+    symbols, counts = np.unique(frames, return_counts=True)
+    return {int(s): float(-np.log(c / frames.size)) for s, c in zip(symbols, counts, strict=True)}
+
+
+def _source_cells(before: Symbols, after: Symbols, rarity: dict[int, float]) -> Symbols:
+    """For each cell, the cell whose symbol it takes over; -1 where none agrees well enough."""
+    n_cells = before.shape[1]
+    weigh = np.vectorize(lambda symbol: rarity[int(symbol)], otypes=[float])
+    weight_before, weight_after = weigh(before), weigh(after)
+    agreement = np.empty((n_cells, n_cells))
+    for cell in range(n_cells):
+        same = before == after[:, cell : cell + 1]
+        shared = (same * weight_before).sum(axis=0)
+        whole = np.sqrt(weight_before.sum(axis=0) * weight_after[:, cell].sum())
+        agreement[cell] = shared / np.maximum(whole, 1e-9)
+    best = agreement.argmax(axis=1)
+    return np.where(agreement.max(axis=1) >= MIN_AGREEMENT, best, -1).astype(np.int32)
+
+
+def _is_still(cells: Symbols) -> bool:
+    mapped = cells >= 0
+    return bool(np.mean(cells[mapped] == np.flatnonzero(mapped)) > 0.7)
+
+
+def _advance_and_touch(
+    before: Symbols, actions: Symbols, moved: NDArray[np.bool_], maps: dict[int, Symbols]
+) -> tuple[int, int] | None:
+    """The action that may be stopped, and the cell it would enter; None where no action is ever stopped."""
+    best = (0.05, -1, -1)  # bits; less tells nothing
+    for action in maps:
+        rows = actions == action
+        outcome = moved[rows]
+        if not 0.02 < outcome.mean() < 0.98:
+            continue
+        for cell in range(before.shape[1]):
+            told = _information(before[rows, cell], outcome)
+            best = max(best, (told, action, cell))
+    _, advance, telling = best
+    if advance < 0:
+        return None
+    turns = [cells for action, cells in maps.items() if action != advance]
+    own = np.arange(before.shape[1])
+    standing = np.flatnonzero(np.all([cells == own for cells in turns], axis=0)) if turns else own[:0]
+    if len(standing) != 1:
+        return advance, telling
+    mapped = np.flatnonzero(maps[advance] >= 0)
+    shifts, counts = np.unique(maps[advance][mapped] - mapped, return_counts=True)
+    return advance, int(np.clip(standing[0] + shifts[counts.argmax()], 0, own[-1]))
+
+
+def _information(symbols: Symbols, outcome: NDArray[np.bool_]) -> float:
+    """Mutual information between a symbol and a yes-or-no outcome, bits."""
+    kinds = np.unique(symbols, return_inverse=True)[1]
+    n = np.bincount(kinds)
+    yes = np.bincount(kinds, outcome)
+    within = float((n / n.sum() * _entropy(yes / n)).sum())
+    return float(_entropy(np.array([outcome.mean()]))[0]) - within
+
+
+def _entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    q = np.clip(p, 1e-12, 1 - 1e-12)
+    entropy: NDArray[np.float64] = -(q * np.log2(q) + (1 - q) * np.log2(1 - q))
+    return entropy
+
+
+def _barriers(
+    touched: Symbols, advancing: NDArray[np.bool_], moved: NDArray[np.bool_]
+) -> tuple[set[int], set[int]]:
+    """Symbols that stopped the advance more often than not, and those that let it pass."""
+    blocked, passed = set(), set()
+    for symbol in np.unique(touched[advancing]):
+        outcome = moved[advancing & (touched == symbol)]
+        if len(outcome) >= MIN_SEEN and outcome.mean() < 0.5:
+            blocked.add(int(symbol))
+        elif outcome.mean() >= 0.5:
+            passed.add(int(symbol))
+    return blocked, passed
+
+
+def _rare(frames: Symbols) -> set[int]:
+    """Symbols that few frames show."""
+    shown: dict[int, int] = {}
+    for frame in frames:
+        for symbol in set(frame.tolist()):
+            shown[symbol] = shown.get(symbol, 0) + 1
+    return {symbol for symbol, count in shown.items() if count < RARE_FRAMES * len(frames)}
+
+
+def _prizes(runs: list[ViewLog], touch: int) -> list[list[int]]:
+    """[symbol under the touch, action] of steps that were rewarded where most steps are not."""
+    rewards = np.concatenate([run.rewards for run in runs])
+    if np.mean(rewards > 0) > 0.05:
+        return []
+    pairs: dict[tuple[int, int], int] = {}
+    for run in runs:
+        for t in np.flatnonzero(run.rewards > 0):
+            pair = int(run.frames[t, touch]), int(run.actions[t])
+            pairs[pair] = pairs.get(pair, 0) + 1
+    best: dict[int, tuple[int, int]] = {}
+    for (symbol, action), count in pairs.items():
+        best[symbol] = max(best.get(symbol, (0, 0)), (count, action))
+    return [[symbol, action] for symbol, (_, action) in sorted(best.items())]
