@@ -184,6 +184,10 @@ class GridMap:
         if self.kind[cell] == UNSEEN:
             self.clear[cell] = NO
 
+    def ignore(self, cell):
+        """Take a cell for one not worth a look."""
+        self.unseen[cell] = NO
+
     def novelty(self, cell, direction):
         """How many unseen cells could come into view at this pose, if what is unseen hides nothing."""
         step, right = STEP[direction], STEP[(direction + 1) % 4]
