@@ -10,6 +10,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -21,7 +22,7 @@ from evopolicy_common.blobs import BlobStore, digest_of, is_digest
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.episode import BlobRef, ResourceLimits
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
@@ -31,6 +32,7 @@ from evopolicy_coordinator.store import stored_blobs
 
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
+_MAX_COUNT = 2**31 - 1
 
 _VERBS: dict[type[Message], str] = {
     worker.Register: "register",
@@ -207,12 +209,14 @@ class Intake:
         )
 
     def results_requested(self, m: gateway.ResultsRequest, request: int, stimulus: str) -> AnyEvent:
+        if not 0 <= m.submit_index <= _MAX_COUNT:
+            raise RefusedError("unknown_submit", f"this run has no submit {m.submit_index}")
         return events.ResultsRequested(
             stimulus_id=stimulus,
             request=request,
             run=m.run,
             submit_index=m.submit_index,
-            cursor=max(0, m.cursor),
+            cursor=_cursor(m.cursor),
             wait_s=_wait(m.wait_s),
         )
 
@@ -226,6 +230,7 @@ class Intake:
     def run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
         _check_idempotency_key(m.key)
         wanted = m.settings
+        _check_limits(wanted.limits)
         try:
             suite = catalogue.suite_of(wanted.env)
             cases = self._source.splits(
@@ -264,6 +269,7 @@ class Intake:
     def evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
         _check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
+        _check_limits(m.limits)
         try:
             suite = catalogue.suite_of(m.env)
             cases = self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
@@ -302,7 +308,7 @@ class Intake:
             stimulus_id=stimulus,
             request=request,
             evaluation=m.evaluation,
-            cursor=max(0, m.cursor),
+            cursor=_cursor(m.cursor),
             wait_s=_wait(m.wait_s),
         )
 
@@ -361,6 +367,17 @@ def _or(value: int | None, otherwise: int) -> int:
 def _wait(seconds: float) -> float:
     """A long poll's wait, made finite: NaN decodes."""
     return min(seconds, _MAX_WAIT_S) if seconds > 0 else 0.0
+
+
+def _cursor(cursor: int) -> int:
+    return min(max(0, cursor), _MAX_COUNT)
+
+
+def _check_limits(limits: ResourceLimits) -> None:
+    for name in limits.__struct_fields__:
+        value = getattr(limits, name)
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise RefusedError("invalid_settings", f"limit {name} is {value}; it must be above 0 and finite")
 
 
 def _check_token(expected: str, given: str) -> None:

@@ -1,0 +1,259 @@
+"""The intake: which requests become events, and why the others do not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from store_rows import blob
+
+from evopolicy_common import codec, keys
+from evopolicy_common.blobs import BlobStore
+from evopolicy_common.errors import ProtocolError, RefusedError
+from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.worker import Message
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.intake import Intake
+from evopolicy_coordinator.splits import SplitSource
+from evopolicy_coordinator.state import ROLES, Identity
+
+IDENTITY = Identity(
+    cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
+)
+
+
+class OneRun:
+    """Rights of a coordinator that has the run `r`."""
+
+    def capability(self, run: str) -> str | None:
+        return "capable" if run == "r" else None
+
+
+@pytest.fixture
+def blobs(tmp_path: Path) -> BlobStore:
+    return BlobStore(tmp_path)
+
+
+@pytest.fixture
+def intake(blobs: BlobStore) -> Intake:
+    return make_intake(blobs)
+
+
+def make_intake(blobs: BlobStore) -> Intake:
+    source = SplitSource(data=None, secret=b"s" * 32)
+    return Intake(IDENTITY, blobs, source, allowed_imports=("numpy",), denied_imports=("gymnasium",))
+
+
+def event(intake: Intake, key: str, message: Message) -> Any:
+    return intake.event(intake.parse(key, codec.encode(message), OneRun()), 7, "stimulus")
+
+
+def refused(intake: Intake, key: str, message: Message) -> RefusedError:
+    with pytest.raises(RefusedError) as caught:
+        event(intake, key, message)
+    return caught.value
+
+
+def submit(**changes: Any) -> gateway.Submit:
+    values = {"run": "r", "token": "capable", "key": "k", "env_instances": (0,), "bundle": None, **changes}
+    return gateway.Submit(**values)
+
+
+def create(**settings: Any) -> operator.CreateRun:
+    values = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", **settings}
+    return operator.CreateRun(token="operate", key="k", settings=RunSettings(**values))
+
+
+def evaluate(**changes: Any) -> operator.Evaluate:
+    values = {
+        "token": "operate",
+        "key": "k",
+        "env": "toy/line",
+        "bundle": None,
+        "split": "train",
+        "cases": None,
+    }
+    return operator.Evaluate(**{**values, **changes})
+
+
+SUBMIT = keys.gateway_key("c", "r", "submit")
+OPS = keys.operator_key("c", "any")
+
+
+def test_run_takes_its_numbers_and_cases_from_its_suite(intake: Intake) -> None:
+    made = event(intake, OPS, create())
+    assert (made.budget, made.min_episodes_per_submit, made.max_episodes_per_submit) == (128, 1, 128)
+    assert (len(made.train), len(made.validation), len(made.heldout)) == (64, 16, 32)
+    assert made.split_secret
+    assert len(made.secret) == 32
+    assert keys.valid_name(made.run)
+    assert (made.allowed_imports, made.denied_imports) == (("numpy",), ("gymnasium",))
+    other = event(intake, OPS, create())
+    assert (other.train, other.split_hashes) == (made.train, made.split_hashes)
+    assert made.run != other.run
+    assert made.capability != other.capability
+    assert made.secret != other.secret
+
+
+def test_run_may_ask_for_other_numbers(intake: Intake) -> None:
+    made = event(intake, OPS, create(budget=8, n_validation=3, n_heldout=4, min_episodes_per_submit=2))
+    assert (made.budget, made.min_episodes_per_submit, made.max_episodes_per_submit) == (8, 2, 8)
+    usual = event(intake, OPS, create())
+    assert made.validation == usual.validation[:3]
+    assert made.heldout == usual.heldout[:4]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"env": "toy/lime"}, "toy/line"),
+        ({"budget": 0}, "budget 0"),
+        ({"budget": -1}, "budget -1"),
+        ({"budget": 4, "min_episodes_per_submit": 5}, "5 to 4"),
+        ({"min_episodes_per_submit": 0}, "0 to 128"),
+        ({"n_heldout": 0}, "at least one"),
+        ({"limits": ResourceLimits(act_wall_s=math.nan)}, "limit act_wall_s is nan"),
+        ({"limits": ResourceLimits(memory_bytes=0)}, "limit memory_bytes is 0"),
+        ({"limits": ResourceLimits(submit_wall_s=math.inf)}, "limit submit_wall_s is inf"),
+    ],
+)
+def test_run_with_impossible_settings_is_refused(
+    intake: Intake, settings: dict[str, Any], message: str
+) -> None:
+    error = refused(intake, OPS, create(**settings))
+    assert error.status == "invalid_settings"
+    assert message in error.message
+
+
+def test_evaluation_plays_the_cases_named(intake: Intake) -> None:
+    made = event(intake, OPS, evaluate(cases=(5, 0, 5)))
+    run = event(intake, OPS, create())
+    assert made.cases == (run.train[5], run.train[0], run.train[5])
+    assert len(event(intake, OPS, evaluate(split="heldout")).cases) == 32
+    for cases in ((64,), (-1,), ()):
+        assert refused(intake, OPS, evaluate(cases=cases)).status == "invalid_env_instance"
+
+
+def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
+    intake: Intake, blobs: BlobStore
+) -> None:
+    failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
+    assert event(intake, SUBMIT, submit(bundle_error=failure)).bundle_error == failure
+    assert refused(intake, SUBMIT, submit(bundle="a" * 64)).status == "missing_bundle"
+    assert refused(intake, SUBMIT, submit(bundle="../../identity.json")).status == "missing_bundle"
+    stored = blobs.put(b"bundle")
+    assert event(intake, SUBMIT, submit(bundle=stored)).bundle == stored
+    assert refused(intake, SUBMIT, submit()).status == "bad_message"
+    assert refused(intake, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"
+
+
+@pytest.mark.parametrize("key", ["", "k" * 201])
+def test_idempotency_key_has_a_length(intake: Intake, key: str) -> None:
+    failure = PolicyFailure(category="missing_policy", step_index=None, message="")
+    assert refused(intake, SUBMIT, submit(key=key, bundle_error=failure)).status == "bad_message"
+
+
+def hand_in(**blobs_of_outcome: BlobRef) -> worker.HandIn:
+    outcome = EpisodeOutcome(
+        index=0, episode_return=1.0, length=1, terminated=True, truncated=False, **blobs_of_outcome
+    )
+    result = worker.JobResult(lease_id="l", job_id="j", attempt=1, kind="done", episodes=(outcome,))
+    return worker.HandIn(worker="w", session="s", results=(result,))
+
+
+def test_results_must_hold_or_have_stored_the_blobs_they_name(intake: Intake, blobs: BlobStore) -> None:
+    key = keys.worker_key("c", "done")
+    data = b"trajectory"
+    assert isinstance(event(intake, key, hand_in(trajectory=blob(data))), events.ResultsHandedIn)
+    named = blob(data, inline=False)
+    assert refused(intake, key, hand_in(trajectory=named)).status == "missing_blob"
+    blobs.put(data)
+    assert isinstance(event(intake, key, hand_in(trajectory=named)), events.ResultsHandedIn)
+    wrong = BlobRef(digest=named.digest, size=len(data), inline=b"trajectorY")
+    assert refused(intake, key, hand_in(video=wrong)).status == "bad_blob"
+    assert refused(intake, key, hand_in(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({"token": "guess"}, "bad_token"),
+        ({"token": "operate"}, "bad_token"),
+        ({"protocol": codec.WIRE_VERSION + 1}, "wrong_protocol"),
+        ({"worker": "a/b"}, "bad_name"),
+        ({"worker": ""}, "bad_name"),
+        ({"slots": 0}, "bad_message"),
+    ],
+)
+def test_wrong_registration_is_refused(intake: Intake, changes: dict[str, Any], status: str) -> None:
+    values: dict[str, Any] = {
+        "worker": "w",
+        "token": "join",
+        "protocol": codec.WIRE_VERSION,
+        "slots": 1,
+        "tiers": (),
+        "environments": (),
+        "fingerprint": worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
+    }
+    key = keys.worker_key("c", "register")
+    made = event(intake, key, worker.Register(**values))
+    assert len(made.session) >= 16
+    assert refused(intake, key, worker.Register(**{**values, **changes})).status == status
+
+
+@given(wait=st.floats(), cursor=st.integers(-(2**63), 2**64 - 1))
+def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
+    tmp_path_factory: pytest.TempPathFactory, wait: float, cursor: int
+) -> None:
+    intake = make_intake(BlobStore(tmp_path_factory.getbasetemp()))
+    message = gateway.ResultsRequest(run="r", token="capable", submit_index=0, cursor=cursor, wait_s=wait)
+    made = event(intake, keys.gateway_key("c", "r", "results"), message)
+    assert 0 <= made.wait_s <= 60
+    assert 0 <= made.cursor < 2**31
+
+
+@pytest.mark.parametrize("index", [-1, 2**63])
+def test_submit_index_that_cannot_be_is_unknown(intake: Intake, index: int) -> None:
+    message = gateway.ResultsRequest(run="r", token="capable", submit_index=index, cursor=0, wait_s=0)
+    assert refused(intake, keys.gateway_key("c", "r", "results"), message).status == "unknown_submit"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "evopolicy/v1/other/ops/status",
+        "evopolicy/v1/c/else/status",
+        keys.worker_key("c", "done"),
+        keys.gateway_key("c", "r", "state"),
+        keys.gateway_key("c", "*", "submit"),
+        keys.gateway_key("c", "**", ""),
+        "",
+    ],
+)
+def test_message_on_a_wrong_key_is_refused(intake: Intake, key: str) -> None:
+    with pytest.raises((RefusedError, ProtocolError)):
+        intake.parse(key, codec.encode(submit()), OneRun())
+
+
+@given(payload=st.binary(max_size=200), room=st.sampled_from(["work/lease", "gw/r/submit", "ops/any"]))
+def test_any_bytes_are_refused_without_a_stumble(
+    tmp_path_factory: pytest.TempPathFactory, payload: bytes, room: str
+) -> None:
+    intake = make_intake(BlobStore(tmp_path_factory.getbasetemp()))
+    with pytest.raises((RefusedError, ProtocolError)):
+        intake.parse(f"evopolicy/v1/c/{room}", payload, OneRun())
+
+
+def test_only_what_makes_something_new_asks_for_change(intake: Intake) -> None:
+    assert intake.asks_for_change(SUBMIT, codec.encode(submit()))
+    assert intake.asks_for_change(OPS, codec.encode(create()))
+    assert intake.asks_for_change(OPS, codec.encode(evaluate()))
+    assert not intake.asks_for_change(OPS, codec.encode(operator.StatusRequest(token="")))
+    assert not intake.asks_for_change(SUBMIT, b"junk")
+    assert not intake.asks_for_change(keys.worker_key("c", "done"), codec.encode(hand_in()))
