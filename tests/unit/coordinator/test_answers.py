@@ -1,0 +1,161 @@
+"""Answers from disk: pages that show a gateway its own train episodes only, blobs in checked chunks."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from store_rows import blob, outcome_row, run_row, state_row, submit_row
+
+from evopolicy_common import codec
+from evopolicy_common.blobs import BlobStore
+from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
+from evopolicy_common.messages.operator import EvaluationPage
+from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_coordinator.answers import MAX_PAGE_BYTES, Answers
+from evopolicy_coordinator.core import records
+from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.store import Store
+
+TRAIN = records.train_group("r-1", 0)
+
+
+class Desk:
+    """Answers on a store, waited for."""
+
+    def __init__(self, root: Path) -> None:
+        self.store = Store(root / "db")
+        self.blobs = BlobStore(root / "blobs")
+        self.answers = Answers(root / "db", self.blobs)
+        self._answered: queue.Queue[Message | None] = queue.Queue()
+
+    def page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Any:
+        self.answers.page(effect, self._answered.put)
+        return self._answered.get(timeout=10)
+
+    def results(self, cursor: int, upto: int | None) -> Any:
+        return self.page(ReadResults(request=1, run="r-1", submit_index=0, cursor=cursor, upto=upto))
+
+    def put(self, message: BlobPut, most: int = 1 << 20) -> Any:
+        self.answers.put("sender", message, most, self._answered.put)
+        return self._answered.get(timeout=10)
+
+    def get(self, run: str | None, digest: str, offset: int = 0) -> Any:
+        self.answers.get(run, BlobGet(sender="", token="", digest=digest, offset=offset), self._answered.put)
+        return self._answered.get(timeout=10)
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    desk = Desk(tmp_path)
+    desk.store.write([run_row(), state_row(), submit_row()])
+    yield desk
+    desk.answers.close()
+    desk.store.close()
+
+
+def put(whole: bytes, /, **changes: Any) -> BlobPut:
+    ref = blob(whole)
+    values = {"sender": "", "token": "", "digest": ref.digest, "size": len(whole), "offset": 0, "data": whole}
+    return BlobPut(**{**values, **changes})
+
+
+def test_page_shows_what_is_released_and_no_more(desk: Desk) -> None:
+    desk.store.write([outcome_row(TRAIN, index, index) for index in range(4)])
+    page = desk.results(0, 2)
+    assert isinstance(page, ResultsPage)
+    assert [episode.index for episode in page.episodes] == [0, 1]
+    assert (page.cursor, page.done) == (2, None)
+    assert desk.results(2, 2).episodes == ()
+
+
+def test_end_comes_with_the_page_that_reaches_it(desk: Desk) -> None:
+    big = blob(b"x" * (MAX_PAGE_BYTES // 2))
+    desk.store.write([outcome_row(TRAIN, index, index, big) for index in range(4)])
+    desk.store.write([submit_row(status="ok", completed_at=2.0, released=4, n_kept=4)])
+    cursor, pages = 0, []
+    while True:
+        page = desk.results(cursor, 2)
+        pages.append(page)
+        cursor = page.cursor
+        if page.done is not None:
+            break
+    assert [episode.index for page in pages for episode in page.episodes] == [0, 1, 2, 3]
+    assert len(pages) > 1
+    assert pages[-1].done.status == "ok"
+    assert desk.results(0, None).episodes[0].trajectory == big
+
+
+def test_feedback_of_an_episode_carries_what_an_agent_may_see(desk: Desk) -> None:
+    desk.store.write([outcome_row(TRAIN, 0, 0)])
+    (episode,) = desk.results(0, 1).episodes
+    assert set(msgspec.to_builtins(episode)) == set(EpisodeFeedback.__struct_fields__)
+    assert not {"wall_s", "policy_cpu_s", "worker", "seed"} & set(EpisodeFeedback.__struct_fields__)
+
+
+def test_unknown_submit_and_unfinished_run_are_refused(desk: Desk) -> None:
+    effect = ReadResults(request=1, run="r-1", submit_index=7, cursor=0, upto=None)
+    assert desk.page(effect).status == "unknown_submit"
+    assert desk.page(ReadFinished(request=1, run="r-1")).status == "unknown_run"
+
+
+def test_evaluation_is_finished_on_the_page_that_reaches_its_end(desk: Desk) -> None:
+    group = records.evaluation_group("e")
+    desk.store.write([outcome_row(group, index, index, blob(b"x" * MAX_PAGE_BYTES)) for index in range(2)])
+    effect = ReadEvaluation(request=1, evaluation="e", cursor=0, upto=2, total=2, finished=True)
+    first = desk.page(effect)
+    assert isinstance(first, EvaluationPage)
+    assert (len(first.outcomes), first.finished) == (1, False)
+    second = desk.page(msgspec.structs.replace(effect, cursor=first.cursor))
+    assert (len(second.outcomes), second.finished) == (1, True)
+
+
+def test_blob_put_in_chunks_is_got_in_chunks(desk: Desk) -> None:
+    data = bytes(range(256)) * 1000
+    size, half = len(data), len(data) // 2
+    assert desk.put(put(data, data=data[:half])) == BlobAck(have=half)
+    assert desk.put(put(data, offset=0, data=data[half:])) == BlobAck(have=size - half)
+    assert desk.put(put(data, offset=7, data=b"")) == BlobAck(have=size - half)
+    assert desk.put(put(data, offset=0, data=data[:half])) == BlobAck(have=half)
+    assert desk.put(put(data, offset=half, data=data[half:])) == BlobAck(have=size)
+    got = bytearray()
+    while len(got) < size:
+        chunk = desk.get(None, blob(data).digest, len(got))
+        assert isinstance(chunk, BlobChunk)
+        assert chunk.size == size
+        assert 0 < len(chunk.data) <= codec.CHUNK_BYTES
+        got += chunk.data
+    assert bytes(got) == data
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"digest": "../../etc/passwd"}, {"size": -1}, {"size": 1 << 40}, {"digest": "0" * 64}],
+)
+def test_blob_that_cannot_be_is_refused(desk: Desk, changes: dict[str, Any]) -> None:
+    answer = desk.put(put(b"data", **changes))
+    assert isinstance(answer, Refused)
+    assert answer.status == "bad_blob"
+
+
+def test_run_gets_only_the_blobs_that_its_train_feedback_names(desk: Desk) -> None:
+    named, other = blob(b"named", inline=False), blob(b"other", inline=False)
+    desk.blobs.put(b"named")
+    desk.blobs.put(b"other")
+    desk.store.write(
+        [outcome_row(TRAIN, 0, 0, named), outcome_row(records.heldout_group("r-1", 0), 0, 0, other)]
+    )
+    assert desk.get("r-1", named.digest).data == b"named"
+    assert desk.get("r-1", other.digest).status == "unknown_blob"
+    assert desk.get("r-2", named.digest).status == "unknown_blob"
+    assert desk.get(None, other.digest).data == b"other"
+    assert desk.get(None, "no digest").status == "unknown_blob"
+
+
+def test_store_that_cannot_be_read_leaves_the_asker_to_ask_again(desk: Desk) -> None:
+    desk.store._db.execute("UPDATE submits SET data = x'00'")
+    assert desk.results(0, 1) is None
