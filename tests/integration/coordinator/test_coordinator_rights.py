@@ -20,6 +20,7 @@ from coordinator_harness import (
 )
 
 from evopolicy_common import codec, keys
+from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
@@ -198,10 +199,13 @@ def test_router_lets_a_role_ask_on_its_own_keys_only(coordinator: Coordinator, s
 def test_wrong_password_is_not_let_in(coordinator: Coordinator) -> None:
     async def scenario() -> None:
         known = coordinator.credentials("operator")
-        for changes in ({"password": "guess"}, {"user": "nobody"}, {"user": "gateway"}):
-            with pytest.raises(TransportError):
-                async with connect(msgspec.structs.replace(known, **changes), timeout_s=1.5):
-                    pass
+        changes = ({"password": "guess"}, {"user": "nobody"}, {"user": "gateway"})
+        await asyncio.gather(*(shut_out(msgspec.structs.replace(known, **change)) for change in changes))
+
+    async def shut_out(credentials: Credentials) -> None:
+        with pytest.raises(TransportError):
+            async with connect(credentials, timeout_s=1.5):
+                pass
 
     run(scenario)
 
