@@ -1,0 +1,159 @@
+"""The environment's process of a slot: `python -m evopolicy_worker.env_process`, started and told by `slot.Slot`.
+
+It owns seeds, rewards and trajectories, imports the simulators it plays and nothing of Zenoh, and ends with its parent.
+Commands come on standard input, answers go to what was standard output; whatever simulators print goes to standard
+error. The main thread plays; the monitor's thread hears commands meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError
+from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.episodes import CancelledJobError, Player, Progress, fault_of
+from evopolicy_worker.monitor import Monitor
+from evopolicy_worker.sandbox import jail
+from evopolicy_worker.sandbox.zygote import Zygote
+
+_PROGRESS_S = 0.25
+_PR_SET_PDEATHSIG = 1
+
+
+class Channel:
+    """Commands in, answers out."""
+
+    def __init__(self, commands: int, answers: int) -> None:
+        self._commands = commands
+        self._answers = answers
+        self._received = bytearray()
+        self._lock = threading.Lock()
+
+    def receive(self) -> list[messages.Command]:
+        """The commands that arrived; blocks until there are bytes. Ends this process when the slot is gone."""
+        data = os.read(self._commands, 1 << 20)
+        if not data:
+            os._exit(0)
+        self._received += data
+        found: list[messages.Command] = []
+        size = messages.LENGTH.size
+        while len(self._received) >= size:
+            (length,) = messages.LENGTH.unpack_from(self._received)
+            if len(self._received) < size + length:
+                break
+            found.append(messages.commands.decode(bytes(self._received[size : size + length])))
+            del self._received[: size + length]
+        return found
+
+    def send(self, message: messages.Message) -> None:
+        data = memoryview(messages.framed(message))
+        with self._lock:
+            while data:
+                data = data[os.write(self._answers, data) :]
+
+
+class EnvProcess:
+    """One slot's life: start, then job after job."""
+
+    def __init__(self, channel: Channel, commands: int) -> None:
+        self._channel = channel
+        self._jobs: queue.SimpleQueue[messages.Play] = queue.SimpleQueue()
+        self._progress: Progress | None = None
+        self._told = (0.0, 0)
+        self._monitor = Monitor(commands, self._hear, self._tell)
+
+    def run(self, start: messages.Start, early: list[messages.Command]) -> None:
+        if start.core is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(0, {start.core})
+        scratch = Path(start.scratch)
+        scratch.mkdir(parents=True, exist_ok=True)
+        plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed)
+        player = Player(Zygote(plan, scratch), plan, self._monitor, scratch)
+        for command in early:
+            self._take(command)
+        self._monitor.start()
+        player.prepare()
+        self._channel.send(messages.Ready())
+        while True:
+            command = self._jobs.get()
+            self._channel.send(self._play(player, command))
+            with contextlib.suppress(SandboxError):
+                player.prepare()
+
+    def _play(self, player: Player, command: messages.Play) -> messages.Answer:
+        progress = self._progress = Progress()
+        self._monitor.ticking = True
+        self._monitor.wake()
+        try:
+            outcomes = player.play(command.job, command.bundle, progress)
+            return messages.Played(outcomes=tuple(outcomes), cancelled=progress.cancelled)
+        except CancelledJobError:
+            return messages.Played(outcomes=(), cancelled=True)
+        except SlotDiedError as error:
+            return messages.Fault(kind="died", message=str(error))
+        except SandboxError as error:
+            return messages.Fault(kind="sandbox", message=str(error))
+        except Exception as error:
+            if progress.cancelled:
+                return messages.Played(outcomes=(), cancelled=True)
+            return messages.Fault(kind="worker", message=fault_of(error))
+        finally:
+            self._progress = None
+            self._monitor.ticking = False
+
+    def _hear(self) -> None:
+        for command in self._channel.receive():
+            self._take(command)
+
+    def _take(self, command: messages.Command) -> None:
+        if isinstance(command, messages.Play):
+            self._jobs.put(command)
+        elif isinstance(command, messages.Cancel):
+            progress = self._progress
+            if progress is not None:
+                progress.cancel()
+
+    def _tell(self) -> None:
+        progress = self._progress
+        if progress is None:
+            return
+        now = time.monotonic()
+        at, steps = self._told
+        if progress.steps != steps and now - at >= _PROGRESS_S:
+            self._told = now, progress.steps
+            self._channel.send(messages.Told(episodes_done=progress.episodes_done, steps=progress.steps))
+
+
+def main() -> None:
+    """The process's entry."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    commands, answers = os.dup(0), os.dup(1)
+    with open(os.devnull) as nothing:
+        os.dup2(nothing.fileno(), 0)
+    os.dup2(2, 1)
+    channel = Channel(commands, answers)
+    received: list[messages.Command] = []
+    while not received:
+        received = channel.receive()
+    start, *early = received
+    if not isinstance(start, messages.Start):
+        sys.exit(f"the first command is {type(start).__name__}, not Start")
+    try:
+        EnvProcess(channel, commands).run(start, early)
+    except EvopolicyError as error:
+        kind = "sandbox" if isinstance(error, SandboxError) else "worker"
+        channel.send(messages.Fault(kind=kind, message=str(error)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,375 @@
+"""The episode loop: one environment, one policy process, step by step; what the environment's process runs.
+
+Rules:
+- The policy is given observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, an info.
+- A policy that fails is replaced for the rest of the episode by uniform random actions keyed by the policy seed, and
+  every row with such an action says `policy_failed`. An action outside the space is repaired and its row marked.
+- What the policy did is a result; what the environment or the sandbox did wrong is raised.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import time
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.blobs import digest_of
+from evopolicy_common.errors import EvopolicyError, WorkerError
+from evopolicy_common.messages.episode import (
+    NO_POLICY,
+    BlobRef,
+    EpisodeOutcome,
+    EpisodeSpec,
+    Job,
+    PolicyFailure,
+    ResourceLimits,
+)
+from evopolicy_common.trajectory import Recorder
+from evopolicy_worker import environments
+from evopolicy_worker.environments import Environment
+from evopolicy_worker.monitor import Monitor
+from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
+from evopolicy_worker.sandbox.jail import Jail
+from evopolicy_worker.sandbox.zygote import Child, Zygote
+
+MAX_WARM_ENVIRONMENTS = 4
+"""Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
+
+
+class CancelledJobError(Exception):
+    """The job was cancelled while it ran."""
+
+
+class Progress:
+    """How far the running job is; written by the loop, read by the monitor's thread."""
+
+    def __init__(self) -> None:
+        self.episodes_done = 0
+        self.steps = 0
+        self.cancelled = False
+        self.policy: PolicyProcess | None = None
+
+    def cancel(self) -> None:
+        """Ends the running job at the next step, and the policy at once."""
+        self.cancelled = True
+        policy = self.policy
+        if policy is not None:
+            policy.kill()
+
+
+class Player:
+    """Plays jobs one after another with warm environments and a zygote."""
+
+    def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
+        self._zygote = zygote
+        self._jail = jail
+        self._monitor = monitor
+        self._scratch = scratch
+        self._environments: OrderedDict[str, Environment] = OrderedDict()
+        self._bundle: tuple[str, BundleFiles] | None = None
+        self._prepared: Child | None = None
+        self._n_policies = 0
+
+    def play(self, job: Job, folder: str | None, progress: Progress) -> list[EpisodeOutcome]:
+        """Play the job's episodes in order.
+
+        Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
+        """
+        environment = self._environment(job.env)
+        files = self._read_bundle(folder) if job.bundle is not None else None
+        policies = _Policies(self, job, files, environment)
+        outcomes: list[EpisodeOutcome] = []
+        try:
+            for k, spec in enumerate(job.episodes):
+                if progress.cancelled:
+                    raise CancelledJobError
+                outcome = _Episode(job, spec, environment, policies, progress).play(k)
+                outcomes.append(outcome)
+                progress.episodes_done += 1
+                if _yields_no_policy(job, outcome):
+                    assert outcome.failure is not None
+                    outcomes += [
+                        _unplayed(other.index, outcome.failure) for other in job.episodes[len(outcomes) :]
+                    ]
+                    break
+        finally:
+            policies.close(progress)
+        return outcomes
+
+    def prepare(self) -> None:
+        """Fork the process for the next policy; to be called while there is nothing else to do."""
+        if self._prepared is None:
+            self._prepared = self._zygote.spawn()
+
+    def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
+        child, self._prepared = self._prepared, None
+        if child is None:
+            child = self._zygote.spawn()
+        self._n_policies += 1
+        folder = str(self._scratch / "policies" / str(self._n_policies))
+        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, folder)
+
+    def close(self) -> None:
+        for environment in self._environments.values():
+            environment.close()
+        self._environments.clear()
+        self._zygote.close()
+
+    def _environment(self, env_id: str) -> Environment:
+        environment = self._environments.get(env_id)
+        if environment is None:
+            while len(self._environments) >= MAX_WARM_ENVIRONMENTS:
+                self._environments.popitem(last=False)[1].close()
+            environment = self._environments[env_id] = environments.make(env_id)
+        self._environments.move_to_end(env_id)
+        return environment
+
+    def _read_bundle(self, folder: str | None) -> BundleFiles:
+        if folder is None:
+            raise WorkerError("a job with a bundle came without the bundle's folder")
+        if self._bundle is None or self._bundle[0] != folder:
+            self._bundle = folder, _read_files(folder)
+        return self._bundle[1]
+
+
+class _Policies:
+    """The policy of each episode of a job: its own, or one for several."""
+
+    def __init__(self, player: Player, job: Job, files: BundleFiles | None, environment: Environment) -> None:
+        self._player = player
+        self._job = job
+        self._files = files
+        description = environment.description
+        self._env_meta = job.env_meta | {
+            "obs_space": description.obs_space,
+            "action_space": description.action_space,
+            "obs_storage": description.obs_storage,
+        }
+        self._policy: PolicyProcess | None = None
+
+    def take(self, k: int, spec: EpisodeSpec, progress: Progress) -> PolicyProcess:
+        """The policy for the job's k-th episode, before its reset. Raises PolicyFailedError."""
+        job, files = self._job, self._files
+        assert files is not None
+        if self._policy is not None and not (job.policy_every and k % job.policy_every == 0):
+            self._policy.begin_episode(first=False)
+            return self._policy
+        self._end()
+        if not any(name == "policy.py" for name, _, _ in files.names):
+            raise PolicyFailedError(
+                PolicyFailure(
+                    category="missing_policy",
+                    step_index=None,
+                    message="there is no policy.py in system/; it must hold a top-level class Policy",
+                )
+            )
+        policy = self._policy = progress.policy = self._player.new_policy(job.limits)
+        n = len(job.episodes) if job.policy_scope == "submit" else 1
+        if job.policy_every:
+            n = min(n, job.policy_every)
+        policy.init(files, spec.policy_seed, self._env_meta, job.observations, cpu_s=job.limits.cpu_s * n)
+        return policy
+
+    def release(self) -> Ended:
+        """What the policy leaves of the episode that ended; a policy for one episode ends with it."""
+        policy = self._policy
+        if policy is None:
+            return Ended(b"", b"", 0.0)
+        if self._job.policy_scope == "submit" and not policy.dead:
+            ended = policy.take_output()
+            if not policy.dead:
+                return ended
+        else:
+            ended = policy.end()
+        self._policy = None
+        return ended
+
+    def close(self, progress: Progress) -> None:
+        progress.policy = None
+        self._end()
+
+    def _end(self) -> None:
+        if self._policy is not None:
+            policy, self._policy = self._policy, None
+            policy.kill()
+            policy.end()
+
+
+class _Episode:
+    """One episode from reset to its end."""
+
+    def __init__(
+        self,
+        job: Job,
+        spec: EpisodeSpec,
+        environment: Environment,
+        policies: _Policies,
+        progress: Progress,
+    ) -> None:
+        self._job = job
+        self._spec = spec
+        self._environment = environment
+        self._policies = policies
+        self._progress = progress
+        self._failure: PolicyFailure | None = None
+
+    def play(self, k: int) -> EpisodeOutcome:
+        job, spec = self._job, self._spec
+        start = time.monotonic()
+        policy = self._begin(k) if job.bundle is not None else None
+        if self._failure is not None and _verdict_of_submit(job, spec, self._failure):
+            ended = self._policies.release()
+            return msgspec.structs.replace(
+                _unplayed(spec.index, self._failure),
+                stdout=ended.stdout,
+                stderr=ended.stderr,
+                policy_cpu_s=ended.cpu_s,
+                wall_s=time.monotonic() - start,
+            )
+        recorder = Recorder(job.record, job.observations)
+        total, components, length, terminated, truncated = self._steps(policy, recorder)
+        wall_s = time.monotonic() - start
+        ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
+        return EpisodeOutcome(
+            index=spec.index,
+            episode_return=total,
+            length=length,
+            terminated=terminated,
+            truncated=truncated,
+            failure=self._failure,
+            reward_components=components,
+            trajectory=_blob(recorder.finish()),
+            stdout=ended.stdout,
+            stderr=ended.stderr,
+            wall_s=wall_s,
+            policy_cpu_s=ended.cpu_s,
+        )
+
+    def _begin(self, k: int) -> PolicyProcess | None:
+        """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
+        try:
+            policy = self._policies.take(k, self._spec, self._progress)
+            policy.reset(self._spec.episode_index)
+            policy.prepare_acts()
+            return policy
+        except PolicyFailedError as error:
+            self._note(error.failure)
+            return None
+
+    def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
+        if self._progress.cancelled:
+            raise CancelledJobError
+        self._failure = msgspec.structs.replace(failure, step_index=step)
+
+    def _steps(
+        self, policy: PolicyProcess | None, recorder: Recorder
+    ) -> tuple[float, dict[str, float], int, bool, bool]:
+        """Play to the end: return, components of the reward, length, terminated, truncated."""
+        environment, progress = self._environment, self._progress
+        codec = environment.action_codec
+        repair, step, append = codec.repair, environment.step, recorder.append
+        actions_only = self._job.record == "actions"
+        rng = None if policy is not None else random_actions(self._spec.policy_seed)
+        failed = self._job.bundle is not None and policy is None
+        names = environment.description.reward_components
+        sums = dict.fromkeys(names, 0.0)
+        total, t = 0.0, 0
+        obs = environment.reset(self._spec.case)
+        while True:
+            invalid = False
+            if policy is not None:
+                try:
+                    returned = policy.act(obs)
+                    action, invalid = repair(returned)
+                except PolicyFailedError as error:
+                    self._note(error.failure, t)
+                    policy, failed = None, True
+                    rng = random_actions(self._spec.policy_seed)
+            if rng is not None:
+                action = returned = codec.sample(rng)
+            next_obs, reward, terminated, truncated, info = step(action)
+            for name in names:
+                sums[name] += _number(info.get(name))
+            if invalid:
+                info = {**info, "action_invalid": True}
+            if failed:
+                info = {**info, "policy_failed": True}
+            append(obs, action if actions_only else returned, reward, terminated, truncated, info)
+            total += reward
+            t += 1
+            progress.steps += 1
+            if terminated or truncated:
+                break
+            if progress.cancelled:
+                raise CancelledJobError
+            obs = next_obs
+        for name, value in (("return", total), *sums.items()):
+            if not math.isfinite(value):
+                raise WorkerError(f"{self._job.env}, episode {self._spec.index}: its {name} is {value}")
+        return total, sums, t, terminated, truncated
+
+
+def random_actions(policy_seed: bytes) -> np.random.Generator:
+    """The generator of the uniform random actions that play in place of a policy."""
+    digest = hashlib.sha256(b"evopolicy random actions\0" + policy_seed).digest()
+    return np.random.default_rng(int.from_bytes(digest, "little"))
+
+
+def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:
+    """Whether the failure says that the whole submit yields no Policy: there is nothing to play then.
+
+    Hidden episodes are played in any case: a return of nothing would beat every policy where steps cost.
+    """
+    return spec.index == 0 and job.record == "full" and failure.category in NO_POLICY
+
+
+def _yields_no_policy(job: Job, outcome: EpisodeOutcome) -> bool:
+    return (
+        outcome.failure is not None
+        and outcome.length == 0
+        and _verdict_of_submit(job, job.episodes[0], outcome.failure)
+    )
+
+
+def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
+    return EpisodeOutcome(
+        index=index, episode_return=0.0, length=0, terminated=False, truncated=False, failure=failure
+    )
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _blob(data: bytes) -> BlobRef:
+    return BlobRef(digest=digest_of(data), size=len(data), inline=data)
+
+
+def _read_files(folder: str) -> BundleFiles:
+    names: list[tuple[str, bool, int]] = []
+    data: list[bytes] = []
+    for root, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            path = os.path.join(root, name)
+            try:
+                with open(path, "rb") as file:
+                    content = file.read()
+                    executable = bool(os.fstat(file.fileno()).st_mode & 0o100)
+            except OSError as error:
+                raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
+            names.append((os.path.relpath(path, folder), executable, len(content)))
+            data.append(content)
+    return BundleFiles(names, data)
+
+
+def fault_of(error: BaseException) -> str:
+    """An error of ours in one line, with its kind where it is not one raised on purpose."""
+    return str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"

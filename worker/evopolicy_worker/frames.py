@@ -1,0 +1,210 @@
+"""The bytes between an environment's process and a policy's: observations out, actions in.
+
+Rules: a question is written in one piece and answered by exactly one frame. What comes back is hostile: it is bounded,
+parsed as plain values and arrays, and never executed; anything else raises BadReplyError. The other end is
+`sandbox/inside/player.py`, which names the same numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import SpaceSchema
+
+INIT, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5
+OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
+REQUEST_HEADER = struct.Struct("<IBxxxq")
+REPLY_HEADER = struct.Struct("<IBxxx")
+MAX_REPLY_BYTES = (1 << 20) + (1 << 16)
+MAX_DEPTH = 24
+
+Writer = Callable[[Any], list[Any]]
+"""From an observation to the buffers of its payload, in order."""
+
+_INT = struct.Struct("<q")
+_FLOAT = struct.Struct("<d")
+_EXT_ARRAY, _EXT_INT = 1, 2
+_DTYPES = {
+    np.dtype(name).newbyteorder("<").str.encode().ljust(4, b"\0"): np.dtype(name).newbyteorder("<")
+    for name in (
+        *("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+        *("float16", "float32", "float64"),
+    )
+}
+
+
+class BadReplyError(Exception):
+    """The policy's process sent what is no reply; the message says what."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What the policy's own code raised, as its process tells it: text that the policy may have forged."""
+
+    stage: str
+    kind: str | None
+    message: str
+    traceback: str
+    missing: str | None = None
+
+
+_report_decoder = msgspec.json.Decoder(Report)
+
+
+def compile_writer(space: SpaceSchema) -> Writer:
+    """How observations of this space are laid out: fixed arrays and ints, each on a multiple of 8 bytes, then texts."""
+    if space["type"] in ("Box", "Image"):
+        shape = tuple(space["shape"])
+
+        def write_array(obs: Any) -> list[Any]:
+            if obs.shape != shape:
+                raise WorkerError(f"the environment gave an observation of shape {obs.shape}, not {shape}")
+            return [obs]
+
+        return write_array
+    fixed: list[Callable[[Any, list[Any]], None]] = []
+    texts: list[Callable[[Any, list[Any]], None]] = []
+    _collect(space, (), fixed, texts)
+    steps = [*fixed, *texts]
+
+    def write(obs: Any) -> list[Any]:
+        out: list[Any] = []
+        for step in steps:
+            step(obs, out)
+        return out
+
+    return write
+
+
+def _collect(space: SpaceSchema, path: tuple[Any, ...], fixed: list[Any], texts: list[Any]) -> None:
+    kind = space["type"]
+    if kind == "Dict":
+        for key, part in space["spaces"].items():
+            _collect(part, (*path, key), fixed, texts)
+    elif kind == "Tuple":
+        for index, part in enumerate(space["spaces"]):
+            _collect(part, (*path, index), fixed, texts)
+    elif kind == "Text":
+        texts.append(_text_step(path))
+    elif kind == "Discrete":
+        fixed.append(_int_step(path))
+    else:
+        if kind in ("Box", "Image"):
+            shape, size = tuple(space["shape"]), np.dtype(space["dtype"]).itemsize
+        elif kind == "MultiDiscrete":
+            shape, size = np.shape(space["nvec"]), 8
+        else:
+            n = space["n"]
+            shape, size = (n,) if isinstance(n, int) else tuple(n), 1
+        fixed.append(_array_step(path, shape, -(int(np.prod(shape, dtype=np.int64)) * size) % 8))
+
+
+def _at(obs: Any, path: tuple[Any, ...]) -> Any:
+    for key in path:
+        obs = obs[key]
+    return obs
+
+
+def _array_step(
+    path: tuple[Any, ...], shape: tuple[int, ...], padding: int
+) -> Callable[[Any, list[Any]], None]:
+    pad = bytes(padding)
+
+    def step(obs: Any, out: list[Any]) -> None:
+        leaf = _at(obs, path)
+        if leaf.shape != shape:
+            raise WorkerError(f"the environment gave {path} of shape {leaf.shape}, not {shape}")
+        out.append(leaf)
+        if pad:
+            out.append(pad)
+
+    return step
+
+
+def _int_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
+    def step(obs: Any, out: list[Any]) -> None:
+        out.append(_INT.pack(_at(obs, path)))
+
+    return step
+
+
+def _text_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
+    def step(obs: Any, out: list[Any]) -> None:
+        text = _at(obs, path).encode("utf-8", "surrogatepass")
+        out.append(struct.pack("<I", len(text)) + text)
+
+    return step
+
+
+def init_frame(init: dict[str, Any], files: list[bytes]) -> list[bytes]:
+    """The first request: what the policy's process is to be, and its bundle."""
+    head = json.dumps(init).encode()
+    length = len(head) + sum(map(len, files))
+    return [REQUEST_HEADER.pack(length, INIT, len(head)), head, *files]
+
+
+def action(tag: int, payload: bytes) -> Any:
+    """What `act` returned. BadReplyError for what is no action at all; whether it is valid is not decided here."""
+    try:
+        if tag == ARRAY:
+            return _array(payload)
+        if tag == INT:
+            return _INT.unpack(payload)[0]
+        if tag == FLOATS:
+            return list(struct.unpack(f"<{len(payload) // 8}d", payload))
+        if tag == FLOAT:
+            return _FLOAT.unpack(payload)[0]
+        if tag == GENERIC:
+            value = _decoder.decode(payload)
+            _check_depth(value, MAX_DEPTH)
+            return value
+    except (struct.error, msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise BadReplyError(f"what it sent as an action cannot be read: {error}") from error
+    raise BadReplyError(f"it answered with frame {tag}, which is no action")
+
+
+def report(payload: bytes) -> Report:
+    """The failure in a FAILED frame; BadReplyError when it is none."""
+    try:
+        return _report_decoder.decode(payload)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise BadReplyError(f"its report of a failure cannot be read: {error}") from error
+
+
+def _array(data: bytes | memoryview) -> NDArray[Any]:
+    code, ndim = struct.unpack_from("<4sI", data)
+    dtype = _DTYPES.get(code)
+    if dtype is None or ndim > 32:
+        raise ValueError(f"an array of type {code!r} with {ndim} axes")
+    shape = struct.unpack_from(f"<{ndim}I", data, 8)
+    return np.frombuffer(data, dtype, offset=8 + 4 * ndim).reshape(shape)
+
+
+def _ext_hook(code: int, data: memoryview) -> Any:
+    if code == _EXT_ARRAY:
+        return _array(bytes(data))
+    if code == _EXT_INT and len(data) <= 1300:
+        return int(bytes(data))
+    raise ValueError(f"extension {code} of {len(data)} bytes")
+
+
+_decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
+
+
+def _check_depth(value: Any, left: int) -> None:
+    if left < 0:
+        raise ValueError(f"it nests deeper than {MAX_DEPTH}")
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list):
+        return
+    for item in value:
+        if isinstance(item, dict | list):
+            _check_depth(item, left - 1)

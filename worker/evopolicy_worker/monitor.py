@@ -1,0 +1,205 @@
+"""The environment process's second thread: keeps a policy's output drained and its limits, and hears the supervisor.
+
+Rules: the episode loop never waits for this thread and pays nothing for it per step. Whoever touches a policy's output
+descriptors holds the lock. A limit that is passed ends the policy by SIGKILL; the loop then finds its pipe closed and
+the verdict here.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from evopolicy_common.messages.episode import FailureCategory, ResourceLimits
+from evopolicy_worker.sandbox.zygote import Child
+
+TICK_S = 0.1
+"""How often limits are looked at while a policy works, seconds; sooner when one is near."""
+_SHORTEST_TICK_S = 0.005
+_PIECE = 65536
+
+
+class Verdict(NamedTuple):
+    """The limit that a policy was ended for."""
+
+    category: FailureCategory
+    message: str
+    limit: float
+    used: float
+
+
+class Output:
+    """The first `limit` bytes of a stream; what follows is read and dropped."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._kept = bytearray()
+        self._open = True
+
+    def drain(self, fd: int) -> None:
+        """Read what is there, without waiting."""
+        for _ in range(64):
+            if not self._open:
+                return
+            try:
+                data = os.read(fd, _PIECE)
+            except BlockingIOError:
+                return
+            self._open = bool(data)
+            self._kept += data[: self._limit - len(self._kept)]
+
+    @property
+    def open(self) -> bool:
+        return self._open
+
+    def take(self) -> bytes:
+        """What was kept, and start anew."""
+        kept, self._kept = bytes(self._kept), bytearray()
+        return kept
+
+
+class Watch:
+    """What is watched of one policy process. The episode loop writes the times, the monitor reads them."""
+
+    def __init__(self, child: Child, limits: ResourceLimits, *, count_threads: bool) -> None:
+        self.child = child
+        self.limits = limits
+        self.stdout = Output(limits.output_bytes)
+        self.stderr = Output(limits.output_bytes)
+        self.since = 0.0
+        """Since when (monotonic) the policy owes an answer; 0.0 while it owes none."""
+        self.what = ""
+        """What it was asked for: `import`, `init`, `reset`, `act`."""
+        self.answer_limit_s = limits.init_wall_s
+        self.spent_s = 0.0
+        """Its earlier wall time in this episode."""
+        self.cpu_start_s = 0.0
+        self.verdict: Verdict | None = None
+        self._cpu_clock = (~child.host_pid << 3) | 2 if child.host_pid else 0
+        self._count_threads = count_threads
+        for fd in (child.stdout, child.stderr):
+            os.set_blocking(fd, False)
+
+    def begin_episode(self) -> None:
+        """Wall and CPU time count from here."""
+        self.spent_s = 0.0
+        self.cpu_start_s = self.cpu_s()
+
+    def cpu_s(self) -> float:
+        """CPU time of the process so far, seconds; 0.0 when it is gone."""
+        try:
+            return time.clock_gettime(self._cpu_clock) if self._cpu_clock else 0.0
+        except OSError:
+            return 0.0
+
+    def drain(self) -> None:
+        self.stdout.drain(self.child.stdout)
+        self.stderr.drain(self.child.stderr)
+
+    def judge(self, now: float) -> float:
+        """Ends the policy if it passed a limit; seconds until it is worth looking again."""
+        since = self.since
+        if not since or self.verdict is not None:
+            return TICK_S
+        limits = self.limits
+        running = now - since
+        left_answer = self.answer_limit_s - running
+        left_episode = limits.episode_wall_s - self.spent_s - running
+        cpu = self.cpu_s() - self.cpu_start_s
+        verdict: Verdict | None = None
+        if left_answer <= 0:
+            verdict = Verdict(
+                "act_timeout",
+                f"{self.what} took longer than {self.answer_limit_s:g} s",
+                self.answer_limit_s,
+                running,
+            )
+        elif left_episode <= 0:
+            used = self.spent_s + running
+            verdict = Verdict(
+                "episode_timeout",
+                f"the policy worked for longer than {limits.episode_wall_s:g} s in this episode",
+                limits.episode_wall_s,
+                used,
+            )
+        elif cpu > limits.cpu_s:
+            verdict = Verdict(
+                "cpu_limit",
+                f"the policy used more than {limits.cpu_s:g} s of CPU time in this episode",
+                limits.cpu_s,
+                cpu,
+            )
+        elif self._count_threads and (n := _threads(self.child.host_pid)) > limits.processes:
+            verdict = Verdict(
+                "process_limit",
+                f"the policy had {n} threads; {limits.processes} are the limit",
+                limits.processes,
+                n,
+            )
+        if verdict is not None and self.since == since:
+            self.verdict = verdict
+            self.child.kill()
+        return max(_SHORTEST_TICK_S, min(TICK_S, left_answer, left_episode))
+
+
+class Monitor(threading.Thread):
+    """Watches one policy at a time, and one descriptor for commands."""
+
+    def __init__(self, commands: int, on_command: Callable[[], None], on_tick: Callable[[], None]) -> None:
+        """`on_command` reads from `commands` when there is something; `on_tick` runs every tick while one is watched."""
+        super().__init__(name="monitor", daemon=True)
+        self._commands = commands
+        self._on_command = on_command
+        self._on_tick = on_tick
+        self._lock = threading.Lock()
+        self._watch: Watch | None = None
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.ticking = False
+        """Whether to tick although no policy is watched: while random actions are played."""
+
+    def watch(self, watch: Watch | None) -> None:
+        """Watch this policy from now on; None to stop. After the return no other thread touches the one before."""
+        with self._lock:
+            self._watch = watch
+        self.wake()
+
+    def wake(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+    def run(self) -> None:
+        pause_s = 0.0
+        while True:
+            with self._lock:
+                watch = self._watch
+            poller = select.poll()
+            poller.register(self._commands, select.POLLIN)
+            poller.register(self._wake, select.POLLIN)
+            busy = watch is not None or self.ticking
+            if watch is not None:
+                for output, fd in ((watch.stdout, watch.child.stdout), (watch.stderr, watch.child.stderr)):
+                    if output.open:
+                        poller.register(fd, select.POLLIN)
+            ready = {fd for fd, _ in poller.poll(pause_s * 1000 if busy else None)}
+            if self._wake in ready:
+                os.eventfd_read(self._wake)
+            if self._commands in ready:
+                self._on_command()
+            pause_s = TICK_S
+            with self._lock:
+                if watch is not None and self._watch is watch:
+                    watch.drain()
+                    pause_s = watch.judge(time.monotonic())
+            if busy:
+                self._on_tick()
+
+
+def _threads(pid: int) -> int:
+    try:
+        with open(f"/proc/{pid}/status") as lines:
+            return next((int(line.split()[1]) for line in lines if line.startswith("Threads:")), 0)
+    except OSError:
+        return 0

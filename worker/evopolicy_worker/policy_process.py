@@ -1,0 +1,429 @@
+"""One policy in the sandbox, as the episode loop sees it: init, reset, act, and how it failed.
+
+Rules: whatever the policy does is either an answer or a `PolicyFailedError`; what is the sandbox's own fault is a
+SandboxError or SlotDiedError and never blamed on the policy. A policy that failed by dying or by breaking the pipes' rules
+is `dead`; one whose code raised lives on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import sys
+import time
+from typing import Any, NamedTuple
+
+from evopolicy_common.errors import SandboxError
+from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
+from evopolicy_worker import frames
+from evopolicy_worker.monitor import Monitor, Watch
+from evopolicy_worker.sandbox.jail import Jail
+from evopolicy_worker.sandbox.zygote import Child, Zygote, wait_dead
+
+MAX_DESCRIPTORS = 256
+MAX_FILES = 4096
+"""Files and folders that a policy may make beside its bundle's."""
+DENIED = frozenset(
+    {
+        *(
+            "gymnasium",
+            "gymnasium_robotics",
+            "gym",
+            "mujoco",
+            "mujoco_py",
+            "Box2D",
+            "minigrid",
+            "highway_env",
+        ),
+        *(
+            "pygame",
+            "ale_py",
+            "miniworld",
+            "mo_gymnasium",
+            "metaworld",
+            "browsergym",
+            "miniwob",
+            "pettingzoo",
+        ),
+        *("evopolicy_common", "evopolicy_worker", "evopolicy_coordinator", "evopolicy_gateway", "zenoh"),
+    }
+)
+"""What a policy is told it may not import: simulators and our own code; the sandbox does not show them."""
+_GRACE_S = 1.0
+_DEATH_S = 10.0
+_MAX_MESSAGE = 2000
+_MAX_TRACEBACK = 16_000
+_STAGES: dict[str, FailureCategory] = {
+    "import": "import_error",
+    "init": "init_error",
+    "reset": "reset_error",
+    "act": "act_error",
+}
+
+
+class PolicyFailedError(Exception):
+    """The policy failed; `failure` says how (its step is for the episode loop to add)."""
+
+    def __init__(self, failure: PolicyFailure) -> None:
+        super().__init__(failure.message)
+        self.failure = failure
+
+
+class BundleFiles(NamedTuple):
+    """A bundle's files, read once per job."""
+
+    names: list[tuple[str, bool, int]]
+    """Path, executable, size in bytes."""
+    data: list[bytes]
+
+
+class Ended(NamedTuple):
+    """What a policy leaves behind."""
+
+    stdout: bytes
+    stderr: bytes
+    cpu_s: float
+
+
+class PolicyProcess:
+    """A forked process of the zygote's that becomes one Policy."""
+
+    def __init__(
+        self,
+        zygote: Zygote,
+        child: Child,
+        monitor: Monitor,
+        jail: Jail,
+        limits: ResourceLimits,
+        folder: str,
+    ) -> None:
+        """`folder` is where its files are when the jail gives it no home of its own."""
+        self._zygote = zygote
+        self._child = child
+        self._monitor = monitor
+        self._limits = limits
+        self._home = jail.home or folder
+        self._enclosed = jail.home is not None
+        self._watch = Watch(child, limits, count_threads=not self._enclosed)
+        self._base_bytes = _address_space(child.host_pid)
+        self._write: frames.Writer = list
+        self._finished: Ended | None = None
+        self._requests = child.requests
+        self._replies = child.replies
+        self.dead = False
+
+    def init(
+        self,
+        bundle: BundleFiles,
+        seed: bytes,
+        env_meta: dict[str, Any],
+        observations: str,
+        *,
+        cpu_s: float,
+    ) -> None:
+        """Seal the process, import the bundle and build its Policy. `cpu_s` is what all its episodes may use together.
+
+        Raises PolicyFailedError with a category of NO_POLICY.
+        """
+        limits = self._limits
+        n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
+        rlimits = {
+            "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
+            "RLIMIT_CPU": math.ceil(cpu_s) + 2,
+            "RLIMIT_FSIZE": limits.file_bytes,
+            "RLIMIT_NOFILE": MAX_DESCRIPTORS,
+            "RLIMIT_CORE": 0,
+            "RLIMIT_MEMLOCK": 0,
+            "RLIMIT_MSGQUEUE": 0,
+            "RLIMIT_SIGPENDING": 256,
+        }
+        if self._enclosed:
+            # Counted per user namespace: its parent and the zygote are in it too.
+            rlimits["RLIMIT_NPROC"] = limits.processes + 2
+        init = {
+            "home": self._home,
+            "home_bytes": limits.file_bytes + sum(-(-size // 4096) * 4096 for _, _, size in bundle.names),
+            "home_inodes": MAX_FILES + len(bundle.names) + n_folders,
+            "files": bundle.names,
+            "limits": rlimits,
+            "seed": seed.hex(),
+            "obs_space": env_meta["obs_space"],
+            "action_space": env_meta["action_space"],
+            "env_meta": env_meta,
+            "observations": observations,
+        }
+        self._write = frames.compile_writer(env_meta["obs_space"])
+        if self._child.host_pid:
+            # If the machine runs out of memory, the policy goes first.
+            with (
+                contextlib.suppress(OSError),
+                open(f"/proc/{self._child.host_pid}/oom_score_adj", "w") as file,
+            ):
+                file.write("1000")
+        self._monitor.watch(self._watch)
+        self._expect_ok(frames.init_frame(init, bundle.data), "init", limits.init_wall_s)
+
+    def begin_episode(self, *, first: bool) -> None:
+        """Wall, CPU time and output count from here; the first episode's include the import."""
+        if not first:
+            self._watch.begin_episode()
+
+    def reset(self, episode_index: int) -> None:
+        """Raises PolicyFailedError."""
+        frame = [frames.REQUEST_HEADER.pack(0, frames.RESET, episode_index)]
+        self._expect_ok(frame, "reset", self._limits.act_wall_s)
+
+    def prepare_acts(self) -> None:
+        """After `reset`: what `act` need not do on every step."""
+        self._watch.what = "act"
+        self._watch.answer_limit_s = self._limits.act_wall_s
+
+    def act(self, obs: Any) -> Any:
+        """The policy's answer to one observation, as it returned it. Raises PolicyFailedError."""
+        parts = self._write(obs)
+        length = 0
+        for part in parts:
+            length += part.nbytes if type(part) is not bytes else len(part)
+        tag, payload = self._exchange(
+            [frames.REQUEST_HEADER.pack(length, frames.ACT, 0), *parts], 16 + length
+        )
+        if tag <= frames.GENERIC:
+            try:
+                return frames.action(tag, payload)
+            except frames.BadReplyError as error:
+                raise self._broken(str(error)) from None
+        raise self._told(tag, payload, "act")
+
+    @property
+    def spent_s(self) -> float:
+        """The policy's own wall time in this episode, seconds."""
+        return self._watch.spent_s
+
+    def take_output(self) -> Ended:
+        """Output and CPU time of the episode that ends; the policy lives on when it can."""
+        if not self.dead:
+            with contextlib.suppress(PolicyFailedError):
+                self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.FLUSH, 0)], "act", _GRACE_S)
+        if self.dead:
+            return self.end()
+        # Under the monitor's lock: nobody else reads meanwhile.
+        self._monitor.watch(None)
+        self._watch.drain()
+        cpu_s = self._watch.cpu_s() - self._watch.cpu_start_s
+        ended = Ended(self._watch.stdout.take(), self._watch.stderr.take(), cpu_s)
+        self._monitor.watch(self._watch)
+        return ended
+
+    def end(self) -> Ended:
+        """End the process, if it has not ended, and collect what it leaves. SlotDiedError when it cannot be ended."""
+        if self._finished is None:
+            if not self.dead:
+                with contextlib.suppress(PolicyFailedError):
+                    self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.END, 0)], "act", _GRACE_S)
+            if not self.dead:
+                self._bury()
+            self._monitor.watch(None)
+            self._watch.drain()
+            watch = self._watch
+            cpu_s = max(0.0, self._exit.cpu_s - watch.cpu_start_s)
+            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
+            self._child.close()
+        return self._finished
+
+    def kill(self) -> None:
+        """SIGKILL from any thread; the loop finds out by itself."""
+        self._child.kill()
+
+    # What passes over the pipes.
+
+    def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> None:
+        self._watch.what = what
+        self._watch.answer_limit_s = limit_s
+        tag, payload = self._exchange(parts, sum(map(len, parts)))
+        if tag != frames.OK:
+            raise self._told(tag, payload, what)
+
+    def _exchange(self, parts: list[Any], total: int) -> tuple[int, bytes]:
+        watch = self._watch
+        start = watch.since = time.monotonic()
+        try:
+            n = os.writev(self._requests, parts)
+            if n < total:
+                self._write_rest(parts, n)
+            data = os.read(self._replies, 65536)
+        except BrokenPipeError:
+            data = b""
+        if len(data) < 8:
+            data = self._read_more(data, 8)
+        length, tag = frames.REPLY_HEADER.unpack_from(data)
+        if len(data) != 8 + length:
+            if length > frames.MAX_REPLY_BYTES:
+                raise self._broken(
+                    f"it announced an answer of {length} bytes; {frames.MAX_REPLY_BYTES} are the limit"
+                )
+            data = self._read_more(data, 8 + length)
+            if len(data) > 8 + length:
+                raise self._broken("it sent more than one answer to one question")
+        watch.since = 0.0
+        watch.spent_s += time.monotonic() - start
+        return tag, data[8:]
+
+    def _write_rest(self, parts: list[Any], n: int) -> None:
+        left = memoryview(
+            b"".join([bytes(part) if type(part) is bytes else part.tobytes() for part in parts])
+        )[n:]
+        while left:
+            left = left[os.write(self._requests, left) :]
+
+    def _read_more(self, data: bytes, wanted: int) -> bytes:
+        pieces = [data]
+        have = len(data)
+        while have < wanted:
+            piece = os.read(self._replies, min(1 << 20, wanted - have))
+            if not piece:
+                raise self._died()
+            pieces.append(piece)
+            have += len(piece)
+        return b"".join(pieces)
+
+    # How it failed.
+
+    def _told(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
+        """The failure that the policy's process reports of itself."""
+        if tag == frames.FAULT:
+            self._bury()
+            raise SandboxError(
+                f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
+            )
+        if tag != frames.FAILED:
+            return self._broken(f"it answered {what} with frame {tag}")
+        try:
+            report = frames.report(payload)
+        except frames.BadReplyError as error:
+            return self._broken(str(error))
+        stage = report.stage if what == "init" and report.stage in ("import", "init") else what
+        category = _STAGES[stage]
+        limit, used = None, None
+        limits = self._limits
+        by_kind: dict[str, tuple[FailureCategory, float, float | None, str]] = {
+            "memory": (
+                "oom",
+                limits.memory_bytes,
+                self._memory_used(),
+                f"memory: {limits.memory_bytes:,} bytes beside Python's own are the limit",
+            ),
+            "files": (
+                "file_limit",
+                limits.file_bytes,
+                limits.file_bytes,
+                f"files: {limits.file_bytes:,} bytes written are the limit, {MAX_FILES:,} files",
+            ),
+            "descriptors": (
+                "file_limit",
+                MAX_DESCRIPTORS,
+                MAX_DESCRIPTORS,
+                f"files: {MAX_DESCRIPTORS} open descriptors are the limit",
+            ),
+            "processes": (
+                "process_limit",
+                limits.processes,
+                limits.processes,
+                f"processes: {limits.processes} threads are the limit, and no process may be started",
+            ),
+        }
+        message = report.message
+        if report.kind in by_kind:
+            of_kind, limit, used, text = by_kind[report.kind]
+            if stage in ("reset", "act"):
+                category = of_kind
+            message = f"{message} [{text}]"
+        if stage == "import" and report.missing:
+            top = report.missing.partition(".")[0]
+            if top in DENIED:
+                category = "denied_import"
+                message = f"{message}: policies may not import {top}; they see observations only"
+        return self._failed(category, message, report.traceback, limit, used)
+
+    def _broken(self, how: str) -> PolicyFailedError:
+        """It did what no honest policy process does on its pipes."""
+        self._bury()
+        return self._failed(self._fatal("killed"), f"the policy's process was ended: {how}")
+
+    def _died(self) -> PolicyFailedError:
+        """Its pipe closed: a limit, or an end of its own."""
+        alive = not wait_dead(self._child.pidfd, 0.05)
+        self._bury()
+        verdict = self._watch.verdict
+        if verdict is not None:
+            return self._failed(
+                self._fatal(verdict.category), verdict.message, limit=verdict.limit, used=verdict.used
+            )
+        if alive:
+            return self._failed(self._fatal("killed"), "the policy closed the pipe that it answers on")
+        if (
+            os.WIFSIGNALED(self._exit.status)
+            and self._exit.cpu_s - self._watch.cpu_start_s > self._limits.cpu_s
+        ):
+            used = self._exit.cpu_s - self._watch.cpu_start_s
+            text = f"the policy used more than {self._limits.cpu_s:g} s of CPU time"
+            return self._failed(self._fatal("cpu_limit"), text, limit=self._limits.cpu_s, used=used)
+        return self._failed(self._fatal("killed"), f"the policy's process {self._exit.describe()}")
+
+    def _fatal(self, category: FailureCategory) -> FailureCategory:
+        """Before there is a Policy, whatever ends the process means that the bundle yields none."""
+        return "init_error" if self._watch.what == "init" else category
+
+    def _bury(self) -> None:
+        """The process is dead when this returns."""
+        self.dead = True
+        self._watch.since = 0.0
+        self._child.kill()
+        if not wait_dead(self._child.pidfd, _DEATH_S):
+            raise SandboxError(f"a policy's process does not end within {_DEATH_S:g} s of SIGKILL")
+        self._exit = self._zygote.wait(self._child)
+
+    def _memory_used(self) -> float | None:
+        """The most that it had beside Python's own, bytes; None when that cannot be read."""
+        with contextlib.suppress(OSError, ValueError), open(f"/proc/{self._child.host_pid}/status") as lines:
+            for line in lines:
+                if line.startswith("VmPeak:"):
+                    return max(0.0, float(int(line.split()[1]) * 1024 - self._base_bytes))
+        return None
+
+    def _failed(
+        self,
+        category: FailureCategory,
+        message: str,
+        traceback: str = "",
+        limit: float | None = None,
+        used: float | None = None,
+    ) -> PolicyFailedError:
+        self._watch.since = 0.0
+        return PolicyFailedError(
+            PolicyFailure(
+                category=category,
+                step_index=None,
+                message=self._without_paths(message)[:_MAX_MESSAGE],
+                traceback=self._without_paths(traceback)[-_MAX_TRACEBACK:],
+                limit=limit,
+                used=used,
+            )
+        )
+
+    def _without_paths(self, text: str) -> str:
+        """Text without this machine's folders: `system/policy.py`, `python3.11/random.py`, `numpy/…`."""
+        text = text.encode("utf-8", "replace").decode().replace(f"{self._home}/", "")
+        library = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        for prefix in (os.path.realpath(sys.base_prefix), sys.base_prefix):
+            text = text.replace(f"{prefix}/lib/{library}/", f"{library}/")
+        return text.replace("/packages/", "")
+
+
+def _address_space(pid: int) -> int:
+    """Bytes of address space that the process has; as much as Python with numpy has when that cannot be read."""
+    try:
+        with open(f"/proc/{pid}/statm") as file:
+            return int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError):
+        return 1 << 29

@@ -1,0 +1,329 @@
+"""Answers for one policy: builds it from its bundle, hands it observations, sends back what it returns.
+
+Runs inside the sandbox, in one process with the policy, which may change all of it: nothing here is trusted by the
+worker. Frames: a request is `<u32 length, u8 kind, 3 pad, i64 argument>` and its payload, a reply is `<u32 length,
+u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evopolicy_worker.frames` is the other end.
+Standard library and numpy only: the sandbox shows nothing else.
+"""
+
+import contextlib
+import ctypes
+import errno
+import importlib
+import json
+import os
+import random
+import struct
+import sys
+import traceback
+
+import numpy as np
+
+REQUESTS, REPLIES = 3, 4
+INIT, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5
+OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
+REQUEST_HEADER = struct.Struct("<IBxxxq")
+REPLY_HEADER = struct.Struct("<IBxxx")
+MAX_ACTION_BYTES = 1 << 20
+MAX_ACTION_DEPTH = 16
+MAX_TEXT = 16_000
+
+libc = ctypes.CDLL(None, use_errno=True)
+
+
+def play(init):
+    """Builds the Policy and answers for it until told to end."""
+    seed_generators(bytes.fromhex(init["seed"]))
+    os.environ["HOME"] = init["home"]
+    os.environ["TMPDIR"] = init["home"] + "/tmp"
+    sys.path.insert(0, init["home"] + "/system")
+    stage = "import"
+    try:
+        module = importlib.import_module("policy")
+        if not isinstance(getattr(module, "Policy", None), type):
+            raise ImportError("policy.py has no top-level class named Policy")
+        stage = "init"
+        policy = module.Policy(init["obs_space"], init["action_space"], init["env_meta"])
+    except BaseException as error:
+        reply_failure(stage, error)
+        flush_output()
+        os._exit(0)
+    reply(OK, b"")
+    answer(policy, init)
+
+
+def seed_generators(seed):
+    random.seed(seed)
+    np.random.seed(list(struct.unpack("<4I", seed[:16])))
+    # Where numpy would ask the system for entropy: unseeded default_rng(), SeedSequence(), bit generators.
+    entropy = random.Random(seed + b"numpy")
+    np.random.bit_generator.randbits = entropy.getrandbits
+
+
+def answer(policy, init):
+    make_buffer, observation = observation_reader(init["obs_space"], init["observations"] == "lists")
+    header = bytearray(REQUEST_HEADER.size)
+    unpack = REQUEST_HEADER.unpack
+    readv, write = os.readv, os.write
+    while True:
+        body = make_buffer()
+        n = readv(REQUESTS, (header, body))
+        if not n:
+            os._exit(0)
+        if n < 16:
+            n += read_more(memoryview(header)[n:])
+        length, kind, argument = unpack(header)
+        if n < 16 + length:
+            body = complete(body, n - 16, length)
+        if kind == ACT:
+            try:
+                data = encoded(policy.act(observation(body, length)))
+            except BaseException as error:
+                reply_failure("act", error)
+            else:
+                n = write(REPLIES, data)
+                while n < len(data):
+                    n += write(REPLIES, data[n:])
+        elif kind == RESET:
+            try:
+                policy.reset(argument)
+            except BaseException as error:
+                reply_failure("reset", error)
+            else:
+                reply(OK, b"")
+        else:
+            flush_output()
+            reply(OK, b"")
+            if kind == END:
+                os._exit(0)
+
+
+def read_exactly(buffer):
+    view = memoryview(buffer)
+    while len(view):
+        n = os.readv(REQUESTS, [view])
+        if not n:
+            os._exit(0)
+        view = view[n:]
+
+
+def read_more(view):
+    n = len(view)
+    read_exactly(view)
+    return n
+
+
+def complete(body, have, length):
+    """`body` with the rest of a payload of which `have` bytes are in it; a larger buffer when it does not fit."""
+    raw = memoryview(body if isinstance(body, bytearray) else body.reshape(-1).view(np.uint8))
+    if len(raw) < length:
+        body = bytearray(length)
+        body[:have] = raw[:have]
+        raw = memoryview(body)
+    read_exactly(raw[have:length])
+    return body
+
+
+# Observations: fixed arrays and ints first, each on a multiple of 8 bytes, then texts with their lengths.
+
+
+def observation_reader(space, as_lists):
+    """Two functions: a fresh buffer to read a payload into, and from buffer and length to the observation."""
+    kind = space["type"]
+    if kind in ("Box", "Image") and not as_lists:
+        shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
+        empty = np.empty
+        return (lambda: empty(shape, dtype)), (lambda body, length: body)
+    fixed = [0]
+    build = leaf_reader(space, fixed, as_lists)
+    start = fixed[0]
+
+    def observation(body, length):
+        return build(body, [start])
+
+    return (lambda: bytearray(start + 512)), observation
+
+
+def leaf_reader(space, fixed, as_lists):
+    kind = space["type"]
+    if kind in ("Dict", "Tuple"):
+        parts = space["spaces"]
+        if kind == "Dict":
+            readers = {key: leaf_reader(part, fixed, as_lists) for key, part in parts.items()}
+            return lambda body, at: {key: read(body, at) for key, read in readers.items()}
+        row = [leaf_reader(part, fixed, as_lists) for part in parts]
+        return lambda body, at: (list if as_lists else tuple)(read(body, at) for read in row)
+    if kind == "Text":
+        return read_text
+    offset = fixed[0]
+    if kind == "Discrete":
+        fixed[0] += 8
+        return lambda body, at: int.from_bytes(body[offset : offset + 8], "little", signed=True)
+    if kind in ("Box", "Image"):
+        shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
+    elif kind == "MultiDiscrete":
+        shape, dtype = np.shape(space["nvec"]), np.dtype(np.int64)
+    else:
+        n = space["n"]
+        shape, dtype = (n,) if isinstance(n, int) else tuple(n), np.dtype(np.int8)
+    count = int(np.prod(shape, dtype=np.int64))
+    fixed[0] += -(-count * dtype.itemsize // 8) * 8
+    frombuffer = np.frombuffer
+    if as_lists:
+        return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape).tolist()
+    return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape)
+
+
+def read_text(body, at):
+    start = at[0] + 4
+    end = start + int.from_bytes(body[at[0] : start], "little")
+    at[0] = end
+    return body[start:end].decode("utf-8", "surrogatepass")
+
+
+# Actions.
+
+
+def encoded(action):
+    """The reply frame for what `act` returned."""
+    kind = type(action)
+    if kind is int and -(1 << 63) <= action < 1 << 63:
+        return struct.pack("<IBxxxq", 8, INT, action)
+    if kind is np.ndarray and action.dtype.kind in "biuf" and action.itemsize <= 8:
+        if action.nbytes > MAX_ACTION_BYTES:
+            raise ValueError(f"the action has {action.nbytes} bytes; {MAX_ACTION_BYTES} are the limit")
+        data = array_data(action)
+        return REPLY_HEADER.pack(len(data), ARRAY) + data
+    if isinstance(action, np.integer) and kind is not np.uint64:
+        return struct.pack("<IBxxxq", 8, INT, int(action))
+    if kind is float:
+        return struct.pack("<IBxxxd", 8, FLOAT, action)
+    if kind is list and 0 < len(action) < 10_000:
+        kinds = set(map(type, action))
+        if kinds == {float}:
+            return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
+    out = bytearray()
+    pack(action, out, 0)
+    return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
+
+
+array_heads = {}
+
+
+def array_data(array):
+    key = array.dtype, array.shape
+    head = array_heads.get(key)
+    if head is None:
+        plain = array.dtype.newbyteorder("<")
+        head = struct.pack(f"<4sI{array.ndim}I", plain.str.encode(), array.ndim, *array.shape)
+        array_heads[key] = head
+    if array.dtype.byteorder == ">":
+        array = array.astype(array.dtype.newbyteorder("<"))
+    return head + array.tobytes()
+
+
+def pack(value, out, depth):
+    """Appends `value` as msgpack; what has no form there goes as the name of its type."""
+    if depth > MAX_ACTION_DEPTH:
+        raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
+    if len(out) > MAX_ACTION_BYTES:
+        raise ValueError(f"the action has more than {MAX_ACTION_BYTES} bytes")
+    if isinstance(value, np.generic):
+        value = np.asarray(value) if value.dtype.kind == "f" else value.item()
+    if value is None:
+        out.append(0xC0)
+    elif value is True or value is False:
+        out.append(0xC3 if value else 0xC2)
+    elif isinstance(value, int):
+        if -(1 << 63) <= value < 1 << 63:
+            out += struct.pack(">Bq", 0xD3, value)
+        elif value.bit_length() <= 4096:
+            extension(2, str(int(value)).encode(), out)
+        else:
+            raise ValueError(f"the action holds an integer of {value.bit_length()} bits")
+    elif isinstance(value, float):
+        out += struct.pack(">Bd", 0xCB, value)
+    elif isinstance(value, str):
+        text = value.encode("utf-8", "backslashreplace")
+        out += struct.pack(">BI", 0xDB, len(text)) + text
+    elif isinstance(value, bytes | bytearray):
+        out += struct.pack(">BI", 0xC6, len(value)) + bytes(value)
+    elif isinstance(value, list | tuple):
+        out += struct.pack(">BI", 0xDD, len(value))
+        for item in value:
+            pack(item, out, depth + 1)
+    elif isinstance(value, dict):
+        out += struct.pack(">BI", 0xDF, len(value))
+        for key, item in value.items():
+            pack(str(key), out, depth + 1)
+            pack(item, out, depth + 1)
+    elif hasattr(value, "__array__"):
+        array = np.asarray(value)
+        if array.dtype.kind == "f" and array.itemsize > 8:
+            array = array.astype(np.float64)
+        if array.dtype.kind in "biuf":
+            extension(1, array_data(array), out)
+        else:
+            pack(array.tolist(), out, depth + 1)
+    else:
+        pack(f"<{type(value).__name__}>", out, depth)
+
+
+def extension(code, data, out):
+    out += struct.pack(">BIb", 0xC9, len(data), code) + data
+
+
+# Replies.
+
+
+def reply(tag, payload):
+    data = REPLY_HEADER.pack(len(payload), tag) + payload
+    while data:
+        data = data[os.write(REPLIES, data) :]
+
+
+def reply_failure(stage, error):
+    """Tells what the policy's own code raised. Its text is the policy's to forge; it names its own failure only."""
+    try:
+        frames = error.__traceback__
+        while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
+            frames = frames.tb_next
+        text = "".join(traceback.format_exception(type(error), error, frames))
+        message = "".join(traceback.format_exception_only(type(error), error)).strip().rpartition("\n")[2]
+    except BaseException:
+        text, message = "", type(error).__name__
+    report = {
+        "stage": stage,
+        "kind": kind_of(error),
+        "message": message[:2000],
+        "traceback": text[-MAX_TEXT:],
+        "missing": getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None,
+    }
+    reply(FAILED, json.dumps(report, default=str).encode())
+
+
+def kind_of(error):
+    """Which limit an exception tells of, if any."""
+    seen = 0
+    while error is not None and seen < 10:
+        if isinstance(error, MemoryError):
+            return "memory"
+        if isinstance(error, OSError):
+            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+                return "files"
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                return "descriptors"
+            if error.errno == errno.EAGAIN:
+                return "processes"
+        if isinstance(error, RuntimeError) and "start new thread" in str(error):
+            return "processes"
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+        seen += 1
+    return None
+
+
+def flush_output():
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BaseException):
+            stream.flush()
+    libc.fflush(None)

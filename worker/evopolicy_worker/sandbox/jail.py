@@ -1,0 +1,153 @@
+"""How the zygote is started: inside bubblewrap, or as a plain process that Landlock holds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import SandboxError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_worker.sandbox import python_files, seccomp
+
+INSIDE = Path(__file__).parent / "inside"
+"""Our code that the sandbox shows: the zygote and the player, nothing else."""
+
+INSTALL_BWRAP = "apt-get install bubblewrap (Debian, Ubuntu), dnf install bubblewrap (Fedora)"
+
+POLICY_HOME = "/home/policy"
+_PACKAGES = "/packages"
+_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+_FIRST_UID = 0x6D000000
+"""As root, policies run as users from here on, which no machine gives to anyone."""
+
+ENVIRONMENT = {
+    "PATH": "/usr/bin:/bin",
+    "HOME": POLICY_HOME,
+    "LANG": "C.UTF-8",
+    "LC_ALL": "C.UTF-8",
+    "TZ": "UTC",
+    "PYTHONHASHSEED": "0",
+    "PYTHONDONTWRITEBYTECODE": "1",
+    "PYTHONNOUSERSITE": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    # An arena per thread reserves 64 MiB of address space, which is what a policy's memory is counted in.
+    "MALLOC_ARENA_MAX": "2",
+}
+"""The whole environment of a policy's process."""
+
+
+class Jail(msgspec.Struct, frozen=True, kw_only=True):
+    """A command that starts a zygote, and what it is told."""
+
+    command: tuple[str, ...]
+    """To be followed by the number of the control socket's descriptor."""
+    config: dict[str, object]
+    user: int | None
+    """User outside to whom the sandbox's user is mapped by the worker; None when nothing is to be mapped."""
+    home: str | None
+    """Where a policy's files are; None when each policy gets a folder in the slot's scratch."""
+
+
+def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed: bool = True) -> Jail:
+    """The jail of that tier. SandboxError, with what to do, when this machine cannot build it.
+
+    `sealed=False` leaves a defence off, for tests that show what it defends against.
+    """
+    files = python_files.find(allowed_packages)
+    config: dict[str, object] = {
+        "become_nobody": False,
+        "namespaces": tier == "bwrap",
+        "packages": _PACKAGES,
+        "warm": [name for name in allowed_packages if name != "numpy"],
+        "seals": tier != "none" and sealed,
+        "landlock": None,
+        "filter": seccomp.policy_filter().hex() if tier != "none" else "",
+    }
+    has_landlock = landlock_version() > 0
+    if tier == "bwrap":
+        if has_landlock:
+            config["landlock"] = {"read": ["/"], "write": ["/tmp", *_DEVICES]}
+        as_root = os.geteuid() == 0
+        config["become_nobody"] = as_root
+        return Jail(
+            command=(*_bubblewrap(files, as_root), *_python(files, "/sandbox")),
+            config=config,
+            user=_FIRST_UID + os.getpid() % 0x10000 if as_root else None,
+            home=POLICY_HOME,
+        )
+    config["packages"] = str(_package_links(files, scratch))
+    if tier == "landlock":
+        if not has_landlock:
+            raise SandboxError(
+                "tier landlock needs a kernel with Landlock (5.13 or later, and enabled); see doctor"
+            )
+        places = [*files.read, *files.packages.values(), str(config["packages"]), str(INSIDE)]
+        config["landlock"] = {"read": places, "write": list(_DEVICES)}
+    return Jail(command=_python(files, str(INSIDE)), config=config, user=None, home=None)
+
+
+def landlock_version() -> int:
+    """ABI version of the kernel's Landlock; 0 when there is none."""
+    import ctypes
+
+    libc = ctypes.CDLL(None, use_errno=True)
+    return max(0, int(libc.syscall(444, None, 0, 1)))
+
+
+def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
+    # No site (-S), no user site (-s), no script folder on the path (-P): the path is stdlib and allowed packages.
+    return (files.interpreter, "-s", "-S", "-P", "-B", f"{folder}/zygote.py")
+
+
+def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
+    bwrap = shutil.which("bwrap")
+    if bwrap is None:
+        raise SandboxError(f"bubblewrap is not installed: {INSTALL_BWRAP}")
+    command = [bwrap, "--die-with-parent", "--new-session", "--hostname", "policy"]
+    command += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
+    if as_root:
+        # The zygote makes the user namespace itself, so that the policy's user is nobody outside either.
+        command += ["--cap-add", "CAP_SYS_ADMIN", "--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID"]
+    else:
+        command += ["--unshare-user", "--uid", "65534", "--gid", "65534", "--cap-add", "CAP_SYS_ADMIN"]
+    command.append("--clearenv")
+    for name, value in ENVIRONMENT.items():
+        command += ["--setenv", name, value]
+    # Parents that bubblewrap makes by itself are closed to other users, which the policy's user is.
+    for path in sorted(_parents([*files.read, *map(os.path.realpath, files.read), "/dev/null", POLICY_HOME])):
+        command += ["--perms", "0755", "--dir", path]
+    for path in files.read:
+        target = os.path.realpath(path)
+        if target != path and os.path.isdir(path) and os.path.islink(path):
+            command += ["--ro-bind", target, target, "--symlink", target, path]
+        else:
+            command += ["--ro-bind", path, path]
+    for path in files.hidden:
+        command += ["--tmpfs", path, "--remount-ro", path]
+    command += ["--perms", "0755", "--dir", _PACKAGES]
+    for name, path in files.packages.items():
+        command += ["--ro-bind", path, f"{_PACKAGES}/{name}"]
+    command += ["--ro-bind", str(INSIDE), "/sandbox"]
+    for device in _DEVICES:
+        if os.path.exists(device):
+            command += ["--dev-bind", device, device]
+    return [*command, "--dir", POLICY_HOME, "--dir", "/tmp", "--chdir", "/", "--remount-ro", "/"]
+
+
+def _parents(paths: list[str]) -> set[str]:
+    return {str(parent) for path in paths for parent in Path(path).parents} - {"/"}
+
+
+def _package_links(files: python_files.PythonFiles, scratch: Path) -> Path:
+    """A folder with links to the allowed packages only."""
+    folder = scratch / "packages"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name, path in files.packages.items():
+        (folder / name).symlink_to(path)
+    return folder

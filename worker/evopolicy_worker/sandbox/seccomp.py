@@ -1,0 +1,124 @@
+"""The system calls that a policy may make, as a seccomp filter assembled by hand.
+
+Rules that this module owns:
+- What is not listed is refused (EPERM; ENOSYS for numbers younger than the lists, so that a C library falls back).
+- No process is ever made: `fork` and the like answer EAGAIN, as at a process limit. Threads are allowed.
+- No sockets, no signals to anyone else, no mounts, namespaces, keyrings, shared memory, file locks (two sandboxes that
+  see the same read-only file could talk through its locks), `memfd` (not counted against any limit) or CPU affinity.
+- The filter is for one process: its own pid is put in place of `PID_MARK` when it seals itself.
+"""
+
+from __future__ import annotations
+
+import errno
+import platform
+import struct
+
+from evopolicy_common.errors import SandboxError
+from evopolicy_worker.sandbox.syscall_numbers import NUMBERS
+
+PID_MARK = 0x7FFFABCD
+"""Stands in the filter for the pid of the process that installs it; instructions are 8 bytes, this is their last word."""
+
+_AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+_X32_BIT = 0x40000000
+
+_CHECKED = frozenset({"ioctl", "fcntl", "prctl", "clone", "clone3", "fork", "vfork", "kill", "tgkill"})
+_FCNTL = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    1030,
+    1032,
+)  # F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_SETFL, F_DUPFD_CLOEXEC, F_GETPIPE_SZ
+_IOCTL = (
+    0x5401,
+    0x5413,
+    0x541B,
+    0x5421,
+    0x5450,
+    0x5451,
+)  # TCGETS, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX
+_PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
+_CLONE_THREAD = 0x00010000
+_CLONE_NAMESPACES = 0x7E020000
+_YOUNGEST = 450
+
+# Classic BPF: opcodes, and where `struct seccomp_data` keeps what they load.
+_LOAD, _AND = 0x20, 0x54
+_JUMP_EQUAL, _JUMP_AT_LEAST = 0x15, 0x35
+_RETURN = 0x06
+_NUMBER, _ARCHITECTURE = 0, 4
+_KILL_PROCESS, _ERRNO, _ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
+
+Instruction = tuple[int, int, int, int]
+
+
+def supported() -> bool:
+    """Whether there are lists for this machine's processor."""
+    return platform.machine() in NUMBERS
+
+
+def policy_filter() -> bytes:
+    """The program: 8 bytes an instruction, to be given to seccomp(2) with `PID_MARK` replaced.
+
+    Raises SandboxError on a processor that the lists do not cover.
+    """
+    machine = platform.machine()
+    if machine not in NUMBERS:
+        raise SandboxError(
+            f"no seccomp filter for {machine}; the sandbox runs on {' and '.join(NUMBERS)} (or ask for tier none)"
+        )
+    numbers = NUMBERS[machine]
+    program: list[Instruction] = [
+        (_LOAD, 0, 0, _ARCHITECTURE),
+        (_JUMP_EQUAL, 1, 0, _AUDIT_ARCH[machine]),
+        (_RETURN, 0, 0, _KILL_PROCESS),
+        (_LOAD, 0, 0, _NUMBER),
+    ]
+    if machine == "x86_64":
+        program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
+    for name, number in numbers.items():
+        if name not in _CHECKED:
+            program += [(_JUMP_EQUAL, 0, 1, number), (_RETURN, 0, 0, _ALLOW)]
+    blocks = {
+        "ioctl": _one_of(1, _IOCTL, errno.ENOTTY),
+        "fcntl": _one_of(1, _FCNTL, errno.EPERM),
+        "prctl": _one_of(0, _PRCTL, errno.EPERM),
+        "kill": _one_of(0, (PID_MARK,), errno.EPERM),
+        "tgkill": _one_of(0, (PID_MARK,), errno.EPERM),
+        "clone": [
+            (_LOAD, 0, 0, _argument(0)),
+            (_AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),
+            (_JUMP_EQUAL, 0, 1, _CLONE_THREAD),
+            (_RETURN, 0, 0, _ALLOW),
+            _refuse(errno.EAGAIN),
+        ],
+        "fork": [_refuse(errno.EAGAIN)],
+        "vfork": [_refuse(errno.EAGAIN)],
+        # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
+        "clone3": [_refuse(errno.ENOSYS)],
+    }
+    for name, block in blocks.items():
+        if name in numbers:
+            program += [(_JUMP_EQUAL, 0, len(block), numbers[name]), *block]
+    program += [(_JUMP_AT_LEAST, 0, 1, _YOUNGEST), _refuse(errno.ENOSYS), _refuse(errno.EPERM)]
+    return b"".join(struct.pack("<HBBI", *instruction) for instruction in program)
+
+
+def _argument(index: int) -> int:
+    """Offset of the low half of an argument (both architectures are little-endian)."""
+    return 16 + 8 * index
+
+
+def _refuse(number: int) -> Instruction:
+    return (_RETURN, 0, 0, _ERRNO | number)
+
+
+def _one_of(argument: int, allowed: tuple[int, ...], otherwise: int) -> list[Instruction]:
+    block: list[Instruction] = [(_LOAD, 0, 0, _argument(argument))]
+    for value in allowed:
+        block += [(_JUMP_EQUAL, 0, 1, value), (_RETURN, 0, 0, _ALLOW)]
+    return [*block, _refuse(otherwise)]

@@ -1,0 +1,201 @@
+"""The worker's end of a zygote: starts it, has it fork policy processes, learns how they ended.
+
+Rules: the zygote is ours and answers at once; when it does not, the slot is dead. Everything that a policy's process
+is given passes over pipes of its own, never through the zygote.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_worker.sandbox.jail import ENVIRONMENT, Jail
+
+START_TIMEOUT_S = 60.0
+ANSWER_TIMEOUT_S = 20.0
+_MAX_MESSAGE = 1 << 16
+
+
+class Child(msgspec.Struct, kw_only=True):
+    """A forked process that waits for its first request, and our ends of its pipes."""
+
+    pid: int
+    """In the zygote's namespace."""
+    host_pid: int
+    """In ours; 0 when it is gone already."""
+    pidfd: int
+    requests: int
+    replies: int
+    stdout: int
+    stderr: int
+
+    def kill(self) -> None:
+        """SIGKILL. In its own pid namespace this ends everything that it may have started."""
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
+
+    def close(self) -> None:
+        for fd in (self.pidfd, self.requests, self.replies, self.stdout, self.stderr):
+            os.close(fd)
+
+
+class Exit(msgspec.Struct, frozen=True, kw_only=True):
+    """How a child ended."""
+
+    status: int
+    """As from waitpid."""
+    cpu_s: float
+
+    def describe(self) -> str:
+        if os.WIFSIGNALED(self.status):
+            number = os.WTERMSIG(self.status)
+            with contextlib.suppress(ValueError):
+                return f"was ended by {signal.Signals(number).name}"
+            return f"was ended by signal {number}"
+        return f"exited with status {os.waitstatus_to_exitcode(self.status)}"
+
+
+class Zygote:
+    """One running zygote. Not thread-safe."""
+
+    def __init__(self, jail: Jail, scratch: Path) -> None:
+        """Starts it and waits until it can fork. SandboxError, with what bubblewrap or Python said, when it cannot."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.settimeout(START_TIMEOUT_S)
+        with tempfile.TemporaryFile(dir=scratch) as said:
+            self._process = subprocess.Popen(
+                [*jail.command, str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                pass_fds=[theirs.fileno()],
+                cwd="/",
+                env=ENVIRONMENT,
+            )
+            theirs.close()
+            self._control = ours
+            try:
+                ours.send(json.dumps(jail.config).encode())
+                self._wait_until_ready(jail)
+            except (OSError, SandboxError) as error:
+                self.close()
+                said.seek(0)
+                words = said.read(4000).decode("utf-8", "replace").strip()
+                raise SandboxError(
+                    f"the sandbox does not start: {error}; {words or 'it said nothing'}"
+                ) from error
+        ours.settimeout(ANSWER_TIMEOUT_S)
+
+    def spawn(self) -> Child:
+        """A new policy process. SlotDiedError when the zygote is gone; SandboxError when it cannot fork."""
+        theirs: list[int] = []
+        ours: list[int] = []
+        try:
+            for reads_here in (False, True, True, True):
+                read, write = os.pipe2(os.O_CLOEXEC)
+                ours.append(read if reads_here else write)
+                theirs.append(write if reads_here else read)
+            answer, fds = self._ask({"fork": True}, theirs)
+        except BaseException:
+            for fd in ours:
+                os.close(fd)
+            raise
+        finally:
+            for fd in theirs:
+                os.close(fd)
+        if "error" in answer:
+            for fd in ours:
+                os.close(fd)
+            raise SandboxError(f"no process for a policy: {answer['error']}")
+        pidfd = fds[0]
+        return Child(
+            pid=answer["pid"],
+            host_pid=pid_of(pidfd),
+            pidfd=pidfd,
+            requests=ours[0],
+            replies=ours[1],
+            stdout=ours[2],
+            stderr=ours[3],
+        )
+
+    def wait(self, child: Child) -> Exit:
+        """How a killed or ended child ended. Takes its entry from the process table."""
+        answer, _ = self._ask({"wait": child.pid}, [])
+        return Exit(status=answer["status"], cpu_s=answer["cpu_s"])
+
+    def close(self) -> None:
+        """Ends the zygote and with it every process in its sandbox."""
+        self._control.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.5)
+        self._process.kill()
+        self._process.wait()
+
+    def _wait_until_ready(self, jail: Jail) -> None:
+        while True:
+            answer, fds = self._receive()
+            if "map" in answer:
+                assert jail.user is not None
+                _map_user(pid_of(fds[0]), jail.user)
+                os.close(fds[0])
+                self._control.send(b"mapped")
+            elif "ready" in answer:
+                return
+            else:
+                raise SandboxError(str(answer.get("error", answer)))
+
+    def _ask(self, request: dict[str, Any], fds: list[int]) -> tuple[dict[str, Any], list[int]]:
+        try:
+            socket.send_fds(self._control, [json.dumps(request).encode()], fds)
+            return self._receive()
+        except OSError as error:
+            raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
+
+    def _receive(self) -> tuple[dict[str, Any], list[int]]:
+        data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)
+        if not data:
+            raise ConnectionResetError("it closed its end")
+        answer = json.loads(data)
+        if not isinstance(answer, dict):
+            raise ConnectionResetError("it sent no message")
+        return answer, fds
+
+
+def pid_of(pidfd: int) -> int:
+    """The process's id in our namespace; 0 when it is gone."""
+    with open(f"/proc/self/fdinfo/{pidfd}") as lines:
+        for line in lines:
+            if line.startswith("Pid:"):
+                return max(0, int(line.split()[1]))
+    return 0
+
+
+def wait_dead(pidfd: int, timeout_s: float) -> bool:
+    """Waits until the process has ended; False when it has not in that time."""
+    import select
+
+    poller = select.poll()
+    poller.register(pidfd, select.POLLIN)
+    end = time.monotonic() + timeout_s
+    while (left := end - time.monotonic()) > 0:
+        if poller.poll(left * 1000):
+            return True
+    return False
+
+
+def _map_user(pid: int, user: int) -> None:
+    """Makes the namespace's user 65534 the unprivileged `user` of this machine."""
+    Path(f"/proc/{pid}/setgroups").write_text("deny")
+    Path(f"/proc/{pid}/gid_map").write_text(f"65534 {user} 1\n")
+    Path(f"/proc/{pid}/uid_map").write_text(f"65534 {user} 1\n")

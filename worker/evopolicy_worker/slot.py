@@ -1,0 +1,214 @@
+"""A slot: one core's worth of episodes. The supervisor's end of an environment process and its sandbox.
+
+Rules: a job's failure is its policy's (an outcome), ours (WorkerError, SandboxError: played elsewhere) or the death of
+the slot's processes (SlotDiedError: a strike against the bundle). `cancel` leaves the slot usable; after an error `start`
+makes it new. One job at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import structlog
+
+from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_worker import environments
+from evopolicy_worker import slot_messages as messages
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+START_TIMEOUT_S = 120.0
+CANCEL_TIMEOUT_S = 20.0
+"""A cancelled job that has not stopped by then takes its processes with it."""
+MAX_ANSWER_BYTES = 1 << 31
+
+
+class Slot:
+    """An environment process and, inside a sandbox, the policies that it plays. Used by one asyncio loop."""
+
+    def __init__(
+        self,
+        core: int | None,
+        tier: Tier,
+        scratch: Path,
+        allowed_packages: tuple[str, ...] = ("numpy",),
+        *,
+        sealed: bool = True,
+    ) -> None:
+        """`core` is the CPU that all its processes are pinned to; None leaves that to the system.
+
+        `scratch` is a folder of the slot's own. `sealed=False` (tests only) leaves the policy's process unsealed.
+        """
+        self._start = messages.Start(
+            tier=tier, core=core, scratch=str(scratch), allowed_packages=allowed_packages, sealed=sealed
+        )
+        self._scratch = scratch
+        self._process: asyncio.subprocess.Process | None = None
+        self._said: deque[str] = deque(maxlen=40)
+        self._listener: asyncio.Task[None] | None = None
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    async def start(self) -> None:
+        """Start the processes, ending those of before.
+
+        SandboxError, with what to do, when this machine cannot provide the tier; WorkerError for other failures.
+        """
+        await self.close()
+        self._scratch.mkdir(parents=True, exist_ok=True)
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "evopolicy_worker.env_process",
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            env={**os.environ, **environments.process_environment()},
+            start_new_session=True,
+            limit=1 << 20,
+        )
+        self._said.clear()
+        self._listener = asyncio.create_task(self._listen(self._process))
+        try:
+            async with asyncio.timeout(START_TIMEOUT_S):
+                await self._send(self._start)
+                answer = await self._answer()
+        except TimeoutError:
+            await self.close()
+            raise WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s") from None
+        except SlotDiedError as error:
+            await self.close()
+            raise WorkerError(str(error)) from error
+        if not isinstance(answer, messages.Ready):
+            await self.close()
+            raise _error(answer)
+
+    async def play(
+        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]:
+        """Play a job: an outcome for each of its episodes, in order, trajectories inline.
+
+        `bundle` is the unpacked bundle's folder, None for random actions; `on_progress` is told episodes and steps done.
+        A cancelled job gives what was done, possibly nothing. Raises SlotDiedError, SandboxError or WorkerError.
+        """
+        if self._process is None:
+            raise WorkerError("the slot is not started")
+        if job.tier != self._start.tier:
+            raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
+        self._idle.clear()
+        try:
+            await self._send(messages.Play(job=job, bundle=None if bundle is None else str(bundle)))
+            while True:
+                answer = await self._answer()
+                if isinstance(answer, messages.Told):
+                    on_progress(answer.episodes_done, answer.steps)
+                elif isinstance(answer, messages.Played):
+                    return answer.outcomes
+                else:
+                    raise _error(answer)
+        except asyncio.CancelledError:
+            # Nobody reads the rest of this job's answers: the processes are of no more use.
+            self._end_process()
+            raise
+        finally:
+            self._idle.set()
+
+    async def cancel(self) -> None:
+        """Stop the running job at once; its `play` returns and the slot can be used again. Nothing runs: no effect."""
+        if self._idle.is_set():
+            return
+        process = self._process
+        with contextlib.suppress(SlotDiedError):
+            await self._send(messages.Cancel())
+        try:
+            async with asyncio.timeout(CANCEL_TIMEOUT_S):
+                await self._idle.wait()
+        except TimeoutError:
+            if process is self._process:
+                self._end_process()
+
+    async def close(self) -> None:
+        """End the slot's processes and remove its scratch folder; a second close does nothing."""
+        process, self._process = self._process, None
+        if process is not None:
+            _kill(process)
+            await process.wait()
+        if self._listener is not None:
+            self._listener.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._listener
+            self._listener = None
+        await asyncio.to_thread(shutil.rmtree, self._scratch, ignore_errors=True)
+
+    def _end_process(self) -> None:
+        if self._process is not None:
+            _kill(self._process)
+
+    async def _send(self, message: messages.Message) -> None:
+        process = self._process
+        assert process is not None
+        assert process.stdin is not None
+        try:
+            process.stdin.write(messages.framed(message))
+            await process.stdin.drain()
+        except (ConnectionError, OSError) as error:
+            raise SlotDiedError(await self._last_words()) from error
+
+    async def _answer(self) -> messages.Answer:
+        process = self._process
+        assert process is not None
+        assert process.stdout is not None
+        try:
+            (length,) = messages.LENGTH.unpack(await process.stdout.readexactly(messages.LENGTH.size))
+            if length > MAX_ANSWER_BYTES:
+                raise SlotDiedError(f"the slot's process announced an answer of {length} bytes")
+            return messages.answers.decode(await process.stdout.readexactly(length))
+        except (asyncio.IncompleteReadError, ConnectionError) as error:
+            raise SlotDiedError(await self._last_words()) from error
+
+    async def _last_words(self) -> str:
+        process = self._process
+        status = "?"
+        if process is not None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(5.0):
+                    status = str(await process.wait())
+        await asyncio.sleep(0)
+        return f"the slot's process ended with status {status}; {' | '.join(self._said) or 'it said nothing'}"
+
+    async def _listen(self, process: asyncio.subprocess.Process) -> None:
+        """Keeps what the process says on standard error (simulators' notices, our tracebacks)."""
+        assert process.stderr is not None
+        while True:
+            try:
+                line = await process.stderr.readline()
+            except ValueError:  # a line beyond the reader's limit; it is dropped
+                continue
+            if not line:
+                return
+            text = line.decode("utf-8", "replace").rstrip()[:500]
+            self._said.append(text)
+            log.debug("slot says", text=text)
+
+
+def _error(answer: messages.Answer) -> WorkerError | SandboxError:
+    if not isinstance(answer, messages.Fault):
+        return WorkerError(f"the slot's process answered {type(answer).__name__} out of turn")
+    if answer.kind == "died":
+        return SlotDiedError(answer.message)
+    return SandboxError(answer.message) if answer.kind == "sandbox" else WorkerError(answer.message)
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        # Its group: the sandbox dies with its parent, simulators' helpers with the group.
+        os.killpg(process.pid, signal.SIGKILL)

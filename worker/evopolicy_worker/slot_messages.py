@@ -1,0 +1,71 @@
+"""What a slot and its environment process say to each other over their pipes: length-prefixed msgpack."""
+
+from __future__ import annotations
+
+import struct
+
+import msgspec
+
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+
+LENGTH = struct.Struct("<I")
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
+    """One message; `op` names its type."""
+
+
+class Start(Message, frozen=True, kw_only=True, tag="start"):
+    """The first message: what kind of slot to be."""
+
+    tier: Tier
+    core: int | None
+    scratch: str
+    allowed_packages: tuple[str, ...]
+    sealed: bool = True
+
+
+class Play(Message, frozen=True, kw_only=True, tag="play"):
+    """Play this job; answered by Progress and then Played or Fault."""
+
+    job: Job
+    bundle: str | None
+
+
+class Cancel(Message, frozen=True, kw_only=True, tag="cancel"):
+    """Stop the running job, which is answered by Played with what was done."""
+
+
+class Ready(Message, frozen=True, kw_only=True, tag="ready"):
+    """Started, sandbox and all."""
+
+
+class Told(Message, frozen=True, kw_only=True, tag="progress"):
+    episodes_done: int
+    steps: int
+
+
+class Played(Message, frozen=True, kw_only=True, tag="played"):
+    outcomes: tuple[EpisodeOutcome, ...]
+    cancelled: bool = False
+
+
+class Fault(Message, frozen=True, kw_only=True, tag="fault"):
+    """Our own failure, never the policy's."""
+
+    kind: str
+    """`sandbox`, `worker`, or `died`: the slot is of no more use."""
+    message: str
+
+
+Command = Start | Play | Cancel
+Answer = Ready | Told | Played | Fault
+
+encoder = msgspec.msgpack.Encoder()
+commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
+answers: msgspec.msgpack.Decoder[Answer] = msgspec.msgpack.Decoder(Answer)
+
+
+def framed(message: Message) -> bytes:
+    data = encoder.encode(message)
+    return LENGTH.pack(len(data)) + data
