@@ -18,7 +18,7 @@ from rich.console import Console
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway import harnesses, options, trials
+from evopolicy_gateway import harnesses, options, processes, trials
 from evopolicy_gateway.command_line import run_app
 from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
@@ -292,6 +292,7 @@ def _add_commands_of_other_rooms(arguments: list[str]) -> None:
 
 def main() -> None:
     """The console script."""
+    processes.become_subreaper()
     _add_commands_of_other_rooms(sys.argv[1:])
     run_app(app)
 

@@ -92,8 +92,12 @@ class Journal:
         """All lines, oldest first."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._file = os.fdopen(fd, "r+b", buffering=0)
-        self._load()
-        fsync_directory(path.parent)
+        try:
+            self._load()
+            fsync_directory(path.parent)
+        except BaseException:
+            self._file.close()
+            raise
 
     def append(self, entry: AnyEntry) -> None:
         """Durable when it returns; StorageError when the disk refuses, and then nothing was added."""

@@ -150,7 +150,7 @@ class RunPlay:
             for child in (self._keeper, self._gateway):
                 if child is not None:
                     await child.end(END_GRACE_S)
-            await asyncio.to_thread(processes.end_descendants, 0.0, spare=frozenset(children.live))
+            await asyncio.to_thread(processes.end_orphans, frozenset(children.live))
         return time.monotonic() - started
 
     async def _close(self, ended: AgentEnded) -> None:
@@ -229,7 +229,7 @@ class RunPlay:
                 ended = event
         await self._keeper.ended()
         # What a keeper that died has left behind has become ours.
-        await asyncio.to_thread(processes.end_descendants, 0.0, spare=frozenset(children.live))
+        await asyncio.to_thread(processes.end_orphans, frozenset(children.live))
         return ended
 
     async def _finish(self, run: str) -> RunFinished:

@@ -14,8 +14,16 @@ _PAUSE_S = 0.01
 KILL_PATIENCE_S = 10.0
 
 
+_reaps = False
+
+
 def become_subreaper() -> None:
-    """From now on descendants whose parent dies become children of this process, so that none is lost sight of."""
+    """From now on descendants whose parent dies become children of this process, so that none is lost sight of.
+
+    For processes all of whose children are ours: `end_orphans` and `end_descendants` take every other for a stray.
+    """
+    global _reaps
+    _reaps = True
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
@@ -56,6 +64,15 @@ def end_descendants(
         time.sleep(_PAUSE_S)
     _reap(kept)
     return _below(spare)
+
+
+def end_orphans(known: Collection[int]) -> None:
+    """Ends what has become this process's child by its parent's death: all but the `known` and what is below them.
+
+    Does nothing in a process that has not become a subreaper: its other children are not ours to end.
+    """
+    if _reaps:
+        end_descendants(0.0, spare=known)
 
 
 def _table() -> list[tuple[int, int, bytes]]:

@@ -110,10 +110,10 @@ def run_record(
             finished_at=utc_text(finished.finished_at),
             wall_s=round(finished.finished_at - finished.created_at, 3),
             agent_s=round(max(0.0, agents_side_s - in_flight_s), 3),
-            queue_s=finished.wall_s.get("queue", 0.0),
-            rollout_s=finished.wall_s.get("rollout", 0.0),
+            queue_s=round(finished.wall_s.get("queue", 0.0), 3),
+            rollout_s=round(finished.wall_s.get("rollout", 0.0), 3),
             feedback_s=0.0 if last is None else last.feedback_s,
-            finalise_s=finished.wall_s.get("finalise", 0.0),
+            finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
         ),
         outcome=_outcome(finished),
         rejected_submits=tuple(

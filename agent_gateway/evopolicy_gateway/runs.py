@@ -16,7 +16,6 @@ from evopolicy_common import transport
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.run_record import RunRecord
-from evopolicy_gateway import processes
 from evopolicy_gateway.local_cluster import local_cluster
 from evopolicy_gateway.operations import Operations, find_credentials
 from evopolicy_gateway.play import Plan, RunPlay
@@ -60,7 +59,6 @@ async def connected(
     where: Cluster, env_ids: Sequence[str]
 ) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Task[None] | None]]:
     """A link to the cluster, the gateways' credentials, and the task that fails when a local cluster cannot be kept up."""
-    processes.become_subreaper()
     _end_on_sigterm()
     async with contextlib.AsyncExitStack() as stack:
         failed: asyncio.Task[None] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import sys
@@ -57,8 +58,9 @@ def _split(command: str) -> list[str]:
 
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     """The command with files that lie where it was given named absolutely."""
+    # Links stay links: a virtual environment's python is one, and another program without it.
     resolved = [
-        str((started_in / word).resolve()) if (started_in / word).is_file() else word for word in words
+        os.path.abspath(started_in / word) if (started_in / word).is_file() else word for word in words
     ]
     if shutil.which(resolved[0]) is None:
         raise ConfigError(f"--agent {agent}: no program {words[0]!r}, neither a file here nor on the PATH")

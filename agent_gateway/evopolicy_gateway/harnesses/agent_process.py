@@ -62,6 +62,11 @@ class AgentProcess:
             return False
         return True
 
+    def hang_up(self) -> None:
+        """Ends its stdin: nothing more is said to it."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
     async def ended(self) -> int:
         """Its exit status (negative: the signal that ended it)."""
         # `Process.wait` would wait for the pipes too, which a daemonised child can hold open for ever.
@@ -74,8 +79,7 @@ class AgentProcess:
         self._stderr.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._stderr
-        if self._process.stdin is not None:
-            self._process.stdin.close()
+        self.hang_up()
 
     async def _drain_stderr(self) -> None:
         assert self._process.stderr is not None

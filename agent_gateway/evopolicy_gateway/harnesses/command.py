@@ -68,6 +68,7 @@ async def _talk(process: AgentProcess, stage: Stage) -> tuple[int, bool]:
             turn += 1
             stage.on_turn(turn, str(answer.get("text", "")))
             if answer["stop"]:
+                process.hang_up()
                 return turn, True
             await saying
             saying = asyncio.create_task(_prompt(process, stage, turn))

@@ -1,0 +1,85 @@
+"""The feedback tree on disk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from evopolicy_gateway.feedback import SubmitTree
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_episodes_stream_into_the_partial_folder_and_a_rename_commits_them(tmp_path: Path) -> None:
+    tree = SubmitTree(tmp_path, "submit_000")
+    tree.begin()
+    tree.put_episode("ep_001", {"trajectory.jsonl": b"1\n"})
+    assert names(tmp_path) == ["submit_000.partial"]
+    assert names(tmp_path / "submit_000.partial" / "episodes") == ["ep_001"]
+    tree.commit(b"{}\n", None)
+    assert names(tmp_path) == ["submit_000"]
+    assert names(tmp_path / "submit_000") == ["episodes", "summary.json"]
+
+
+def test_the_summary_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    real = os.open
+
+    def opened(path: object, flags: int, *args: int, **kwargs: int) -> int:
+        if flags & os.O_CREAT:
+            written.append(Path(str(path)).name)
+        return real(path, flags, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(os, "open", opened)
+    tree = SubmitTree(tmp_path, "submit_000")
+    tree.begin()
+    tree.put_episode("ep_000", {"trajectory.jsonl": b"", "stdout.txt": b""})
+    tree.commit(b"{}\n", b"why\n")
+    assert written == ["trajectory.jsonl", "stdout.txt", "errors.txt", "summary.json"]
+
+
+def test_beginning_again_forgets_what_was_written(tmp_path: Path) -> None:
+    tree = SubmitTree(tmp_path, "submit_000")
+    tree.begin()
+    tree.put_episode("ep_000", {"a": b"old"})
+    tree.begin()
+    tree.put_episode("ep_000", {"a": b"new"})
+    tree.put_episode("ep_000", {"a": b"newer"})
+    tree.commit(b"{}\n", None)
+    assert (tmp_path / "submit_000" / "episodes" / "ep_000" / "a").read_bytes() == b"newer"
+
+
+def test_a_committed_folder_of_a_gateway_that_died_before_its_journal_is_replaced(tmp_path: Path) -> None:
+    for text in (b"1", b"2"):
+        tree = SubmitTree(tmp_path, "submit_000")
+        tree.begin()
+        tree.commit(text, None)
+    assert tree.final.joinpath("summary.json").read_bytes() == b"2"
+
+
+def test_a_dropped_episode_is_gone(tmp_path: Path) -> None:
+    tree = SubmitTree(tmp_path, "submit_000")
+    tree.begin()
+    tree.put_episode("ep_000", {"a": b""})
+    tree.drop_episode("ep_000")
+    tree.drop_episode("ep_001")
+    tree.commit(b"{}", b"e")
+    assert names(tree.final / "episodes") == []
+
+
+def test_links_in_the_way_are_removed_and_not_followed(tmp_path: Path) -> None:
+    feedback, outside = tmp_path / "feedback", tmp_path / "outside"
+    feedback.mkdir()
+    outside.mkdir()
+    (outside / "precious").write_text("x")
+    (feedback / "submit_000.partial").symlink_to(outside)
+    (feedback / "submit_000").symlink_to(outside)
+    tree = SubmitTree(feedback, "submit_000")
+    tree.begin()
+    tree.commit(b"{}", None)
+    assert names(outside) == ["precious"]
+    assert not tree.final.is_symlink()

@@ -1,0 +1,86 @@
+"""The gateway's journal."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evopolicy_common.errors import StorageError
+from evopolicy_gateway.journal import Accepted, AnyEntry, Closed, Journal, Rejected, Requested, Settled
+
+REQUESTED = Requested(
+    key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None
+)
+ENTRIES: list[AnyEntry] = [
+    REQUESTED,
+    Accepted(key="k", submit_index=0, first_global_episode=0, remaining_budget=3),
+    Settled(key="k", status="ok", summary='{\n  "a": "é\u2028"\n}\n'),
+    Rejected(status="budget_invalid", message="no", at=1.5, after_submits=1),
+    Closed(reason="budget_spent"),
+]
+
+
+def entries_in(path: Path) -> list[AnyEntry]:
+    journal = Journal(path)
+    journal.close()
+    return journal.entries
+
+
+def written(path: Path) -> bytes:
+    journal = Journal(path)
+    for entry in ENTRIES:
+        journal.append(entry)
+    journal.close()
+    return path.read_bytes()
+
+
+def test_what_was_appended_is_read_back(tmp_path: Path) -> None:
+    written(tmp_path / "j")
+    assert entries_in(tmp_path / "j") == ENTRIES
+    assert (tmp_path / "j").stat().st_mode & 0o077 == 0
+
+
+def test_a_journal_cut_anywhere_keeps_its_whole_lines_and_goes_on(tmp_path: Path) -> None:
+    data = written(tmp_path / "j")
+
+    @given(st.integers(0, len(data)))
+    def check(cut: int) -> None:
+        path = tmp_path / "cut"
+        path.write_bytes(data[:cut])
+        journal = Journal(path)
+        whole = data[:cut].count(b"\n")
+        assert journal.entries == ENTRIES[:whole]
+        journal.append(ENTRIES[-1])
+        journal.close()
+        assert entries_in(path) == [*ENTRIES[:whole], ENTRIES[-1]]
+
+    check()
+
+
+def test_a_damaged_line_in_the_middle_is_told(tmp_path: Path) -> None:
+    data = written(tmp_path / "j")
+    (tmp_path / "j").write_bytes(b"junk\n" + data)
+    with pytest.raises(StorageError, match="line 1"):
+        Journal(tmp_path / "j")
+
+
+def test_a_line_that_the_disk_refuses_leaves_no_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = Journal(tmp_path / "j")
+    journal.append(REQUESTED)
+
+    def full(fd: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(StorageError, match="No space left"):
+            journal.append(ENTRIES[1])
+    journal.append(ENTRIES[2])
+    journal.close()
+    assert entries_in(tmp_path / "j") == [REQUESTED, ENTRIES[2]]
