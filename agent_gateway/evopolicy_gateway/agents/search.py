@@ -28,8 +28,8 @@ FIRST_STRENGTH, STRENGTH_DECAY = 0.8, 0.7
 """Mutation strength of the first round after the opening, and its factor from round to round."""
 SPARSE_SHARE = 0.6
 """Returns are sparse when more than this share of them is the same."""
-NOISY_RATIO = 0.5
-"""Variance of noise over that of candidate effects from which on a candidate meets two cases a round."""
+NOISY_RATIO, VERY_NOISY_RATIO = 0.5, 1.2
+"""Variance of noise over that of candidate effects from which on a candidate meets two and four cases a round."""
 TIED_SHARE = 0.15
 """Share of a round that may share its best return before one case is taken to be too easy."""
 NOVELTY_BONUS = 0.3
@@ -208,19 +208,30 @@ class Search:
 
     @property
     def repeats(self) -> int:
-        """How many cases each candidate of the next round should meet: two where one does not tell them apart."""
+        """How many cases each candidate of the next round should meet: more where one does not tell them apart."""
         tried = [c for c in self.candidates if c.episodes]
-        if not tried or self.is_sparse:
+        if not tried or self.is_flat:
             return 1
+        if self.is_sparse:
+            return 2
+        if max(len(c.episodes) for c in tried) < 2:
+            return 2  # nothing is known of the noise yet
         last = [c.episodes[-1].episode_return for c in tried if c.episodes[-1].case == tried[-1].episodes[-1].case]
         tied = last.count(max(last)) > len(last) * TIED_SHARE
-        return 2 if tied or self._effects(tried)[1] > NOISY_RATIO else 1
+        ratio = self._effects(tried)[1]
+        return 4 if ratio > VERY_NOISY_RATIO else 2 if tied or ratio > NOISY_RATIO else 1
 
     def _effects(self, tried: list[Candidate]) -> tuple[Vector, float]:
         """Effects of `tried`, and the variance of one episode's noise over that of the better half's effects, ≤ 2."""
         effects, noise = _fit(self._scores(tried))
         better = np.sort(effects)[len(effects) // 2 :]
         return effects, min(noise**2 / max(float(np.var(better)), 1e-12), 2.0)
+
+    @property
+    def is_flat(self) -> bool:
+        """True while no return differs from another."""
+        returns = [e.episode_return for c in self.candidates for e in c.episodes]
+        return not returns or max(returns) - min(returns) < 1e-9
 
     @property
     def is_sparse(self) -> bool:
