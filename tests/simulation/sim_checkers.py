@@ -48,6 +48,7 @@ class Checkers:
         """Lease to worker and incarnation it was granted in."""
         self._attempts: dict[str, int] = {}
         """Job to its highest attempt."""
+        self._handed_in: set[str] = set()
         self._strikes: dict[str, int] = {}
         self._steps = 0
         self._core: Core | None = None
@@ -167,7 +168,14 @@ class Checkers:
             want(disk.states[event.run].phase != "open", "a closed run is durably closed", event)
         elif isinstance(message, wire.HandInReply) and isinstance(event, events.ResultsHandedIn):
             for result in event.results:
+                self._handed_in.add(result.lease_id)
                 self._taken(result)
+        elif isinstance(message, wire.HeartbeatReply) and isinstance(event, events.HeartbeatReceived):
+            for held in event.held:
+                group, _, first = held.job_id.rpartition("/")
+                row = disk.outcome(group, int(first))
+                told = row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
+                want(told, "who plays what is done already is told to stop", held, row)
         elif isinstance(message, wire.Leases) and isinstance(event, events.LeaseRequested):
             for lease in message.leases:
                 self._leased(event.worker, lease)
