@@ -315,6 +315,17 @@ class Intake:
     def run_cancelled(self, m: operator.CancelRun, request: int, stimulus: str) -> AnyEvent:
         return events.RunCancelled(stimulus_id=stimulus, request=request, run=m.run)
 
+    def run_repinned(self, m: operator.RepinRun, request: int, stimulus: str) -> AnyEvent:
+        if not m.reason.strip():
+            raise RefusedError("bad_message", "an override of a run's fingerprint class needs a reason")
+        return events.RunRepinned(
+            stimulus_id=stimulus,
+            request=request,
+            run=m.run,
+            fingerprint_class=m.fingerprint_class,
+            reason=m.reason,
+        )
+
     def worker_state_set(self, m: operator.SetWorker, request: int, stimulus: str) -> AnyEvent:
         return events.WorkerStateSet(stimulus_id=stimulus, request=request, worker=m.worker, state=m.state)
 
@@ -356,6 +367,7 @@ _EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
     operator.WaitRun: Intake.run_waited,
     operator.EvaluationPoll: Intake.evaluation_polled,
     operator.CancelRun: Intake.run_cancelled,
+    operator.RepinRun: Intake.run_repinned,
     operator.SetWorker: Intake.worker_state_set,
 }
 

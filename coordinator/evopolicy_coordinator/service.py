@@ -47,6 +47,7 @@ _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
+_STALLS_TOLD = 5
 _READS_FILES = (operator.CreateRun, operator.Evaluate)
 
 
@@ -368,7 +369,14 @@ class Service:
                 break
             pending.query.drop()
             del self._pending[request]
+        self._tell_stalls()
         self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
+
+    def _tell_stalls(self) -> None:
+        """Names in the log what waits longer than it should, as `evopolicy status` does."""
+        stalls = () if self._core is None else self._core.status(self.now()).stalls
+        if stalls:
+            log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_TOLD])
 
     def _drop_pending(self) -> None:
         for pending in self._pending.values():

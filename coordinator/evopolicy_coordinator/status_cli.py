@@ -25,6 +25,7 @@ from evopolicy_common.messages.operator import (
     CancelRun,
     Done,
     OperatorReply,
+    RepinRun,
     SetWorker,
     StatusReply,
     StatusRequest,
@@ -82,6 +83,10 @@ class Operator:
     async def cancel_run(self, run: str) -> None:
         message = CancelRun(token=self.token, run=run)
         await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
+
+    async def repin_run(self, run: str, fingerprint_class: str, reason: str) -> None:
+        message = RepinRun(token=self.token, run=run, fingerprint_class=fingerprint_class, reason=reason)
+        await self._ask.until_answered("repin", message, Done, patience_s=10.0)
 
 
 def _asking(connect: list[str] | None, file: Path | None, work: Callable[[Operator], Awaitable[T]]) -> T:
@@ -163,6 +168,23 @@ def cancel(
     """End a run without a score; what of it is played stops."""
     _asking(connect, file, lambda operator: operator.cancel_run(run))
     typer.echo(f"{run} is cancelled")
+
+
+@runs_app.command(
+    epilog="Example: evopolicy runs repin r-0f2e9a7c11d04b35 b23d564d30c1 --reason 'the old workers are gone'"
+)
+def repin(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    fingerprint_class: Annotated[
+        str, typer.Argument(metavar="CLASS", help="The workers' class, as `evopolicy status` shows it.")
+    ],
+    reason: Annotated[str, typer.Option(help="Why; recorded in the run.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Let a run go on with workers of other library versions, when those it began with are gone."""
+    _asking(connect, file, lambda operator: operator.repin_run(run, fingerprint_class, reason))
+    typer.echo(f"{run} goes on with workers of class {fingerprint_class}")
 
 
 def render(reply: StatusReply) -> RenderableType:

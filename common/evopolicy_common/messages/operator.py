@@ -168,6 +168,16 @@ class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
     run: str
 
 
+class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
+    """Let a run go on with the workers of another fingerprint class; the reason is recorded in the run."""
+
+    token: str
+    run: str
+    fingerprint_class: str
+    """As `WorkerStatus.fingerprint` shows it."""
+    reason: str
+
+
 class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
     token: str
     worker: str
@@ -233,6 +243,7 @@ OperatorRequest = (
     | Evaluate
     | EvaluationPoll
     | CancelRun
+    | RepinRun
     | SetWorker
     | StatusRequest
     | BlobPut

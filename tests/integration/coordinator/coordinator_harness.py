@@ -114,11 +114,13 @@ class InstantWorker:
         slots: int = 4,
         play: Callable[[Job, EpisodeSpec], EpisodeOutcome] = play,
         pause_s: float = 0.0,
+        fingerprint: worker.Fingerprint = FINGERPRINT,
     ) -> None:
         self.name = name
         self.link = link
         self.slots = slots
         self.play = play
+        self.fingerprint = fingerprint
         self.pause_s = pause_s
         """How long a batch takes."""
         self.session = ""
@@ -137,7 +139,7 @@ class InstantWorker:
             slots=self.slots,
             tiers=("bwrap",),
             environments=(LINE,),
-            fingerprint=FINGERPRINT,
+            fingerprint=self.fingerprint,
         )
         self.session = (await self.ask.until_answered("register", message, worker.Registered)).session
 

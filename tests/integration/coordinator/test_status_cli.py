@@ -12,10 +12,20 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
-from coordinator_harness import Coordinator, bundle_of, gateway_of, operator_of, working
+from coordinator_harness import (
+    FINGERPRINT,
+    Coordinator,
+    OperatorClient,
+    bundle_of,
+    gateway_of,
+    operator_of,
+    working,
+)
 from typer.testing import CliRunner, Result
 
+from evopolicy_common.messages.operator import WorkerStatus
 from evopolicy_coordinator.status_cli import runs_app, status_app, workers_app
 
 APPS = {"status": status_app, "workers": workers_app, "runs": runs_app}
@@ -91,6 +101,40 @@ def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> 
     asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
+def test_run_goes_on_with_workers_of_another_class_when_an_operator_says_why(
+    coordinator: Coordinator,
+) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create("repin", n_validation=1, n_heldout=1)
+            async with gateway_of(coordinator, created) as gateway:
+                async with working(coordinator, "w-old"):
+                    await gateway.submit(bundle_of("# policy"), (0,), "first")
+                    await gateway.results(0)
+                newer = msgspec.structs.replace(FINGERPRINT, code_version="2")
+                async with working(coordinator, "w-new", fingerprint=newer) as worker:
+                    await gateway.submit(bundle_of("# policy"), (0,), "second")
+                    while not (shown := await worker_shown(operator, "w-new")).refused:
+                        await asyncio.sleep(0.02)
+                    assert "pinned" in shown.refused[created.run]
+                    assert worker.jobs == []
+                    repin = ("repin", created.run, shown.fingerprint, "--reason")
+                    assert (await called(coordinator, "runs", *repin, " ")).exit_code == 1
+                    assert (await called(coordinator, "runs", *repin, "old ones gone")).exit_code == 0
+                    _, done = await gateway.results(1)
+                    assert done.status == "ok"
+
+    asyncio.run(asyncio.wait_for(scenario(), 60))
+
+
+async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:
+    while True:
+        for worker in (await operator.status()).workers:
+            if worker.worker == name:
+                return worker
+        await asyncio.sleep(0.02)
+
+
 def test_refusals_are_told_in_a_line_and_exit_1(coordinator: Coordinator) -> None:
     result = call(coordinator, "runs", "cancel", "r-nowhere")
     assert result.exit_code == 1
@@ -131,7 +175,13 @@ def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> 
 
 @pytest.mark.parametrize(
     ("name", "args"),
-    [("status", ()), ("workers", ("drain",)), ("workers", ("resume",)), ("runs", ("cancel",))],
+    [
+        ("status", ()),
+        ("workers", ("drain",)),
+        ("workers", ("resume",)),
+        ("runs", ("cancel",)),
+        ("runs", ("repin",)),
+    ],
 )
 def test_every_command_has_help_with_an_example(name: str, args: tuple[str, ...]) -> None:
     result = CliRunner().invoke(APPS[name], [*args, "--help"])

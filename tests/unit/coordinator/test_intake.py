@@ -153,6 +153,12 @@ def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
     assert refused(intake, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"
 
 
+def test_override_of_a_runs_class_needs_a_reason(intake: Intake) -> None:
+    values = {"token": "operate", "run": "r", "fingerprint_class": "c"}
+    assert event(intake, OPS, operator.RepinRun(**values, reason="gone")).reason == "gone"
+    assert refused(intake, OPS, operator.RepinRun(**values, reason=" ")).status == "bad_message"
+
+
 @pytest.mark.parametrize("key", ["", "k" * 201])
 def test_idempotency_key_has_a_length(intake: Intake, key: str) -> None:
     failure = PolicyFailure(category="missing_policy", step_index=None, message="")
