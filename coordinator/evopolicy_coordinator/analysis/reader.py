@@ -274,6 +274,15 @@ def count_changed_lines(before: Files, after: Files) -> int:
 
 
 def _changed(old: list[bytes], new: list[bytes]) -> int:
+    head = 0
+    for before, after in zip(old, new, strict=False):
+        if before != after:
+            break
+        head += 1
+    old, new = old[head:], new[head:]
+    while old and new and old[-1] == new[-1]:
+        old.pop()
+        new.pop()
     if len(old) + len(new) > _MAX_DIFF_LINES:
         counts: dict[bytes, int] = {}
         for line in old:

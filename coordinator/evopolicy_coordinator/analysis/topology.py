@@ -19,7 +19,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import msgspec
 
@@ -114,13 +114,14 @@ class _Walker:
         self.state: set[tuple[str, str]] = set()
         self.functions = self.branches = self.loops = self.depth = self.nodes = 0
         self._class = ""
+        self._instance = ("", "")
+        """Class and first parameter of the method that is being walked."""
 
     def module(self, module: Module) -> None:
         assert module.tree is not None
         scope = _Scope()
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                self._bind_import(node, scope, module)
+        for node in module.imports:
+            self._bind_import(node, scope, module)
         for statement in module.tree.body:
             unit = self._statement_unit(statement, scope, self.top_defs)
             if unit is not None:
@@ -150,9 +151,9 @@ class _Walker:
 
     def _statement_unit(self, node: ast.stmt, scope: _Scope, defs: set[str]) -> _Unit | None:
         """A unit for a statement of a module's or class's body; None for what is no structure."""
-        if isinstance(node, ast.Import | ast.ImportFrom | ast.Pass) or _is_docstring(node):
+        if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
             return None
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        if isinstance(node, _FUNCTIONS):
             defs.add(node.name)
             unit = _Unit(scope, node.name, is_function=True)
             self._function(node, unit, 0)
@@ -198,23 +199,12 @@ class _Walker:
         for decorator in node.decorator_list:
             self._node(decorator, unit, depth)
         self._arguments(node.args, unit, depth)
+        outer = self._instance
         if self._class:
-            self._collect_state(node)
+            positional = [*node.args.posonlyargs, *node.args.args]
+            self._instance = (self._class, positional[0].arg) if positional else ("", "")
         self._body(node.body, unit, depth)
-
-    def _collect_state(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> None:
-        positional = [*node.args.posonlyargs, *node.args.args]
-        if not positional:
-            return
-        instance = positional[0].arg
-        for child in ast.walk(node):
-            if (
-                isinstance(child, ast.Attribute)
-                and isinstance(child.ctx, ast.Store)
-                and isinstance(child.value, ast.Name)
-                and child.value.id == instance
-            ):
-                self.state.add((self._class, child.attr))
+        self._instance = outer
 
     def _arguments(self, args: ast.arguments, unit: _Unit, depth: int) -> None:
         self._add(unit, "(")
@@ -243,7 +233,7 @@ class _Walker:
         self._add(unit, "}")
 
     def _statement(self, node: ast.stmt, unit: _Unit, depth: int) -> None:
-        if isinstance(node, ast.Import | ast.ImportFrom | ast.Pass) or _is_docstring(node):
+        if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
             return
         if isinstance(node, ast.AnnAssign):
             if node.value is not None:
@@ -251,14 +241,14 @@ class _Walker:
                 self._node(node.target, unit, depth)
                 self._node(node.value, unit, depth)
             return
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        if isinstance(node, _FUNCTIONS):
             unit.stored.add(node.name)
             unit.tokens.append(("n", node.name))
             outer, self._class = self._class, ""
             self._function(node, unit, 0)
             self._class = outer
             return
-        if isinstance(node, ast.Global | ast.Nonlocal):
+        if isinstance(node, _DECLARATIONS):
             if isinstance(node, ast.Global):
                 unit.globals.update(node.names)
                 self.state.update(("", name) for name in node.names)
@@ -272,45 +262,35 @@ class _Walker:
         self._node(node, unit, depth)
 
     def _node(self, node: ast.AST, unit: _Unit, depth: int) -> None:
+        handler = _HANDLERS.get(type(node))
+        if handler is not None:
+            handler(self, node, unit, depth)
+            return
         kind = type(node)
-        if kind is ast.Name:
-            self._name(node, unit)  # type: ignore[arg-type]
-            return
-        if kind is ast.Constant:
-            self._constant(node.value, unit)  # type: ignore[attr-defined]
-            return
-        if kind is ast.Attribute:
-            self._attribute(node, unit, depth)  # type: ignore[arg-type]
-            return
-        if (
-            isinstance(node, ast.UnaryOp)
-            and isinstance(node.op, ast.USub | ast.UAdd)
-            and _is_number(node.operand)
-        ):
-            self._add(unit, "#")
-            return
-        if isinstance(node, ast.JoinedStr):
-            self._f_string(node, unit, depth)
-            return
-        inner = depth
-        if isinstance(node, ast.If):
-            self.branches += 1
-            inner = self._nest(depth)
-        elif isinstance(node, ast.For | ast.AsyncFor | ast.While):
+        if kind in _NESTING:
+            depth = self._nest(depth)
+        if kind in _LOOPS:
             self.loops += 1
-            inner = self._nest(depth)
-        elif isinstance(node, ast.With | ast.AsyncWith | ast.Try | ast.Match) or kind.__name__ == "TryStar":
-            inner = self._nest(depth)
-        elif isinstance(node, ast.IfExp | ast.match_case):
+        elif kind in _CASES:
             self.branches += 1
         self._add(unit, kind.__name__)
-        if isinstance(node, ast.If):
-            self._node(node.test, unit, depth)
-            self._body(node.body, unit, inner)
-            is_elif = len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If)
-            self._body(node.orelse, unit, depth if is_elif else inner)
-            return
-        self._fields(node, unit, inner)
+        self._fields(node, unit, depth)
+
+    def _if(self, node: ast.If, unit: _Unit, depth: int) -> None:
+        self.branches += 1
+        inner = self._nest(depth)
+        self._add(unit, "If")
+        self._node(node.test, unit, depth)
+        self._body(node.body, unit, inner)
+        is_elif = len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If)
+        self._body(node.orelse, unit, depth if is_elif else inner)
+
+    def _unary(self, node: ast.UnaryOp, unit: _Unit, depth: int) -> None:
+        if isinstance(node.op, (ast.USub, ast.UAdd)) and _is_number(node.operand):
+            self._add(unit, "#")
+        else:
+            self._add(unit, "UnaryOp")
+            self._fields(node, unit, depth)
 
     def _fields(self, node: ast.AST, unit: _Unit, depth: int) -> None:
         for name in node._fields:
@@ -344,7 +324,7 @@ class _Walker:
         else:
             self._add(unit, repr(value))
 
-    def _name(self, node: ast.Name, unit: _Unit) -> None:
+    def _name(self, node: ast.Name, unit: _Unit, depth: int) -> None:
         self.nodes += 1
         if not isinstance(node.ctx, ast.Load):
             unit.stored.add(node.id)
@@ -354,6 +334,8 @@ class _Walker:
         self.nodes += 1
         if not isinstance(node.ctx, ast.Load):
             self.attribute_names.add(node.attr)
+            if isinstance(node.ctx, ast.Store) and getattr(node.value, "id", None) == self._instance[1]:
+                self.state.add((self._instance[0], node.attr))
         root: ast.expr = node
         path: list[str] = []
         while isinstance(root, ast.Attribute):
@@ -373,9 +355,8 @@ class _Walker:
         self._node(node.value, unit, depth)
         unit.tokens.append(("a", node.attr))
 
-    def _constant(self, value: object, unit: _Unit) -> None:
-        numeric = isinstance(value, int | float | complex) and not isinstance(value, bool)
-        self._add(unit, "#" if numeric else repr(value))
+    def _constant(self, node: ast.Constant, unit: _Unit, depth: int) -> None:
+        self._add(unit, "#" if _is_number(node) else repr(node.value))
 
     def _f_string(self, node: ast.JoinedStr, unit: _Unit, depth: int) -> None:
         self._add(unit, "JoinedStr")
@@ -404,6 +385,22 @@ class _Walker:
 _SKIPPED_FIELDS = frozenset({"ctx", "type_comment", "type_params", "annotation", "returns", "simple", "kind"})
 
 
+_HANDLERS: dict[type[ast.AST], Callable[..., None]] = {
+    ast.Name: _Walker._name,
+    ast.Constant: _Walker._constant,
+    ast.Attribute: _Walker._attribute,
+    ast.UnaryOp: _Walker._unary,
+    ast.JoinedStr: _Walker._f_string,
+    ast.If: _Walker._if,
+}
+_NO_STRUCTURE = (ast.Import, ast.ImportFrom, ast.Pass)
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+_DECLARATIONS = (ast.Global, ast.Nonlocal)
+_LOOPS = frozenset({ast.For, ast.AsyncFor, ast.While})
+_CASES = frozenset({ast.IfExp, ast.match_case})
+_NESTING = _LOOPS | {ast.With, ast.AsyncWith, ast.Try, ast.TryStar, ast.Match}
+
+
 def _own_name(name: str) -> str:
     return name if name in _PROTOCOL_NAMES or (name.startswith("__") and name.endswith("__")) else "·"
 
@@ -419,7 +416,7 @@ def _is_docstring(node: ast.stmt) -> bool:
 def _is_number(node: ast.expr) -> bool:
     return (
         isinstance(node, ast.Constant)
-        and isinstance(node.value, int | float | complex)
+        and isinstance(node.value, (int, float, complex))
         and not isinstance(node.value, bool)
     )
 
@@ -437,14 +434,22 @@ def _canonical(walker: _Walker) -> str:
         queue.extend(reversed(unit.children))
     resolved = [_resolve(unit, walker) for unit in every]
     place = {id(unit): i for i, unit in enumerate(every)}
+    texts = [_numbered(tokens, {}, {}) for tokens in resolved]
+    references = [
+        [(at, token[1]) for at, token in enumerate(tokens) if isinstance(token, tuple) and token[0] == "d"]
+        for tokens in resolved
+    ]
     labels: dict[str, str] = {}
     own = [""] * len(every)
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         for i in range(
             len(every) - 1, -1, -1
         ):  # a class comes before its children, and its label holds theirs
-            inner = sorted(own[place[id(child)]] for child in every[i].children)
-            own[i] = _hash([*_numbered(resolved[i], labels, {}), *inner])
+            if turn and not references[i] and not every[i].children:
+                continue
+            for at, name in references[i]:
+                texts[i][at] = "d" + labels.get(name, "")
+            own[i] = _hash([*texts[i], *sorted(own[place[id(child)]] for child in every[i].children)])
         by_name: dict[str, list[str]] = {}
         for unit, label in zip(every, own, strict=True):
             if unit.name:
