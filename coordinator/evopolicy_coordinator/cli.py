@@ -81,9 +81,9 @@ async def _run(options: Options, ready_file: Path | None) -> None:
         loop.add_signal_handler(number, stop.set)
 
     def on_ready(ready: Ready) -> None:
+        print(_ready_line(ready), flush=True)
         if ready_file is not None:
             write_atomically(ready_file, msgspec.json.format(msgspec.json.encode(ready)) + b"\n", mode=0o600)
-        print(_ready_line(ready), flush=True)
 
     await process.run(options, stop, on_ready)
 
