@@ -63,9 +63,7 @@ class Session:
 
     async def open(self) -> RunOpened:
         """All that is fixed for the run, and its state."""
-        return await self._requests.until_answered(
-            "open", OpenRun(run=self._run, token=self._token), RunOpened
-        )
+        return await self._ask("open", OpenRun(run=self._run, token=self._token), RunOpened)
 
     async def state(self) -> RunState | None:
         """The run's state now; None when the coordinator does not answer at once."""
