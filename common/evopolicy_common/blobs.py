@@ -144,6 +144,11 @@ class BlobStore:
             self._finish(part, digest)
         return have
 
+    def drop_unfinished(self) -> None:
+        """Forgets uploads that were begun and not finished; their senders begin again."""
+        for part in self._parts.iterdir():
+            part.unlink(missing_ok=True)
+
     def delete(self, digest: str) -> int:
         """Removes the blob and returns the bytes freed; 0 when it was not there."""
         path = self.path(digest)

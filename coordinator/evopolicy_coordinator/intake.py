@@ -117,6 +117,10 @@ class Intake:
         _check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
         return Parsed("gw", run, message)
 
+    def is_gateways(self, key: str) -> bool:
+        """Whether gateways ask on this key: what is answered there, an agent may come to see."""
+        return key.startswith(f"{self._prefix}gw/")
+
     def asks_for_change(self, key: str, payload: bytes) -> bool:
         """Whether the request would make something new (a run, a submit, an evaluation); its token is not looked at."""
         room = key.removeprefix(self._prefix).partition("/")[0]

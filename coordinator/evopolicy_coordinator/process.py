@@ -31,6 +31,9 @@ SIMULATORS = ("gymnasium", "gymnasium_robotics", "mujoco", "Box2D", "minigrid", 
 """What policies may not import: the workers' sandboxes do not show it to them."""
 
 
+_LOOPBACK = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:")
+
+
 class Options(msgspec.Struct, frozen=True, kw_only=True):
     """What a coordinator is started with."""
 
@@ -70,6 +73,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         store = Store(state.database)
         opened.callback(store.close)
         blobs = BlobStore(state.root / "blobs")
+        blobs.drop_unfinished()
         intake = Intake(
             state.identity,
             blobs,
@@ -122,6 +126,11 @@ async def _serve(
 def _listen(state: StateFolder, wanted: tuple[str, ...]) -> tuple[str, ...]:
     """The state folder's socket, always, and what was asked for."""
     listen = resolve_listen(list(wanted))
+    for endpoint in listen:
+        if endpoint.startswith("tcp/") and not endpoint.startswith(_LOOPBACK):
+            log.warning(
+                "passwords and results travel in the clear; keep to a trusted network", endpoint=endpoint
+            )
     try:
         return (state.socket_endpoint, *listen)
     except ConfigError as error:

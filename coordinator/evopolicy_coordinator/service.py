@@ -195,6 +195,11 @@ class Service:
             self._take(request)
             self._refuse(query, error)
             return
+        except Exception:
+            log.exception("request failed", key=query.key)
+            self._take(request)
+            query.drop()
+            return
         if request in self._pending:  # else the core was dropped meanwhile, and the query with it
             self._handle(event)
             self._flush()
@@ -209,6 +214,10 @@ class Service:
         if parsed.room == "work":
             _check_session(core, parsed.asker, message.token)
             most = MAX_BLOB_BYTES
+        elif parsed.room == "gw":
+            run = core.runs.get(parsed.asker)
+            if run is None or run.state.phase != "open":
+                raise RefusedError("closed", f"run {parsed.asker} is closed and takes no more bundles")
         self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, _answer_to(query, parsed.asker))
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
@@ -242,7 +251,11 @@ class Service:
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core nothing can be served; who would change something is told why."""
         if self._storage_error and self._intake.asks_for_change(query.key, query.payload):
-            why = f"the coordinator cannot write its store and takes nothing new: {self._storage_error}"
+            why = "the coordinator cannot write its store and takes nothing new until it can"
+            if not self._intake.is_gateways(
+                query.key
+            ):  # the reason names paths, which no agent needs to know
+                why += f": {self._storage_error}"
             query.reply(codec.encode(Refused(status="unavailable", message=why)))
         else:
             query.drop()

@@ -277,6 +277,20 @@ def test_uploaded_bytes_must_be_the_blob_they_are_named_after(coordinator: Coord
     run(scenario)
 
 
+def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as client:
+            created = await client.create("closed")
+        async with gateway_of(coordinator, created) as owner:
+            await owner.close()
+            bundle = bundle_of("# too late")
+            with pytest.raises(RefusedError) as refused:
+                await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
+            assert refused.value.status == "closed"
+
+    run(scenario)
+
+
 def test_bundle_that_arrives_in_many_chunks_is_whole(coordinator: Coordinator) -> None:
     async def scenario() -> None:
         async with operator_of(coordinator) as client, working(coordinator, "w-big"):

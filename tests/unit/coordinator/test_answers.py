@@ -132,6 +132,14 @@ def test_blob_put_in_chunks_is_got_in_chunks(desk: Desk) -> None:
     assert bytes(got) == data
 
 
+def test_upload_given_up_halfway_is_forgotten_at_the_next_start_and_begun_again(desk: Desk) -> None:
+    data = b"bundle" * 100
+    assert desk.put(put(data, data=data[:50])) == BlobAck(have=50)
+    desk.blobs.drop_unfinished()
+    assert desk.put(put(data, offset=50, data=data[50:])) == BlobAck(have=0)
+    assert desk.put(put(data)) == BlobAck(have=len(data))
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"digest": "../../etc/passwd"}, {"size": -1}, {"size": 1 << 40}, {"digest": "0" * 64}],

@@ -173,7 +173,15 @@ def test_request_that_could_not_be_written_did_not_happen_and_can_be_asked_again
         assert await waiting.message() is None
         refused = await told.message()
         assert refused.status == "unavailable"
-        assert "disk is full" in refused.message
+        assert "cannot write its store" in refused.message
+        assert "disk is full" not in refused.message
+        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
+        creating = Asked(
+            keys.operator_key("c", "create"),
+            operator.CreateRun(token="operate", key="other", settings=settings),
+        )
+        world.ask(creating)
+        assert "disk is full" in (await creating.message()).message
         world.full = False
         while (answer := await asked_again(world, created)) is None or isinstance(answer, worker.Refused):
             await asyncio.sleep(0.02)
