@@ -159,7 +159,10 @@ def test_grids_are_found_at_the_top_and_in_a_dict_but_pictures_are_not() -> None
     assert find_grid(OBS_SPACE) == (True, "view")
     assert find_grid(OBS_SPACE["spaces"]["view"]) == (True, None)
     assert find_grid({"type": "Image", "shape": [96, 96, 3], "dtype": "uint8"}) == (False, None)
-    assert find_grid({"type": "Box", "shape": [5, 5], "dtype": "float32", "low": [], "high": []}) == (False, None)
+    assert find_grid({"type": "Box", "shape": [5, 5], "dtype": "float32", "low": [], "high": []}) == (
+        False,
+        None,
+    )
 
 
 def test_cells_with_equal_channels_are_one_symbol() -> None:
