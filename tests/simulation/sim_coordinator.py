@@ -107,6 +107,7 @@ class SimCoordinator:
             event = kind(request=self._handles, stimulus_id=stimulus, **fields)  # type: ignore[call-arg]
             self._asks[self._handles] = (endpoint, answer, event)  # type: ignore[assignment]
         self.world.note(f"{endpoint} → {event}")
+        self.checkers.asking(event)
         self._take(self.core.handle(event, self.world.now))  # type: ignore[arg-type]
         self.checkers.stepped(self.core)
 

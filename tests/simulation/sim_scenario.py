@@ -57,6 +57,7 @@ class Simulation:
         self.plans = [_plan(f"r{index}", size, chance) for index in range(chance.randint(1, size.runs))]
         if any("twice" in submit.bundle or kills_any(plan) for plan in self.plans for submit in plan.submits):
             self.harmless = False
+        self._horizon_s = HORIZON_S * max(1.0, size.episodes / Size.episodes)
         self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
         self._attempts: dict[str, int] = {}
         self.checkers = Checkers(self)
@@ -145,7 +146,7 @@ class Simulation:
 
     def run(self) -> None:
         """Play the seed to its end; raises what the checkers or the core raise."""
-        finished = self.world.run(self.world.now + HORIZON_S, self._all_done)
+        finished = self.world.run(self.world.now + self._horizon_s, self._all_done)
         if not finished:
             missing = {plan.name for plan in self.plans} - self.checkers.finished_runs
             core = self.coordinator.core

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Container
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -251,7 +251,7 @@ class Queue:
             if lane.n_ready[priority] == 0:
                 self._settle(lane)
 
-    def take(self, profile: Profile, worker: str, warm: Container[str], now: float) -> JobState | None:
+    def take(self, profile: Profile, worker: str, warm: Collection[str], now: float) -> JobState | None:
         """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
         for priority in range(N_PRIORITIES):
             passed: list[Flow] = []
@@ -288,17 +288,22 @@ class Queue:
         self._clock[priority] = max(self._clock[priority], flow.served[priority])
         flow.served[priority] += flow.cost_s(job)
 
-    def _best(self, profile: Profile, priority: int, warm: Container[str]) -> Flow | None:
+    def _best(self, profile: Profile, priority: int, warm: Collection[str]) -> Flow | None:
         best: Flow | None = None
         best_score = 0.0
         for lane in profile.busy:
-            flow = lane.top(priority) if lane.n_ready[priority] else None
-            if flow is None:
+            heap = lane.heaps[priority]
+            if not heap or not lane.n_ready[priority]:
                 continue
-            score = flow.served[priority]
-            if flow.env in warm or (flow.ready[priority][0][1].group.template.bundle or "") in warm:
+            score, _, flow = heap[0]
+            if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
+                found = lane.top(priority)
+                if found is None:
+                    continue
+                flow, score = found, found.served[priority]
+            if warm and (flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm):
                 score -= self._warm_bonus_s
-            if best is None or (score, flow.seq) < (best_score, best.seq):
+            if best is None or score < best_score or (score == best_score and flow.seq < best.seq):
                 best, best_score = flow, score
         return best
 
@@ -325,10 +330,7 @@ class Queue:
         flow = lane.top(priority) if lane.n_ready[priority] else None
         if flow is None:
             return None
-        ready = flow.ready[priority]
-        while ready[0][1].ticket != ready[0][0]:
-            ready.popleft()
-        return ready[0][1]
+        return _next(flow, priority)
 
     def avoided(self, lane: Lane, priority: int, now: float) -> str | None:
         """The worker that the lane's next job is kept from."""
@@ -342,3 +344,11 @@ class Queue:
             if job is not None:
                 return job.group.template.bundle, job.group.template.env
         return None
+
+
+def _next(flow: Flow, priority: int) -> JobState:
+    """The first of a flow's ready jobs; there must be one. Void entries ahead of it are dropped."""
+    ready = flow.ready[priority]
+    while ready[0][1].ticket != ready[0][0]:
+        ready.popleft()
+    return ready[0][1]

@@ -74,10 +74,15 @@ class Scheduler:
         if not self._serve(worker, turn):
             wait_s = min(max(event.wait_s, 0.0), core.settings.max_wait_s)
             core.timers.arm(("lease", worker.name), turn.now + wait_s)
-            if core.fleet.available(worker, turn.now) and worker.reserved is None:
-                self._park(worker, turn)
+            self._park(worker, turn)
 
     def _park(self, worker: Worker, turn: Turn) -> None:
+        """Let a worker's poll wait where new work finds it, if it has a slot for it. Else its next free slot is what
+        brings the poll up again."""
+        if worker.n_live >= worker.slots or worker.reserved is not None:
+            return
+        if not self._core.fleet.available(worker, turn.now):
+            return
         self._core.fleet.park(worker)
         for lane in worker.profile.busy:
             self._core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
@@ -214,7 +219,7 @@ class Scheduler:
         fleet = self._core.fleet
         if worker.poll is None or not fleet.available(worker, turn.now):
             return
-        if not self._serve(worker, turn) and worker.reserved is None:
+        if not self._serve(worker, turn):
             self._park(worker, turn)
 
     def _feed(self, lane: Lane, turn: Turn) -> None:
@@ -228,7 +233,7 @@ class Scheduler:
                 tries = 0
             else:
                 tries += 1
-                self._to_the_back(worker)
+                self._to_the_back(worker, turn)
         if any(lane.n_ready):
             self._core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
 
@@ -237,13 +242,11 @@ class Scheduler:
             for name in list(islice(profile.parked, tries)):
                 worker = self._core.fleet.workers[name]
                 if not self._serve(worker, turn):
-                    self._to_the_back(worker)
+                    self._to_the_back(worker, turn)
 
-    def _to_the_back(self, worker: Worker) -> None:
-        fleet = self._core.fleet
-        fleet.unpark(worker)
-        if worker.reserved is None:
-            fleet.park(worker)
+    def _to_the_back(self, worker: Worker, turn: Turn) -> None:
+        self._core.fleet.unpark(worker)
+        self._park(worker, turn)
 
     def _parked(self, lane: Lane) -> Worker | None:
         """The waiting worker that should get what goes next in the lane."""

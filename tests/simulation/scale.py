@@ -1,0 +1,324 @@
+"""Scale run: the core alone, from 10 to 2,000 workers, with a hundred thousand jobs; prints what a job costs it.
+
+A job's cost is the CPU time of the core and nothing else: the workers here answer at once and the store drops its rows. It
+must stay flat, and memory must not grow with finished jobs: it is measured in a second
+pass over half of the jobs, after two fifths of them (when the core's story, of fixed size, is full) and at the end.
+
+    python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import sys
+import time
+import tracemalloc
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import Effect, ReadResults, Reply
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import Snapshot
+from evopolicy_coordinator.core.settings import CoreSettings
+
+ENVS = tuple(f"toy/env{index}" for index in range(16))
+EPISODES = 128
+"""In a submit."""
+SUBMITS = 4
+"""In a run; then it is validated, scored, and another begins."""
+SLOTS = 2
+EPISODE_S = 2.0
+"""Simulated: long enough that leases go one by one, the dearest case."""
+BEAT_S = 2.0
+
+
+@dataclass
+class Row:
+    """One line of the table."""
+
+    workers: int
+    jobs: int
+    cpu_us_per_job: float
+    events_per_job: float
+    longest_ms: float
+    """Longest that one event took."""
+    kib_early: float
+    """Memory after two fifths of the second pass."""
+    kib_late: float
+    """Memory at its end."""
+
+
+class Load:
+    """A core under load: workers that poll, beat and hand in, gateways that submit again as soon as they may."""
+
+    def __init__(self, workers: int, jobs: int, *, memory: bool) -> None:
+        self.now = 1000.0
+        self.core, _ = Core.load(CoreSettings(), Snapshot(incarnation=1), self.now)
+        self.jobs, self.done, self.handled = jobs, 0, 0
+        self.cpu_s = self.longest_s = 0.0
+        self.memory: list[int] = []
+        self._measure = memory
+        self._requests = 0
+        self._heap: list[tuple[float, int, int, wire.Lease]] = []
+        self._sessions = [f"session-{index}" for index in range(workers)]
+        self._names = [f"worker-{index}" for index in range(workers)]
+        self._held: list[dict[str, wire.HeldLease]] = [{} for _ in range(workers)]
+        self._polls: dict[int, int] = {}
+        self._ready: deque[tuple[int, tuple[wire.Lease, ...]]] = deque()
+        self._accepted: dict[int, int] = {}
+        self._runs = max(2, min(2 * workers * SLOTS // EPISODES + 16, jobs // EPISODES))
+        self._created = 0
+        self._submitted: dict[str, int] = {}
+        """Submits so far of each open run."""
+        self._seq = 0
+
+    def tell(self, event: Any) -> None:
+        began = time.process_time()
+        effects = self.core.handle(event, self.now)
+        took = time.process_time() - began
+        self.cpu_s += took
+        self.longest_s = max(self.longest_s, took)
+        self.handled += 1
+        self._take(effects)
+
+    def _take(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Reply) and isinstance(effect.message, wire.Leases):
+                worker = self._polls.pop(int(effect.request))
+                self._ready.append((worker, effect.message.leases))
+            elif isinstance(effect, ReadResults):
+                self._accepted[int(effect.request)] = 1
+
+    def request(self) -> int:
+        self._requests += 1
+        return self._requests
+
+    # ---- who does what ----
+
+    def start(self) -> None:
+        descriptions = tuple(
+            EnvironmentDescription(
+                env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
+            )
+            for env in ENVS
+        )
+        fingerprint = wire.Fingerprint(code_version="1", python="3", packages={}, cpu="")
+        for index, name in enumerate(self._names):
+            self.tell(
+                events.WorkerRegistered(
+                    request=self.request(),
+                    worker=name,
+                    session=self._sessions[index],
+                    slots=SLOTS,
+                    tiers=("bwrap",),
+                    environments=descriptions,
+                    fingerprint=fingerprint,
+                )
+            )
+        for _ in range(self._runs):
+            self._create()
+        for index in range(len(self._names)):
+            self._poll(index)
+        self.cpu_s, self.longest_s, self.handled = 0.0, 0.0, 0
+
+    def _create(self) -> None:
+        self._created += 1
+        run = f"run-{self._created}"
+        self._submitted[run] = 0
+        self.tell(
+            events.RunCreated(
+                request=self.request(),
+                run=run,
+                key=f"key-{run}",
+                capability="c",
+                secret=b"s" * 32,
+                settings=RunSettings(env=ENVS[self._created % len(ENVS)], entry="e", model="m", exp_id="x"),
+                budget=SUBMITS * EPISODES,
+                min_episodes_per_submit=1,
+                max_episodes_per_submit=EPISODES,
+                train=tuple(Case(seed=seed) for seed in range(EPISODES)),
+                validation=tuple(Case(seed=900 + seed) for seed in range(16)),
+                heldout=tuple(Case(seed=950 + seed) for seed in range(32)),
+                split_hashes={},
+                split_secret=True,
+            )
+        )
+        self._submit(run)
+
+    def _submit(self, run: str) -> None:
+        index = self._submitted[run]
+        self._submitted[run] = index + 1
+        self.tell(
+            events.SubmitRequested(
+                request=self.request(),
+                run=run,
+                key=f"submit-{index}",
+                env_instances=tuple(range(EPISODES)),
+                bundle=f"{run}-{index}",
+            )
+        )
+
+    def _poll(self, worker: int) -> None:
+        request = self.request()
+        self._polls[request] = worker
+        self.tell(
+            events.LeaseRequested(
+                request=request,
+                worker=self._names[worker],
+                session=self._sessions[worker],
+                n=SLOTS,
+                wait_s=30.0,
+            )
+        )
+
+    def _beat(self, worker: int) -> None:
+        held = tuple(self._held[worker].values())
+        self.tell(
+            events.HeartbeatReceived(
+                request=self.request(), worker=self._names[worker], session=self._sessions[worker], held=held
+            )
+        )
+
+    def _hand_in(self, worker: int, lease: wire.Lease) -> None:
+        self._held[worker].pop(lease.lease_id, None)
+        outcomes = tuple(
+            EpisodeOutcome(
+                index=spec.index,
+                episode_return=1.0,
+                length=1,
+                terminated=True,
+                truncated=False,
+                wall_s=EPISODE_S,
+            )
+            for spec in lease.job.episodes
+        )
+        result = wire.JobResult(
+            lease_id=lease.lease_id,
+            job_id=lease.job.job_id,
+            attempt=lease.attempt,
+            kind="done",
+            episodes=outcomes,
+        )
+        self.tell(
+            events.ResultsHandedIn(
+                request=self.request(),
+                worker=self._names[worker],
+                session=self._sessions[worker],
+                results=(result,),
+            )
+        )
+        self.done += 1
+        run, _, rest = lease.job.job_id.partition("/")
+        group = f"{run}/{rest.rpartition('/')[0]}"
+        if "/train" in group and group not in self.core.groups:
+            self._go_on(run)
+
+    def _go_on(self, run: str) -> None:
+        """A submit is over: the next, or the run's end and a new run."""
+        if self._submitted[run] < SUBMITS:
+            self._submit(run)
+        else:
+            del self._submitted[run]
+            self.tell(events.RunClosed(request=self.request(), run=run, reason="budget_spent"))
+            self._create()
+
+    def run(self) -> None:
+        """Until so many jobs are done, train and hidden; workers beat in turn, each every `BEAT_S` simulated seconds."""
+        workers = len(self._names)
+        playing: deque[tuple[float, int, wire.Lease]] = deque()
+        next_beat, beating = self.now, 0
+        if self._measure:
+            tracemalloc.start()
+        marks = [2 * self.jobs // 5, self.jobs]
+        while self.done < self.jobs:
+            while self._ready:
+                worker, leases = self._ready.popleft()
+                for lease in leases:
+                    held = wire.HeldLease(
+                        lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, running=True
+                    )
+                    self._held[worker][lease.lease_id] = held
+                    playing.append((self.now + EPISODE_S, worker, lease))
+                self._poll(worker)
+            while next_beat <= self.now:
+                self._beat(beating)
+                beating = (beating + 1) % workers
+                next_beat += BEAT_S / workers
+            due = self.core.next_deadline()
+            if due is not None and due <= self.now:
+                began = time.process_time()
+                effects = self.core.handle_deadline(self.now)
+                self.cpu_s += time.process_time() - began
+                self._take(effects)
+            if playing and playing[0][0] <= self.now:
+                _, worker, lease = playing.popleft()
+                self._hand_in(worker, lease)
+                if self._measure and marks and self.done >= marks[0]:
+                    marks.pop(0)
+                    gc.collect()
+                    self.memory.append(tracemalloc.get_traced_memory()[0])
+            elif not self._ready:
+                times = [next_beat]
+                if playing:
+                    times.append(playing[0][0])
+                due = self.core.next_deadline()
+                if due is not None:
+                    times.append(due)
+                self.now = max(self.now, min(times))
+        if self._measure:
+            tracemalloc.stop()
+
+
+def measure(workers: int, jobs: int) -> Row:
+    """One line: CPU in one pass, memory in another, shorter one, for watching memory is slow."""
+    load = Load(workers, jobs, memory=False)
+    load.start()
+    gc.collect()
+    load.run()
+    watched = Load(workers, jobs // 2, memory=True)
+    watched.start()
+    watched.run()
+    early, late = watched.memory
+    return Row(
+        workers=workers,
+        jobs=load.done,
+        cpu_us_per_job=1e6 * load.cpu_s / load.done,
+        events_per_job=load.handled / load.done,
+        longest_ms=1e3 * load.longest_s,
+        kib_early=early / 1024,
+        kib_late=late / 1024,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--jobs", type=int, default=100_000, help="jobs in all (100000)")
+    parser.add_argument("--workers", default="10,100,1000,2000", help="fleets to try (10,100,1000,2000)")
+    options = parser.parse_args()
+    print("workers    jobs  core µs/job  events/job  longest event ms  memory early KiB  late KiB")
+    rows = []
+    for workers in [int(each) for each in options.workers.split(",")]:
+        row = measure(workers, options.jobs)
+        rows.append(row)
+        print(
+            f"{row.workers:7d} {row.jobs:7d} {row.cpu_us_per_job:12.1f} {row.events_per_job:11.2f} "
+            f"{row.longest_ms:17.2f} {row.kib_early:17.0f} {row.kib_late:9.0f}",
+            flush=True,
+        )
+    costs = [row.cpu_us_per_job for row in rows]
+    print(f"dearest / cheapest per job: {max(costs) / min(costs):.2f} (wanted: at most 1.5)")
+    return 0 if max(costs) <= 1.5 * min(costs) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
