@@ -16,6 +16,8 @@ import random
 import struct
 import sys
 import traceback
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -30,10 +32,14 @@ MAX_TEXT = 16_000
 
 libc = ctypes.CDLL(None, use_errno=True)
 
+Reader = Callable[[Any, Any], Any]
+"""From the buffer (and where the next text begins, or the payload's length) to the observation or a part of it."""
 
-def play(init):
+
+def play(init: dict[str, Any]) -> NoReturn:
     """Builds the Policy and answers for it until told to end."""
     seed_generators(bytes.fromhex(init["seed"]))
+    os.environ.pop("PWD", None)
     os.environ["HOME"] = init["home"]
     os.environ["TMPDIR"] = init["home"] + "/tmp"
     sys.path.insert(0, init["home"] + "/system")
@@ -52,15 +58,15 @@ def play(init):
     answer(policy, init)
 
 
-def seed_generators(seed):
+def seed_generators(seed: bytes) -> None:
     random.seed(seed)
     np.random.seed(list(struct.unpack("<4I", seed[:16])))
     # Where numpy would ask the system for entropy: unseeded default_rng(), SeedSequence(), bit generators.
     entropy = random.Random(seed + b"numpy")
-    np.random.bit_generator.randbits = entropy.getrandbits
+    vars(np.random.bit_generator)["randbits"] = entropy.getrandbits
 
 
-def answer(policy, init):
+def answer(policy: Any, init: dict[str, Any]) -> NoReturn:
     make_buffer, observation = observation_reader(init["obs_space"], init["observations"] == "lists")
     header = bytearray(REQUEST_HEADER.size)
     unpack = REQUEST_HEADER.unpack
@@ -98,7 +104,7 @@ def answer(policy, init):
                 os._exit(0)
 
 
-def read_exactly(buffer):
+def read_exactly(buffer: bytearray | memoryview) -> None:
     view = memoryview(buffer)
     while len(view):
         n = os.readv(REQUESTS, [view])
@@ -107,13 +113,13 @@ def read_exactly(buffer):
         view = view[n:]
 
 
-def read_more(view):
+def read_more(view: memoryview) -> int:
     n = len(view)
     read_exactly(view)
     return n
 
 
-def complete(body, have, length):
+def complete(body: Any, have: int, length: int) -> Any:
     """`body` with the rest of a payload of which `have` bytes are in it; a larger buffer when it does not fit."""
     raw = memoryview(body if isinstance(body, bytearray) else body.reshape(-1).view(np.uint8))
     if len(raw) < length:
@@ -127,7 +133,7 @@ def complete(body, have, length):
 # Observations: fixed arrays and ints first, each on a multiple of 8 bytes, then texts with their lengths.
 
 
-def observation_reader(space, as_lists):
+def observation_reader(space: dict[str, Any], as_lists: bool) -> tuple[Callable[[], Any], Reader]:
     """Two functions: a fresh buffer to read a payload into, and from buffer and length to the observation."""
     kind = space["type"]
     if kind in ("Box", "Image") and not as_lists:
@@ -138,13 +144,13 @@ def observation_reader(space, as_lists):
     build = leaf_reader(space, fixed, as_lists)
     start = fixed[0]
 
-    def observation(body, length):
+    def observation(body: Any, length: int) -> Any:
         return build(body, [start])
 
     return (lambda: bytearray(start + 512)), observation
 
 
-def leaf_reader(space, fixed, as_lists):
+def leaf_reader(space: dict[str, Any], fixed: list[int], as_lists: bool) -> Reader:
     kind = space["type"]
     if kind in ("Dict", "Tuple"):
         parts = space["spaces"]
@@ -174,17 +180,17 @@ def leaf_reader(space, fixed, as_lists):
     return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape)
 
 
-def read_text(body, at):
+def read_text(body: Any, at: Any) -> str:
     start = at[0] + 4
     end = start + int.from_bytes(body[at[0] : start], "little")
     at[0] = end
-    return body[start:end].decode("utf-8", "surrogatepass")
+    return str(body[start:end], "utf-8", "surrogatepass")
 
 
 # Actions.
 
 
-def encoded(action):
+def encoded(action: Any) -> bytes:
     """The reply frame for what `act` returned."""
     kind = type(action)
     if kind is int and -(1 << 63) <= action < 1 << 63:
@@ -207,10 +213,10 @@ def encoded(action):
     return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
 
 
-array_heads = {}
+array_heads: dict[Any, bytes] = {}
 
 
-def array_data(array):
+def array_data(array: Any) -> bytes:
     key = array.dtype, array.shape
     head = array_heads.get(key)
     if head is None:
@@ -219,10 +225,10 @@ def array_data(array):
         array_heads[key] = head
     if array.dtype.byteorder == ">":
         array = array.astype(array.dtype.newbyteorder("<"))
-    return head + array.tobytes()
+    return head + bytes(array.tobytes())
 
 
-def pack(value, out, depth):
+def pack(value: Any, out: bytearray, depth: int) -> None:
     """Appends `value` as msgpack; what has no form there goes as the name of its type."""
     if depth > MAX_ACTION_DEPTH:
         raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
@@ -269,20 +275,20 @@ def pack(value, out, depth):
         pack(f"<{type(value).__name__}>", out, depth)
 
 
-def extension(code, data, out):
+def extension(code: int, data: bytes, out: bytearray) -> None:
     out += struct.pack(">BIb", 0xC9, len(data), code) + data
 
 
 # Replies.
 
 
-def reply(tag, payload):
+def reply(tag: int, payload: bytes) -> None:
     data = REPLY_HEADER.pack(len(payload), tag) + payload
     while data:
         data = data[os.write(REPLIES, data) :]
 
 
-def reply_failure(stage, error):
+def reply_failure(stage: str, error: BaseException) -> None:
     """Tells what the policy's own code raised. Its text is the policy's to forge; it names its own failure only."""
     try:
         frames = error.__traceback__
@@ -302,7 +308,7 @@ def reply_failure(stage, error):
     reply(FAILED, json.dumps(report, default=str).encode())
 
 
-def kind_of(error):
+def kind_of(error: BaseException | None) -> str | None:
     """Which limit an exception tells of, if any."""
     seen = 0
     while error is not None and seen < 10:
@@ -322,7 +328,7 @@ def kind_of(error):
     return None
 
 
-def flush_output():
+def flush_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(BaseException):
             stream.flush()

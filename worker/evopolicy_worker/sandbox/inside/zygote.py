@@ -11,6 +11,7 @@ Standard library and numpy only: the sandbox shows nothing else.
 import ctypes
 import gc
 import importlib
+import importlib.util
 import io
 import json
 import os
@@ -20,6 +21,7 @@ import socket
 import struct
 import sys
 import traceback
+from typing import Any, NoReturn
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
 MS_NOSUID, MS_NODEV, MS_BIND, MS_REC, MS_PRIVATE = 2, 4, 4096, 16384, 1 << 18
@@ -28,25 +30,25 @@ PID_MARK = 0x7FFFABCD
 MAX_TEXT = 16_000
 
 libc = ctypes.CDLL(None, use_errno=True)
-player = None
+player: Any = None
 """The module `player`: imports numpy, so not before the path to it is known."""
 
 
-def check(result, what):
+def check(result: int, what: str) -> int:
     if result < 0:
         number = ctypes.get_errno()
         raise OSError(number, f"{what}: {os.strerror(number)}")
     return result
 
 
-def main():
+def main() -> None:
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     control = socket.socket(fileno=int(sys.argv[1]))
     config = json.loads(control.recv(1 << 18))
     try:
         if config["become_nobody"]:
             enter_user_namespace(control)
-        sys.path += [config["packages"], os.path.dirname(__file__)]
+        sys.path.append(config["packages"])
         warm(config["warm"])
         if config["namespaces"]:
             # Tried once here, so that a host which cannot do it is told at the start.
@@ -57,7 +59,7 @@ def main():
     zygote(control, config)
 
 
-def enter_user_namespace(control):
+def enter_user_namespace(control: socket.socket) -> None:
     """Started as root: goes on as an unprivileged user, pid 1 of namespaces that this user owns."""
     os.setgroups([])
     wait_if_parent(os.fork(), control)
@@ -75,17 +77,24 @@ def enter_user_namespace(control):
     wait_if_parent(os.fork(), control)
 
 
-def wait_if_parent(child, control):
+def wait_if_parent(child: int, control: socket.socket) -> None:
     if child:
         control.close()
         _, status = os.waitpid(child, 0)
         os._exit(os.waitstatus_to_exitcode(status) & 0x7F)
 
 
-def warm(modules):
+def warm(modules: list[str]) -> None:
     """Imports what every policy may use, so that children share it."""
     global player
-    import player
+    # Not by the path: a bundle may have a module of that name.
+    spec = importlib.util.spec_from_file_location(
+        "_player", os.path.join(os.path.dirname(__file__), "player.py")
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    player = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(player)
 
     np = player.np
     for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules):
@@ -108,7 +117,7 @@ def warm(modules):
     gc.freeze()
 
 
-def zygote(control, config):
+def zygote(control: socket.socket, config: dict[str, Any]) -> NoReturn:
     myself = os.pidfd_open(os.getpid()) if config["namespaces"] else -1
     control.send(b'{"ready": true}')
     while True:
@@ -139,7 +148,7 @@ def zygote(control, config):
         os.close(fd)
 
 
-def fork_isolated(myself, probe=False):
+def fork_isolated(myself: int, probe: bool = False) -> int:
     """fork(), the child being pid 1 of a new pid namespace. `myself` is this process's pidfd; −1: a plain fork."""
     if myself < 0:
         return os.fork()
@@ -167,7 +176,7 @@ def fork_isolated(myself, probe=False):
 # One policy's process.
 
 
-def policy_process(config, fds):
+def policy_process(config: dict[str, Any], fds: list[int]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     arrange_descriptors(fds)
@@ -194,23 +203,22 @@ def policy_process(config, fds):
     player.play(init)
 
 
-def arrange_descriptors(fds):
+def arrange_descriptors(fds: list[int]) -> None:
     """Requests on 3, replies on 4, output on 1 and 2; everything else closed."""
     high = [os.dup2(fd, 100 + k) for k, fd in enumerate(fds)]
     for fd, target in zip(high, (player.REQUESTS, player.REPLIES, 1, 2), strict=True):
         os.dup2(fd, target)
     os.closerange(5, 1024)
     sys.stdout, sys.stderr = output_stream(1), output_stream(2)
-    sys.__stdout__, sys.__stderr__ = sys.stdout, sys.stderr
 
 
-def output_stream(fd):
+def output_stream(fd: int) -> io.TextIOWrapper:
     """Text that is written line by line: what was printed before a policy is killed is kept."""
     raw = io.BufferedWriter(io.FileIO(fd, "w", closefd=False))
     return io.TextIOWrapper(raw, encoding="utf-8", errors="backslashreplace", line_buffering=True)
 
 
-def mount_home(init):
+def mount_home(init: dict[str, Any]) -> None:
     """A file system of the policy's own and limited size, for its copy of `system/` and for /tmp."""
     home = init["home"].encode()
     options = f"size={init['home_bytes']},nr_inodes={init['home_inodes']},mode=0700".encode()
@@ -219,7 +227,7 @@ def mount_home(init):
     check(libc.mount(home + b"/tmp", b"/tmp", None, MS_BIND, None), "bind /tmp")
 
 
-def write_bundle(init, data):
+def write_bundle(init: dict[str, Any], data: memoryview) -> None:
     system = init["home"] + "/system"
     os.makedirs(system, exist_ok=True)
     os.makedirs(init["home"] + "/tmp", exist_ok=True)
@@ -235,7 +243,7 @@ def write_bundle(init, data):
         os.close(fd)
 
 
-def seal(config, init):
+def seal(config: dict[str, Any], init: dict[str, Any]) -> None:
     """From here on this process can do less than any other; nothing of it can be undone."""
     limits = init["limits"]
     for name, value in limits.items():
@@ -248,13 +256,13 @@ def seal(config, init):
         install_filter(bytes.fromhex(config["filter"]))
 
 
-def drop_capabilities():
+def drop_capabilities() -> None:
     libc.prctl(47, 4, 0, 0, 0)  # PR_CAP_AMBIENT_CLEAR_ALL
     header = struct.pack("<Ii", 0x20080522, 0)
     check(libc.capset(header, bytes(24)), "capset")
 
 
-def landlock(rules, home):
+def landlock(rules: dict[str, list[str]], home: str) -> None:
     """Limits what is opened to the given paths; where the kernel can, also TCP, abstract sockets and signals."""
     abi = libc.syscall(444, None, 0, 1)
     if abi < 1:
@@ -280,7 +288,7 @@ def landlock(rules, home):
     os.close(ruleset)
 
 
-def install_filter(program):
+def install_filter(program: bytes) -> None:
     mark, pid = struct.pack("<I", PID_MARK), struct.pack("<I", os.getpid())
     instructions = [program[at : at + 8] for at in range(0, len(program), 8)]
     program = b"".join(code[:4] + (pid if code[4:] == mark else code[4:]) for code in instructions)

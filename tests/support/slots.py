@@ -1,0 +1,145 @@
+"""Slots for tests: started once per tier, and played from ordinary code."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+from collections.abc import Coroutine
+from pathlib import Path
+from textwrap import dedent
+from typing import Any, TypeVar
+
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job, ResourceLimits, Tier
+from evopolicy_common.trajectory import Row, decode
+from evopolicy_worker.slot import Slot
+
+T = TypeVar("T")
+
+QUICK = ResourceLimits(
+    episode_wall_s=20.0,
+    act_wall_s=2.0,
+    init_wall_s=10.0,
+    cpu_s=10.0,
+    memory_bytes=256 << 20,
+    processes=8,
+    file_bytes=4 << 20,
+)
+"""Limits that a test can wait for."""
+
+HONEST = """
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        pass
+
+    def reset(self, episode_index):
+        pass
+
+    def act(self, obs):
+        return [float(obs[2] - obs[0])]
+"""
+"""A policy for `toy/line` that does what it should."""
+
+
+class Slots:
+    """One slot per tier and sealing, each started at its first use."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._slots: dict[tuple[str, bool], Slot] = {}
+        self._numbers = itertools.count()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    def run(self, work: Coroutine[Any, Any, T], timeout_s: float = 120.0) -> T:
+        """The result of a coroutine, run on the slots' loop."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(timeout_s)
+
+    def slot(self, tier: Tier = "bwrap", *, sealed: bool = True) -> Slot:
+        """The running slot of that tier."""
+        key = (tier, sealed)
+        if key not in self._slots:
+            slot = self.new(tier, sealed=sealed)
+            self.run(slot.start())
+            self._slots[key] = slot
+        return self._slots[key]
+
+    def new(self, tier: Tier = "bwrap", *, sealed: bool = True) -> Slot:
+        """A slot of one's own, not started."""
+        return Slot(None, tier, self.folder / f"slot-{next(self._numbers)}", sealed=sealed)
+
+    def bundle(self, files: dict[str, str | bytes] | str) -> Path:
+        """A bundle's folder; a text is its `policy.py`."""
+        folder = self.folder / f"bundle-{next(self._numbers)}"
+        folder.mkdir()
+        for name, content in ({"policy.py": files} if isinstance(files, str) else files).items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(dedent(content).encode() if isinstance(content, str) else content)
+        return folder
+
+    def play_all(
+        self,
+        policy: dict[str, str | bytes] | str | None,
+        *,
+        tier: Tier = "bwrap",
+        sealed: bool = True,
+        slot: Slot | None = None,
+        **options: Any,
+    ) -> tuple[EpisodeOutcome, ...]:
+        """Outcomes of a job with that policy (None: random actions)."""
+        job = make_job(bundle=None if policy is None else "digest", tier=tier, **options)
+        folder = None if policy is None else self.bundle(policy)
+        slot = slot or self.slot(tier, sealed=sealed)
+        return self.run(slot.play(job, folder, lambda episodes, steps: None))
+
+    def play(self, policy: dict[str, str | bytes] | str | None, **options: Any) -> EpisodeOutcome:
+        """The outcome of one episode; not the first of its submit unless `first=0`."""
+        (outcome,) = self.play_all(policy, **options)
+        return outcome
+
+    def close(self) -> None:
+        for slot in self._slots.values():
+            self.run(slot.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+def make_job(
+    *,
+    env: str = "toy/line",
+    first: int = 1,
+    n: int = 1,
+    seed: int = 7,
+    policy_seed: bytes = bytes(range(16)),
+    bundle: str | None = "digest",
+    limits: ResourceLimits = QUICK,
+    **options: Any,
+) -> Job:
+    """A job of `n` episodes from request index `first` on."""
+    episodes = tuple(
+        EpisodeSpec(
+            index=first + k, episode_index=first + k, case=Case(seed=seed + k), policy_seed=policy_seed
+        )
+        for k in range(n)
+    )
+    meta = {
+        "env": env,
+        "submit_index": 3,
+        "n_episodes_this_submit": n,
+        "remaining_budget_after": 5,
+        "max_episode_steps": 60,
+    }
+    return Job(
+        job_id="job", env=env, bundle=bundle, episodes=episodes, env_meta=meta, limits=limits, **options
+    )
+
+
+def rows(outcome: EpisodeOutcome) -> list[Row]:
+    """The outcome's trajectory."""
+    assert outcome.trajectory is not None
+    assert outcome.trajectory.inline is not None
+    return list(decode(outcome.trajectory.inline).rows())

@@ -1,0 +1,199 @@
+"""Frames between the environment's process and the policy's, and the filter: without any process."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evopolicy_common.errors import SandboxError, WorkerError
+from evopolicy_worker import frames
+from evopolicy_worker.monitor import Output
+from evopolicy_worker.sandbox import seccomp
+from evopolicy_worker.sandbox.inside import player
+from evopolicy_worker.sandbox.syscall_numbers import NUMBERS
+
+SPACE: dict[str, Any] = {
+    "type": "Dict",
+    "spaces": {
+        "a": {"type": "Box", "shape": [3], "dtype": "float32"},
+        "b": {"type": "Text", "min_length": 0, "max_length": 99},
+        "c": {
+            "type": "Tuple",
+            "spaces": [{"type": "Discrete", "n": 9}, {"type": "MultiBinary", "n": [2, 3]}],
+        },
+        "d": {"type": "MultiDiscrete", "nvec": [4, 4]},
+        "e": {"type": "Text", "min_length": 0, "max_length": 99},
+    },
+}
+
+
+@given(st.text(max_size=60), st.text(max_size=2000), st.integers(-(2**63), 2**63 - 1))
+def test_observations_arrive_as_they_were_sent(first: str, second: str, number: int) -> None:
+    obs = {
+        "a": np.array([1.5, -0.0, np.nan], np.float32),
+        "b": first,
+        "c": (number, np.array([[0, 1, 1], [1, 0, 0]], np.int8)),
+        "d": np.array([3, 1]),
+        "e": second,
+    }
+    payload = b"".join(bytes(part) for part in frames.compile_writer(SPACE)(obs))
+    make_buffer, read = player.observation_reader(SPACE, False)
+    buffer = make_buffer()
+    if len(buffer) < len(payload):
+        buffer = bytearray(len(payload))
+    buffer[: len(payload)] = payload
+    got = read(buffer, len(payload))
+    assert list(got) == list(obs)
+    assert got["a"].tobytes() == obs["a"].tobytes()  # type: ignore[attr-defined]
+    assert (got["b"], got["e"], got["c"][0]) == (first, second, number)
+    np.testing.assert_array_equal(got["c"][1], obs["c"][1])  # type: ignore[index]
+    assert (got["d"].tolist(), got["d"].dtype) == ([3, 1], np.int64)
+
+
+def test_an_observation_of_another_shape_is_the_environments_fault() -> None:
+    with pytest.raises(WorkerError, match="shape"):
+        frames.compile_writer({"type": "Box", "shape": [3], "dtype": "float32"})(np.zeros(4, np.float32))
+
+
+@settings(max_examples=400)
+@given(st.integers(0, 255), st.binary(max_size=80))
+def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, payload: bytes) -> None:
+    try:
+        frames.action(tag, payload)
+    except frames.BadReplyError:
+        pass
+    try:
+        frames.report(payload)
+    except frames.BadReplyError:
+        pass
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        struct.pack("<4sI", b"|O\0\0", 1) + bytes(8),
+        struct.pack("<4sI2I", b"<f8\0", 2, 1 << 31, 1 << 31),
+        struct.pack("<4sI", b"<f8\0", 4_000_000_000),
+        b"\x91" * 5000 + b"\xc0",
+        b"\xdd\xff\xff\xff\xff",
+        b"\xc7\x05\x01junk!",
+        b"\x92\x01",
+    ],
+)
+def test_impossible_arrays_and_nests_are_refused(payload: bytes) -> None:
+    for tag in (frames.ARRAY, frames.GENERIC):
+        with pytest.raises(frames.BadReplyError):
+            frames.action(tag, payload)
+
+
+def test_both_ends_agree_on_the_numbers() -> None:
+    for name in (
+        "INIT",
+        "RESET",
+        "ACT",
+        "FLUSH",
+        "END",
+        "OK",
+        "INT",
+        "FLOAT",
+        "ARRAY",
+        "FLOATS",
+        "GENERIC",
+        "FAILED",
+        "FAULT",
+    ):
+        assert getattr(frames, name) == getattr(player, name), name
+    assert frames.REQUEST_HEADER.format == player.REQUEST_HEADER.format
+    assert frames.REPLY_HEADER.format == player.REPLY_HEADER.format
+
+
+def test_an_action_that_cannot_be_sent_is_told() -> None:
+    endless: list[Any] = []
+    endless.append(endless)
+    for action in (endless, 1 << 5000, np.zeros(1 << 20), ["x" * (1 << 20)] * 3):
+        with pytest.raises(ValueError, match="the action"):
+            player.encoded(action)
+
+
+def allowed(program: bytes, number: int, *arguments: int) -> int:
+    """What the filter says of a system call: it is run here, instruction by instruction."""
+    data = struct.pack(
+        "<iIQ6Q", number, seccomp._AUDIT_ARCH["x86_64"], 0, *arguments, *([0] * (6 - len(arguments)))
+    )
+    at, register = 0, 0
+    while True:
+        code, if_true, if_false, k = struct.unpack_from("<HBBI", program, 8 * at)
+        at += 1
+        if code == seccomp._LOAD:
+            (register,) = struct.unpack_from("<I", data, k)
+        elif code == seccomp._AND:
+            register &= k
+        elif code == seccomp._JUMP_EQUAL:
+            at += if_true if register == k else if_false
+        elif code == seccomp._JUMP_AT_LEAST:
+            at += if_true if register >= k else if_false
+        else:
+            assert code == seccomp._RETURN
+            return int(k)
+
+
+@pytest.mark.parametrize("machine", sorted(NUMBERS))
+def test_the_filter_ends_for_every_number_and_allows_what_is_listed(
+    machine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: machine)
+    monkeypatch.setitem(seccomp._AUDIT_ARCH, "x86_64", seccomp._AUDIT_ARCH[machine])
+    program = seccomp.policy_filter()
+    assert len(program) // 8 < 4096
+    numbers = {number: name for name, number in NUMBERS[machine].items()}
+    for number in range(600):
+        verdict = allowed(program, number)
+        if number not in numbers:
+            assert verdict & 0x7FFF0000 == seccomp._ERRNO, number
+        elif numbers[number] not in seccomp._CHECKED:
+            assert verdict == seccomp._ALLOW, numbers[number]
+
+
+def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
+    program = seccomp.policy_filter()
+    clone, fork, kill, prctl, mount = 56, 57, 62, 157, 165
+    assert allowed(program, clone, 0x3D0F00) == seccomp._ALLOW  # what pthread_create asks for
+    assert allowed(program, clone, 0x1200011) & 0xFFFF == 11  # fork()
+    assert allowed(program, clone, 0x10010F00) & 0xFFFF == 11  # a thread in a new namespace
+    assert allowed(program, fork) & 0xFFFF == 11
+    assert allowed(program, kill, seccomp.PID_MARK, 9) == seccomp._ALLOW
+    assert allowed(program, kill, 1, 9) & 0xFFFF == 1
+    assert allowed(program, prctl, 4, 1) & 0xFFFF == 1
+    assert allowed(program, mount) & 0xFFFF == 1
+    assert allowed(program, 0x40000000) == seccomp._KILL_PROCESS
+
+
+def test_on_an_unknown_processor_there_is_no_filter_and_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "riscv64")
+    assert not seccomp.supported()
+    with pytest.raises(SandboxError, match="riscv64"):
+        seccomp.policy_filter()
+
+
+def test_output_beyond_its_limit_is_read_and_dropped() -> None:
+    import os
+
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    output = Output(10)
+    os.write(writing, b"12345678")
+    output.drain(reading)
+    os.write(writing, b"90abc")
+    output.drain(reading)
+    assert output.open
+    os.close(writing)
+    output.drain(reading)
+    assert not output.open
+    assert output.take() == b"1234567890"
+    os.close(reading)

@@ -1,0 +1,312 @@
+"""What a policy is given, what is recorded of it, and that the same episode is the same bytes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from slots import HONEST, Slots, make_job, rows
+
+from evopolicy_common.messages.environment import Case
+from evopolicy_worker import environments
+from evopolicy_worker.episodes import random_actions
+from evopolicy_worker.sandbox.jail import ENVIRONMENT
+
+TIERS = ("bwrap", "landlock", "none")
+
+
+@pytest.mark.parametrize("tier", TIERS)
+def test_an_honest_policy_plays_the_whole_episode(slots: Slots, tier: str) -> None:
+    outcome = slots.play(HONEST, tier=tier)
+    played = rows(outcome)
+    assert outcome.failure is None
+    assert (outcome.index, outcome.length, outcome.truncated, outcome.terminated) == (1, 60, True, False)
+    assert len(played) == 60
+    assert outcome.episode_return == sum(row.reward for row in played)
+    assert outcome.reward_components["reward_distance"] == sum(row.info["reward_distance"] for row in played)
+    assert "action_invalid" not in played[0].info
+    assert outcome.wall_s > 0
+    assert outcome.policy_cpu_s > 0
+    line = environments.make("toy/line")
+    obs = line.reset(Case(seed=7))
+    for row in played:
+        assert row.obs.tobytes() == obs.tobytes()
+        assert row.action == [float(obs[2] - obs[0])]
+        obs, reward, _, _, _ = line.step(line.action_codec.repair(row.action)[0])
+        assert reward == row.reward
+
+
+def test_the_same_episode_gives_the_same_bytes_in_every_slot(slots: Slots) -> None:
+    policy = """
+        import random
+        import numpy as np
+
+        class Policy:
+            def __init__(self, *spaces):
+                self.generator = np.random.default_rng()
+
+            def reset(self, episode_index):
+                print(episode_index, hash("text"))
+
+            def act(self, obs):
+                return [random.uniform(-1, 1) * np.random.rand() * self.generator.random()]
+    """
+    first = slots.play(policy)
+    again = slots.play(policy)
+    other = slots.play(policy, tier="landlock")
+    slots.play(HONEST)
+    later = slots.play(policy)
+    assert {outcome.trajectory.digest for outcome in (first, again, other, later) if outcome.trajectory} == {
+        first.trajectory.digest if first.trajectory else None
+    }
+    assert first.stdout == other.stdout == later.stdout
+    elsewhere = slots.play(policy, policy_seed=b"another case's.")
+    assert rows(elsewhere)[0].action != rows(first)[0].action
+
+
+def test_unseeded_numpy_generators_of_all_kinds_are_seeded(slots: Slots) -> None:
+    policy = """
+        import random
+        import numpy as np
+
+        class Policy:
+            def __init__(self, *spaces): pass
+            def reset(self, episode_index): pass
+            def act(self, obs):
+                r = np.random
+                return [r.default_rng().random(), r.default_rng().random(), r.RandomState().rand(),
+                        r.Generator(r.PCG64()).random(), float(r.SeedSequence().generate_state(1)[0]),
+                        random.random(), r.rand()]
+    """
+    one, two = (rows(slots.play(policy))[0].action for _ in range(2))
+    assert one == two
+    assert len(set(one)) == 7
+    assert rows(slots.play(policy, policy_seed=bytes(16)))[0].action != one
+
+
+def test_the_policy_is_given_spaces_and_env_meta_and_nothing_of_the_case(slots: Slots) -> None:
+    policy = """
+        import json, os, sys
+
+        class Policy:
+            def __init__(self, obs_space, action_space, env_meta):
+                print(json.dumps([obs_space, action_space, env_meta]))
+
+            def reset(self, episode_index):
+                print(json.dumps([episode_index, os.getcwd(), sys.path[0], sorted(os.environ)]))
+
+            def act(self, obs):
+                return [0.0]
+    """
+    import json
+
+    outcome = slots.play(policy)
+    built, reset = map(json.loads, outcome.stdout.decode().splitlines())
+    description = environments.describe("toy/line")
+    assert built[0] == description.obs_space
+    assert built[1] == description.action_space
+    assert built[2] == {
+        **make_job().env_meta,
+        "obs_space": description.obs_space,
+        "action_space": description.action_space,
+        "obs_storage": "inline",
+    }
+    assert reset[0] == 1
+    assert reset[1] == reset[2] == "/home/policy/system"
+    assert reset[3] == sorted({*ENVIRONMENT, "TMPDIR"})
+
+
+def test_dicts_texts_and_ints_arrive_as_the_space_says(slots: Slots) -> None:
+    policy = """
+        class Policy:
+            def __init__(self, *spaces): pass
+            def reset(self, episode_index): pass
+            def act(self, obs):
+                obs["view"][0, 0] = 9  # an observation is the policy's own
+                kinds = [type(obs[key]).__name__ for key in obs]
+                return [kinds, str(obs["position"].dtype), obs["view"].shape, obs["compass"], obs["steps"]]
+    """
+    outcome = slots.play(policy, env="toy/maze")
+    for row in rows(outcome)[:3]:
+        kinds, dtype, shape, compass, steps = row.action
+        assert kinds == ["ndarray", "str", "ndarray", "int", "ndarray"]
+        assert (dtype, shape) == ("int64", [5, 5])
+        assert (compass, steps) == (row.obs["compass"], row.obs["steps"])
+        assert row.obs["view"][0, 0] != 9
+        assert row.info["action_invalid"] is True
+
+
+@pytest.mark.parametrize("env", ["toy/line", "toy/maze"])
+def test_observations_can_be_asked_for_as_lists(slots: Slots, env: str) -> None:
+    policy = """
+        class Policy:
+            def __init__(self, *spaces): pass
+            def reset(self, episode_index): pass
+            def act(self, obs):
+                return {"obs": obs}
+    """
+    row = rows(slots.play(policy, env=env, observations="lists"))[0]
+    assert row.action["obs"] == row.obs
+    assert type(row.obs) in (list, dict)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1.5", 1.5),
+        ("[0.25]", [0.25]),
+        ("(1, 2.5)", [1, 2.5]),
+        ("np.float32(0.5)", np.array(0.5, np.float32)),
+        ("np.int64(1)", 1),
+        ("np.array([[True]])", np.array([[True]])),
+        ("np.array([0.5], '>f8')", np.array([0.5])),
+        ("None", None),
+        ("2**100", 2**100),
+        ("{'a': [np.zeros(2)], 3: b'x'}", {"a": [np.zeros(2)], "3": b"x"}),
+        ("object()", "<object>"),
+        ("{1}", "<set>"),
+        ("float('nan')", math.nan),
+        ("'\\ud800'", "\\ud800"),
+        ("np.array(['a'])", ["a"]),
+        ("np.longdouble(0.5)", np.array(0.5)),
+        ("[[]]", [[]]),
+        ("[0.5] * 3000", [0.5] * 3000),
+        ("np.arange(30000.0)", np.arange(30000.0)),
+    ],
+)
+def test_an_action_is_recorded_as_it_was_returned(slots: Slots, text: str, value: object) -> None:
+    policy = f"""
+import numpy as np
+class Policy:
+    def __init__(self, *spaces): pass
+    def reset(self, episode_index): pass
+    def act(self, obs): return {text}
+"""
+    outcome = slots.play(policy)
+    assert outcome.failure is None
+    np.testing.assert_equal(rows(outcome)[0].action, value)
+
+
+def test_without_a_policy_the_actions_are_keyed_and_uniform(slots: Slots) -> None:
+    outcome = slots.play(None, policy_seed=b"k" * 16)
+    line = environments.make("toy/line")
+    rng = random_actions(b"k" * 16)
+    for row in rows(outcome):
+        assert row.action.tobytes() == line.action_codec.sample(rng).tobytes()
+        assert row.info.keys() == {"reward_distance", "reward_effort"}
+    assert (outcome.failure, outcome.stdout, outcome.policy_cpu_s) == (None, b"", 0.0)
+
+
+def test_a_hidden_episode_leaves_actions_after_repair_and_rewards_only(slots: Slots) -> None:
+    policy = HONEST.replace("return [", "return [5.0 + ")
+    full, hidden = slots.play(policy), slots.play(policy, record="actions")
+    assert [row.reward for row in rows(hidden)] == [row.reward for row in rows(full)]
+    assert all(row.action.tolist() == [1.0] for row in rows(hidden))
+    assert all(row.obs is None and row.info == {} for row in rows(hidden))
+    assert rows(full)[0].action[0] > 1.0
+
+
+COUNTING = """
+    class Policy:
+        built = 0
+
+        def __init__(self, *spaces):
+            Policy.built += 1
+            self.episodes = []
+
+        def reset(self, episode_index):
+            self.episodes.append(episode_index)
+            print(Policy.built, self.episodes)
+
+        def act(self, obs):
+            return [0.0]
+"""
+
+
+def test_with_scope_submit_one_policy_plays_all_episodes(slots: Slots) -> None:
+    outcomes = slots.play_all(COUNTING, n=3, first=0, policy_scope="submit")
+    assert [outcome.index for outcome in outcomes] == [0, 1, 2]
+    assert [outcome.stdout for outcome in outcomes] == [b"1 [0]\n", b"1 [0, 1]\n", b"1 [0, 1, 2]\n"]
+    assert all(outcome.policy_cpu_s > 0 for outcome in outcomes)
+
+
+def test_hidden_evaluation_with_scope_submit_renews_the_policy_as_told(slots: Slots) -> None:
+    outcomes = slots.play_all(COUNTING, n=4, first=0, policy_scope="submit", policy_every=2, record="actions")
+    printed = [outcome.stdout.decode() for outcome in outcomes]
+    assert printed == ["1 [0]\n", "1 [0, 1]\n", "1 [2]\n", "1 [2, 3]\n"]
+
+
+def test_with_scope_submit_a_policy_that_raised_goes_on_and_one_that_died_is_built_anew(slots: Slots) -> None:
+    policy = """
+        import os
+
+        class Policy:
+            def __init__(self, *spaces): self.n = 0
+            def reset(self, episode_index):
+                self.n += 1
+                self.index = episode_index
+                print(self.n)
+            def act(self, obs):
+                if self.index == 1: raise ValueError("once")
+                if self.index == 2: os._exit(3)
+                return [0.0]
+    """
+    outcomes = slots.play_all(policy, n=4, first=0, policy_scope="submit")
+    assert [outcome.failure.category if outcome.failure else None for outcome in outcomes] == [
+        None,
+        "act_error",
+        "killed",
+        None,
+    ]
+    assert [outcome.stdout for outcome in outcomes] == [b"1\n", b"2\n", b"3\n", b"1\n"]
+
+
+def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> None:
+    files: dict[str, str | bytes] = {
+        "policy.py": """
+            from pathlib import Path
+            from helpers.gains import GAIN
+            import player
+
+            class Policy:
+                def __init__(self, *spaces):
+                    data = Path("data/weights.bin").read_bytes()
+                    Path("data/weights.bin").write_bytes(data + b"!")
+                    Path("/tmp/note").write_text("mine")
+                    print(GAIN, player.NAME, Path("data/weights.bin").read_bytes(), Path("/tmp/note").read_text())
+                def reset(self, episode_index): pass
+                def act(self, obs): return [0.0]
+        """,
+        "helpers/__init__.py": "",
+        "helpers/gains.py": "GAIN = 3",
+        "player.py": "NAME = 'a module of mine'",
+        "data/weights.bin": b"\x00\xff",
+    }
+    outcome = slots.play(files)
+    assert outcome.failure is None
+    assert outcome.stdout.decode() == "3 a module of mine b'\\x00\\xff!' mine\n"
+
+
+def test_threads_and_numpy_work_in_the_sandbox(slots: Slots) -> None:
+    policy = """
+        import asyncio, concurrent.futures, datetime, hashlib, json, pickle, sqlite3, statistics, tempfile, threading
+        import time
+        import numpy as np
+
+        class Policy:
+            def __init__(self, *spaces):
+                pool = concurrent.futures.ThreadPoolExecutor(4)
+                sums = list(pool.map(lambda k: np.linalg.norm(np.ones((50, 50)) * k), range(8)))
+                with tempfile.TemporaryFile() as file:
+                    np.save(file, np.fft.fft(np.arange(8.0)))
+                np.linalg.svd(np.random.rand(30, 30))
+                pickle.loads(pickle.dumps(sums))
+                time.sleep(0.001)
+                print(round(sums[1]), datetime.datetime.now().year > 2000, time.tzname)
+
+            def reset(self, episode_index): pass
+            def act(self, obs): return [0.0]
+    """
+    outcome = slots.play(policy)
+    assert (outcome.failure, outcome.stdout) == (None, b"50 True ('UTC', 'UTC')\n")

@@ -1,0 +1,187 @@
+"""Starting, cancelling, dying, starting again: what the supervisor relies on."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from slots import HONEST, Slots, make_job
+
+from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_worker.sandbox import available_tiers, jail, why_not
+from evopolicy_worker.slot import Slot
+
+STUCK = HONEST.replace("return [", "import time; time.sleep(60); return [")
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        found += [int(child) for child in (task / "children").read_text().split()]
+    return found
+
+
+def family(pid: int) -> list[int]:
+    """The process and all its descendants, outermost first."""
+    return [pid, *(member for child in children(pid) for member in family(child))]
+
+
+def pid_of(slot: Slot) -> int:
+    assert slot._process is not None
+    return slot._process.pid
+
+
+async def begun(
+    slot: Slot, slots: Slots, policy: str, **options: object
+) -> asyncio.Task[tuple[EpisodeOutcome, ...]]:
+    """A job that is being played: its policy's process is there and has begun to work."""
+    before = len(family(pid_of(slot)))
+    job = make_job(**options)  # type: ignore[arg-type]
+    task = asyncio.create_task(slot.play(job, slots.bundle(policy), lambda episodes, steps: None))
+    while len(family(pid_of(slot))) < before:
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.2)
+    return task
+
+
+def test_a_cancelled_job_returns_at_once_and_the_slot_plays_the_next(slots: Slots) -> None:
+    slot = slots.slot()
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, STUCK)
+        pid = pid_of(slot)
+        await slot.cancel()
+        assert await asyncio.wait_for(task, 5) == ()
+        assert pid_of(slot) == pid
+        await slot.cancel()  # nothing runs: no effect
+        return await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
+
+    (outcome,) = slots.run(work())
+    assert outcome.failure is None
+
+
+def test_an_episode_of_random_actions_can_be_cancelled_too(slots: Slots) -> None:
+    slot = slots.slot()
+
+    async def work() -> None:
+        job = make_job(bundle=None, n=20_000, policy_scope="submit")
+        task = asyncio.create_task(slot.play(job, None, lambda episodes, steps: None))
+        await asyncio.sleep(0.2)
+        await slot.cancel()
+        assert await asyncio.wait_for(task, 10) == ()
+
+    slots.run(work())
+    assert slots.play(HONEST).failure is None
+
+
+def test_progress_is_told_while_a_job_runs(slots: Slots) -> None:
+    told: list[tuple[int, int]] = []
+    policy = HONEST.replace("return [", "import time; time.sleep(0.01); return [")
+    slot = slots.slot()
+    slots.run(
+        slot.play(
+            make_job(n=2, policy_scope="submit"),
+            slots.bundle(policy),
+            lambda *progress: told.append(progress),
+        )
+    )
+    assert told == sorted(told)
+    assert told[0][1] > 0
+    assert told[-1][0] == 1
+
+
+@pytest.mark.parametrize("victim", ["env process", "zygote"])
+def test_the_death_of_a_slots_process_is_told_and_start_makes_it_new(slots: Slots, victim: str) -> None:
+    slot = slots.new()
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        await slot.start()
+        task = await begun(slot, slots, STUCK)
+        members = family(pid_of(slot))
+        # bwrap and its children stand between the environment's process and the policy's, which is the last.
+        os.kill(members[0] if victim == "env process" else members[-3], signal.SIGKILL)
+        with pytest.raises(SlotDiedError):
+            await asyncio.wait_for(task, 30)
+        await slot.start()
+        for pid in members:
+            assert (
+                not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2]
+            )
+        return await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
+
+    (outcome,) = slots.run(work())
+    assert outcome.failure is None
+    slots.run(slot.close())
+
+
+def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
+    slot = slots.new()
+    slots.run(slot.start())
+    members = family(pid_of(slot))
+    assert len(members) > 3
+    slots.run(slot.close())
+    slots.run(slot.close())
+    for _ in range(200):
+        left = [pid for pid in members if Path(f"/proc/{pid}").exists()]
+        if not left:
+            break
+        slots.run(asyncio.sleep(0.02))
+    assert not left
+    assert not slot._scratch.exists()
+
+
+def test_a_slot_that_was_not_started_says_so(slots: Slots) -> None:
+    with pytest.raises(WorkerError, match="not started"):
+        slots.run(slots.new().play(make_job(), None, lambda episodes, steps: None))
+
+
+def test_a_job_of_another_tier_is_never_played_in_this_one(slots: Slots) -> None:
+    with pytest.raises(WorkerError, match="demands tier bwrap; this slot has landlock"):
+        slots.play(HONEST, tier="bwrap", slot=slots.slot("landlock"))
+
+
+def test_an_unknown_environment_is_the_workers_failure_and_leaves_the_slot_usable(slots: Slots) -> None:
+    with pytest.raises(WorkerError, match="toy/none"):
+        slots.play(HONEST, env="toy/none")
+    assert slots.play(HONEST).failure is None
+
+
+def test_without_bubblewrap_the_error_says_what_to_install(
+    slots: Slots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    slot = slots.new()
+    with pytest.raises(SandboxError, match="apt-get install bubblewrap"):
+        slots.run(slot.start())
+    why_not.cache_clear()
+    assert "bwrap" not in available_tiers()
+    assert "apt-get install bubblewrap" in str(why_not("bwrap"))
+    why_not.cache_clear()
+
+
+def test_a_tier_that_works_is_offered_and_none_comes_last() -> None:
+    tiers = available_tiers()
+    assert tiers[0] == "bwrap"
+    assert tiers[-1] == "none"
+
+
+def test_a_package_that_is_not_installed_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SandboxError, match="'no_such_package'"):
+        jail.plan("bwrap", tmp_path, ("numpy", "no_such_package"))
+
+
+def test_an_allowed_package_can_be_imported_with_what_it_needs(slots: Slots) -> None:
+    slot = Slot(None, "bwrap", slots.folder / "with-yaml", ("numpy", "msgpack"))
+    slots.run(slot.start())
+    try:
+        policy = "import msgpack\n" + HONEST
+        assert slots.play(policy, slot=slot).failure is None
+        failure = slots.play(policy).failure
+        assert failure is not None
+        assert failure.category == "import_error"
+    finally:
+        slots.run(slot.close())

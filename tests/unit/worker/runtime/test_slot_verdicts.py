@@ -1,0 +1,226 @@
+"""Each way in which a policy can fail gets its own verdict, and the episode is played on."""
+
+from __future__ import annotations
+
+import signal
+
+import msgspec
+import pytest
+from slots import HONEST, QUICK, Slots, rows
+
+from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
+from evopolicy_worker import environments
+from evopolicy_worker.episodes import random_actions
+
+SHELL = """
+import os, sys, time, threading
+import numpy as np
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+        {init}
+
+    def reset(self, episode_index):
+        {reset}
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == 4:
+            {act}
+        return [0.0]
+"""
+
+
+def policy(init: str = "pass", reset: str = "pass", act: str = "pass") -> str:
+    return SHELL.format(init=init, reset=reset, act=act)
+
+
+def limits(**changes: float) -> ResourceLimits:
+    return msgspec.structs.replace(QUICK, **changes)
+
+
+def played_on_with_random_actions(outcome: EpisodeOutcome, step: int) -> bool:
+    played = rows(outcome)
+    line = environments.make("toy/line")
+    rng = random_actions(bytes(range(16)))
+    return len(played) == 60 and all(
+        (row.info.get("policy_failed") is True) == (row.t >= step)
+        and (row.t < step or row.action.tobytes() == line.action_codec.sample(rng).tobytes())
+        for row in played
+    )
+
+
+@pytest.mark.parametrize(
+    ("source", "category", "step", "words"),
+    [
+        (policy(reset="raise KeyError('left')"), "reset_error", None, "KeyError: 'left'"),
+        (policy(act="raise ValueError('of no use')"), "act_error", 3, "ValueError: of no use"),
+        (policy(act="sys.exit(0)"), "act_error", 3, "SystemExit"),
+        (policy(act="raise KeyboardInterrupt"), "act_error", 3, "KeyboardInterrupt"),
+        (
+            policy(act="self.act(obs) if False else (lambda f: f(f))(lambda f: f(f))"),
+            "act_error",
+            3,
+            "recursion",
+        ),
+        (policy(act="os._exit(7)"), "killed", 3, "exited with status 7"),
+        (policy(act="import ctypes; ctypes.string_at(0)"), "killed", 3, "SIGSEGV"),
+        (policy(act="os.abort()"), "killed", 3, "SIG"),
+        (policy(act="bytearray(1 << 30)"), "oom", 3, "268,435,456 bytes"),
+        (policy(act="np.ones(1 << 28)"), "oom", 3, "268,435,456 bytes"),
+        (policy(act="open('/tmp/big', 'wb').write(bytes(8 << 20))"), "file_limit", 3, "4,194,304 bytes"),
+        (
+            policy(act="[open(f'/tmp/{k}', 'wb').write(bytes(1 << 20)) for k in range(8)]"),
+            "file_limit",
+            3,
+            "No space left",
+        ),
+        (
+            policy(act="self.f = [open('/dev/null') for _ in range(999)]"),
+            "file_limit",
+            3,
+            "256 open descriptors",
+        ),
+        (
+            policy(act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(99)]"),
+            "process_limit",
+            3,
+            "8 threads",
+        ),
+        (policy(act="os.fork()"), "process_limit", 3, "no process may be started"),
+        (policy(act="import subprocess; subprocess.run(['/bin/true'])"), "process_limit", 3, "no process"),
+    ],
+)
+def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
+    slots: Slots, source: str, category: str, step: int | None, words: str
+) -> None:
+    outcome = slots.play(source)
+    failure = outcome.failure
+    assert failure is not None
+    assert (failure.category, failure.step_index) == (category, step)
+    assert words in failure.message
+    assert played_on_with_random_actions(outcome, step or 0)
+    assert slots.play(HONEST).failure is None
+
+
+@pytest.mark.parametrize(
+    ("source", "changes", "category", "limit"),
+    [
+        (policy(act="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
+        (policy(reset="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
+        (policy(act="time.sleep(60)"), {"episode_wall_s": 0.4}, "episode_timeout", 0.4),
+        (policy(act="[0 for _ in iter(int, 1)]"), {"cpu_s": 0.5, "act_wall_s": 20.0}, "cpu_limit", 0.5),
+        (
+            policy(act="import signal; signal.pthread_sigmask(0, range(1, 64)); time.sleep(60)"),
+            {"act_wall_s": 0.3},
+            "act_timeout",
+            0.3,
+        ),
+    ],
+)
+def test_a_limit_of_time_is_told_with_its_value_and_what_was_used(
+    slots: Slots, source: str, changes: dict[str, float], category: str, limit: float
+) -> None:
+    failure = slots.play(source, limits=limits(**changes)).failure
+    assert failure is not None
+    assert (failure.category, failure.limit) == (category, limit)
+    assert failure.used is not None
+    assert limit < failure.used < limit + 5
+
+
+@pytest.mark.parametrize(
+    ("source", "category", "words"),
+    [
+        ({"other.py": ""}, "missing_policy", "no policy.py"),
+        ({"policy.py": "def f(:"}, "import_error", "SyntaxError"),
+        ({"policy.py": "1 / 0"}, "import_error", "ZeroDivisionError"),
+        ({"policy.py": "import numpi"}, "import_error", "No module named 'numpi'"),
+        ({"policy.py": "policy = 3"}, "import_error", "no top-level class named Policy"),
+        ({"policy.py": "import gymnasium"}, "denied_import", "policies may not import gymnasium"),
+        ({"policy.py": "from evopolicy_common import codec"}, "denied_import", "evopolicy_common"),
+        ({"policy.py": policy(init="raise OSError('no')")}, "init_error", "OSError: no"),
+        ({"policy.py": "class Policy: pass"}, "init_error", "takes no arguments"),
+        ({"policy.py": policy(init="time.sleep(60)")}, "init_error", "longer than 0.5 s"),
+        ({"policy.py": policy(init="os._exit(4)")}, "init_error", "exited with status 4"),
+        ({"policy.py": policy(init="bytearray(1 << 30)")}, "init_error", "268,435,456"),
+    ],
+)
+def test_a_bundle_without_a_policy_is_told_at_index_0_and_not_played(
+    slots: Slots, source: dict[str, str | bytes], category: str, words: str
+) -> None:
+    at_first = slots.play(source, first=0, limits=limits(init_wall_s=0.5))
+    assert at_first.failure is not None
+    assert at_first.failure.category == category
+    assert words in at_first.failure.message
+    assert (at_first.length, at_first.trajectory, at_first.episode_return) == (0, None, 0.0)
+
+
+def test_a_bundle_without_a_policy_is_a_later_episodes_own_failure(slots: Slots) -> None:
+    for later in (slots.play("1 / 0", first=2), slots.play("1 / 0", first=0, record="actions")):
+        assert later.failure is not None
+        assert later.failure.category == "import_error"
+        assert later.length == 60
+    assert played_on_with_random_actions(slots.play("1 / 0", first=2), 0)
+
+
+def test_a_submit_that_yields_no_policy_has_an_outcome_for_every_episode(slots: Slots) -> None:
+    outcomes = slots.play_all("1 / 0", first=0, n=3, policy_scope="submit")
+    assert [outcome.index for outcome in outcomes] == [0, 1, 2]
+    assert {outcome.failure.category for outcome in outcomes if outcome.failure} == {"import_error"}
+    assert {outcome.length for outcome in outcomes} == {0}
+
+
+def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: Slots) -> None:
+    failure = slots.play(policy(act="import json; json.loads('{')")).failure
+    assert failure is not None
+    assert 'File "system/policy.py", line 16, in act' in failure.traceback
+    assert "json/__init__.py" in failure.traceback
+    assert "player.py" not in failure.traceback
+    assert "/home/" not in failure.traceback
+    assert str(slots.folder) not in failure.traceback
+
+
+def test_output_is_kept_up_to_its_limit_and_always_drained(slots: Slots) -> None:
+    source = policy(
+        init="print('built')",
+        act="""[os.write(2, b'e' * 1000) for _ in range(1000)]
+            import ctypes
+            for _ in range(30000): print('o' * 100)
+            ctypes.CDLL(None).puts(b'from C')""",
+    )
+    outcome = slots.play(source, limits=limits(output_bytes=5000, act_wall_s=10.0))
+    assert outcome.failure is None
+    assert outcome.stdout == (b"built\n" + (b"o" * 100 + b"\n") * 60)[:5000]
+    assert outcome.stderr == b"e" * 5000
+
+
+def test_what_was_printed_before_an_end_is_kept(slots: Slots) -> None:
+    for end in ("raise ValueError", "os._exit(1)", "time.sleep(60)"):
+        outcome = slots.play(policy(act=f"print('last words'); {end}"), limits=limits(act_wall_s=0.3))
+        assert outcome.stdout == b"last words\n"
+
+
+def test_output_of_c_code_is_kept(slots: Slots) -> None:
+    outcome = slots.play(policy(act="import ctypes; ctypes.CDLL(None).printf(b'from C')"))
+    assert outcome.stdout == b"from C"
+
+
+@pytest.mark.parametrize("tier", ["landlock", "none"])
+def test_verdicts_are_the_same_in_the_other_tiers(slots: Slots, tier: str) -> None:
+    source = policy(
+        act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(20)]; time.sleep(60)"
+    )
+    expected = {
+        policy(act="time.sleep(60)"): "act_timeout",
+        policy(act="os._exit(1)"): "killed",
+        policy(act="bytearray(1 << 30)"): "oom",
+        policy(act="open('big', 'wb').write(bytes(8 << 20))"): "file_limit",
+        policy(act=f"os.kill(os.getpid(), {signal.SIGKILL.value})"): "killed",
+        source: "process_limit",
+    }
+    for text, category in expected.items():
+        failure = slots.play(text, tier=tier, limits=limits(act_wall_s=1.0)).failure
+        assert failure is not None
+        assert failure.category == category, failure
+        assert slots.play(HONEST, tier=tier).failure is None
