@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Coroutine
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import typer
@@ -24,6 +25,8 @@ from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.runs import Cluster, exit_code, play_all
 from evopolicy_gateway.runs import report as report_runs
+
+T = TypeVar("T")
 
 COMMANDS_GROUP = "evopolicy.commands"
 
@@ -203,7 +206,7 @@ def try_policy(
             limits=options.limits_of(limit or ()),
         )
         where = _trial_cluster(connect, credentials_file, slots, state, data)
-        _exit(asyncio.run(trials.try_policy(trial, where, as_json=as_json)))
+        _exit(_run(trials.try_policy(trial, where, as_json=as_json)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
@@ -226,7 +229,7 @@ def play_random(
         if split not in ("train", "validation", "heldout"):
             raise ConfigError(f"--split {split!r}: there are train, validation, heldout")
         where = _trial_cluster(connect, credentials_file, slots, state, data)
-        _exit(asyncio.run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+        _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
 
 
 def _plans(
@@ -254,7 +257,7 @@ def _plans(
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
     console = Console(stderr=as_json)
-    results = asyncio.run(play_all(plans, where, parallel, console))
+    results = _run(play_all(plans, where, parallel, console))
     if as_json:
         print(msgspec.json.format(msgspec.json.encode(results)).decode())
     else:
@@ -268,6 +271,14 @@ def _trial_cluster(
     if connect or file:
         return Cluster(connect=tuple(connect or ()), file=file)
     return Cluster(local_slots=slots, state=state, data=data)
+
+
+def _run(work: Coroutine[Any, Any, T]) -> T:
+    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
+    try:
+        return asyncio.run(work)
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
 
 
 def _exit(code: int) -> None:

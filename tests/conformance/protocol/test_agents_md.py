@@ -1,0 +1,67 @@
+"""Every command of the staged AGENTS.md is executed as it stands."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import sys
+from pathlib import Path
+
+from gateway_double import Served, served
+
+PATIENCE_S = 30.0
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+async def output(program: list[str], cwd: Path) -> str:
+    process = await asyncio.create_subprocess_exec(
+        *program, cwd=cwd, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    async with asyncio.timeout(PATIENCE_S):
+        out, err = await process.communicate()
+    assert process.returncode == 0, err.decode()
+    return out.decode()
+
+
+def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        workspace = s.folder.workspace
+        text = (workspace / "AGENTS.md").read_text()
+        shell = blocks(text, "bash")
+        task, info, submit, read = [
+            await output(["bash", "-euo", "pipefail", "-c", one], workspace) for one in shell
+        ]
+        assert task.startswith("# A line")
+        assert json.loads(info)["state"]["remaining_budget"] == 12
+        answer = json.loads(submit)
+        assert answer["status"] == "ok"
+        summary, _, rows = read.partition("}\n")
+        assert json.loads(summary + "}") == answer["summary"]
+        assert [json.loads(row)["t"] for row in rows.splitlines()] == [0, 1]
+        program, interface = blocks(text, "python")
+        assert (await output([sys.executable, "-c", program], workspace)).startswith("submit_001 ok -3.5")
+        scope: dict[str, type] = {}
+        exec(interface, scope)
+        assert {"__init__", "reset", "act"} <= set(vars(scope["Policy"]))
+
+    async def main() -> None:
+        async with served(tmp_path) as service:
+            await script(service)
+
+    asyncio.run(main())
+
+
+def test_every_path_in_the_rules_exists_after_a_submit(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with served(tmp_path) as s:
+            await s.http.post(s.urls.submit, json={"env_instances": [0]})
+            text = (s.folder.workspace / "AGENTS.md").read_text()
+            for path in ("system/", "feedback/", "AGENTS.md"):
+                assert f"`{path}`" in text
+                assert (s.folder.workspace / path).exists()
+
+    asyncio.run(main())

@@ -1,0 +1,490 @@
+"""`evopolicy` as an operator uses it: real coordinator, real worker, real agents' processes, on the toy environments."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common.run_record import RunRecord, decode_checkpoint_metrics, decode_run_record
+from evopolicy_common.summary import decode_summary
+
+MARK = "EVOTEST_MARK"
+PATIENCE_S = 90.0
+EVOPOLICY = [sys.executable, "-m", "evopolicy_gateway.cli"]
+SMALL = ["--budget", "6", "--validation", "2", "--heldout", "2"]
+
+AGENT = """
+import json, os, subprocess, sys, time, urllib.request
+
+def submit(body, **headers):
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": body}).encode(), headers=headers
+    )
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as error:
+        return json.load(error)
+
+def patient_submit(body, key):
+    while True:
+        try:
+            return submit(body, **{"Idempotency-Key": key})
+        except (OSError, ValueError):
+            time.sleep(0.1)
+"""
+
+
+def agent(tmp_path: Path, code: str) -> str:
+    """`--agent` for a program with that code."""
+    path = tmp_path / "agent.py"
+    path.write_text(AGENT + code)
+    return f"command:{sys.executable} {path}"
+
+
+def marked(mark: str) -> list[int]:
+    """Live processes that were started below a command with that mark."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            with contextlib.suppress(OSError):
+                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+                if state != "Z" and f"{MARK}={mark}".encode() in (entry / "environ").read_bytes():
+                    found.append(int(entry.name))
+    return found
+
+
+def wait_until(what: Any, patience_s: float = PATIENCE_S) -> Any:
+    deadline = time.monotonic() + patience_s
+    while not (value := what()):
+        assert time.monotonic() < deadline, f"{what} did not come true"
+        time.sleep(0.05)
+    return value
+
+
+class Command:
+    """A command that runs, with everything below it findable."""
+
+    def __init__(self, arguments: list[str], cwd: Path, environment: dict[str, str]) -> None:
+        self.mark = uuid.uuid4().hex
+        self.process = subprocess.Popen(
+            [*EVOPOLICY, *arguments],
+            cwd=cwd,
+            env={**os.environ, **environment, MARK: self.mark},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def finish(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, out, err
+
+    def kill_all(self) -> None:
+        for pid in marked(self.mark):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.communicate()
+
+
+@contextlib.contextmanager
+def command(cwd: Path, *arguments: str) -> Iterator[Command]:
+    running = Command(list(arguments), cwd, {"XDG_STATE_HOME": str(cwd / "xdg")})
+    try:
+        yield running
+    finally:
+        running.kill_all()
+
+
+def run_dir(cwd: Path, env: str = "toy_line", exp_id: str = "t") -> Path:
+    found = list((cwd / "runs").glob(f"*/{env}/{exp_id}"))
+    assert len(found) == 1
+    return found[0]
+
+
+def record_in(folder: Path) -> RunRecord:
+    return decode_run_record((folder / "run.json").read_bytes())
+
+
+@pytest.fixture(scope="module")
+def operator_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Credentials for a coordinator with a worker of two slots, up for all tests of this module."""
+    state = tmp_path_factory.mktemp("c") / "s"
+    ready = state.with_name("ready.json")
+    environment = {**os.environ, "XDG_STATE_HOME": str(state.with_name("xdg"))}
+    log = state.with_name("log").open("wb")
+    start = [sys.executable, "-m"]
+    coordinator = subprocess.Popen(
+        [*start, "evopolicy_coordinator.cli", "--state", str(state), "--ready-file", str(ready)],
+        env=environment,
+        stdout=log,
+        stderr=log,
+    )
+    wait_until(ready.exists)
+    credentials = json.loads(ready.read_text())["credentials"]
+    worker = subprocess.Popen(
+        [
+            *(*start, "evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
+            *("--credentials", credentials["worker"]),
+        ],
+        env=environment,
+        stdout=log,
+        stderr=log,
+    )
+    try:
+        yield Path(credentials["operator"])
+    finally:
+        for process in (worker, coordinator):
+            process.terminate()
+            process.wait(timeout=PATIENCE_S)
+        log.close()
+
+
+def run_on(operator_file: Path, tmp_path: Path, agent_name: str, *more: str) -> tuple[int, str, str]:
+    arguments = ["run", "--env", "toy/line", "--agent", agent_name, "--exp-id", "t", *SMALL, *more]
+    with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
+        return running.finish()
+
+
+def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    with command(
+        tmp_path, "local", "--env", "toy/line", "--agent", "evolve", "--exp-id", "t", *SMALL, "--json"
+    ) as running:
+        code, out, err = running.finish()
+        assert code == 0, err
+        assert marked(running.mark) == []
+    folder = run_dir(tmp_path)
+    (result,) = json.loads(out)
+    record = record_in(folder)
+    assert result["run_directory"] == str(folder)
+    assert result["final_score"] == record.outcome.final_score == record.outcome.heldout_mean_return
+    assert record.outcome.status == "completed"
+    assert record.outcome.closed_reason == "budget_spent"
+    assert record.outcome.budget_used == 6
+    assert len(record.outcome.heldout_returns) == 2
+    assert record.outcome.random_reference is not None
+    assert record.agent.harness == record.agent.entry == "evolve"
+    assert record.versions.fingerprint["numpy"]
+    assert sorted(path.name for path in folder.iterdir()) == ["checkpoints", "logs", "run.json", "workspace"]
+    best = folder / "checkpoints" / f"submit_{record.outcome.best_submit_index:03d}"
+    assert (best / "system" / "policy.py").read_bytes() == (
+        folder / "workspace/system/policy.py"
+    ).read_bytes()
+    metrics = decode_checkpoint_metrics((best / "metrics.json").read_bytes())
+    assert metrics.val_mean == record.outcome.val_scores[str(record.outcome.best_submit_index)]
+    summary = decode_summary((folder / "workspace/feedback/submit_000/summary.json").read_bytes())
+    assert summary.env == "toy/line"
+    assert "submit_000 ok" in err
+    for line in (folder / "logs" / "harness.log").read_text().splitlines():
+        assert json.loads(line)["event"]
+
+
+def test_a_spoken_agent_gets_turns_until_it_stops_and_the_run_is_finalised(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+for line in sys.stdin:
+    prompt = json.loads(line)
+    answer = submit([prompt["turn"]])
+    print("a line of its own")
+    print(json.dumps({"turn": prompt["turn"], "text": answer["status"], "stop": prompt["turn"] == 1}), flush=True)
+"""
+    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 0
+    record = record_in(run_dir(tmp_path))
+    assert record.outcome.closed_reason == "agent_stopped"
+    assert record.outcome.budget_used == 2
+    assert record.agent.turns == 2
+    assert "agent stopped" in out
+    lines = [json.loads(line) for line in (run_dir(tmp_path) / "logs/agent.jsonl").read_text().splitlines()]
+    assert [line["turn"] for line in lines if line.get("type") == "prompt"] == [0, 1]
+    assert {"type": "stdout", "text": "a line of its own"} in lines
+    assert "4 episodes" not in lines[0]["message"]
+    assert "5 episodes of the budget are left" in next(
+        line["message"] for line in lines if line.get("turn") == 1 and "message" in line
+    )
+
+
+def test_an_agents_children_are_gone_however_they_hide(operator_file: Path, tmp_path: Path) -> None:
+    code = """
+hide = (
+    "import os, signal, sys, time\\n"
+    "signal.signal(signal.SIGTERM, signal.SIG_IGN)\\n"
+    "os.setsid() if os.getsid(0) != os.getpid() else None\\n"
+    "if os.fork(): os._exit(0)\\n"
+    "open(sys.argv[1], 'w').write(str(os.getpid()))\\n"
+    "time.sleep(1000)\\n"
+)
+subprocess.Popen([sys.executable, "-c", hide, "child.pid"], start_new_session=True)
+while not os.path.exists("child.pid"):
+    time.sleep(0.01)
+submit([0])
+"""
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 0, err
+    child = int((run_dir(tmp_path) / "workspace" / "child.pid").read_text())
+    assert not Path(f"/proc/{child}").exists()
+
+
+def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:
+    code = """
+first = patient_submit([0, 1], "one")
+open("first", "w").write(json.dumps(first))
+while not os.path.exists("killed"):
+    time.sleep(0.02)
+second = patient_submit([2, 3], "two")
+again = patient_submit([0, 1], "one")
+open("again", "w").write(json.dumps(again))
+"""
+    arguments = ["run", "--env", "toy/line", "--agent", agent(tmp_path, code), "--exp-id", "t", *SMALL]
+    with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
+        workspace = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace")])[0]
+        wait_until((workspace / "first").exists)
+        (gateway,) = [
+            pid
+            for pid in marked(running.mark)
+            if b"evopolicy_gateway.serve_cli" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
+        os.kill(gateway, signal.SIGKILL)
+        (workspace / "killed").touch()
+        exit_code, out, err = running.finish()
+        assert exit_code == 0, err
+        assert marked(running.mark) == []
+    assert "starting it again" in out
+    assert json.loads((workspace / "again").read_text()) == json.loads((workspace / "first").read_text())
+    record = record_in(run_dir(tmp_path))
+    assert record.outcome.budget_used == 4
+    assert sorted(path.name for path in (workspace / "feedback").iterdir()) == ["submit_000", "submit_001"]
+
+
+def test_a_killed_keeper_leaves_no_agent_and_the_run_is_finalised(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+submit([0])
+hide = "import os, time\\nos.setsid()\\nopen('child.pid', 'w').write(str(os.getpid()))\\ntime.sleep(1000)"
+subprocess.Popen([sys.executable, "-c", hide])
+time.sleep(1000)
+"""
+    arguments = ["run", "--env", "toy/line", "--agent", agent(tmp_path, code), "--exp-id", "t", *SMALL]
+    with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
+        found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
+        (keeper,) = [
+            pid
+            for pid in marked(running.mark)
+            if b"evopolicy_gateway.harnesses.keeper" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
+        os.kill(keeper, signal.SIGKILL)
+        exit_code, _, err = running.finish()
+        assert exit_code == 0, err
+        assert marked(running.mark) == []
+    assert not Path(f"/proc/{found.read_text()}").exists()
+    assert record_in(run_dir(tmp_path)).outcome.closed_reason == "agent_failed"
+
+
+def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(operator_file: Path, tmp_path: Path) -> None:
+    exit_code, _, err = run_on(
+        operator_file, tmp_path, agent(tmp_path, "submit([0, 1])\ntime.sleep(1000)"), "--agent-wall-s", "2"
+    )
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used, outcome.status) == ("wall_limit", 2, "completed")
+
+
+BAD_INPUT = """
+import shutil
+from pathlib import Path
+system, policy = Path("system"), Path("system/policy.py")
+good = policy.read_text()
+log = []
+
+def case(name, env_instances=(0,)):
+    answer = submit(env_instances if isinstance(env_instances, str) else list(env_instances))
+    info = json.load(urllib.request.urlopen(os.environ["EVOPOLICYGYM_INFO_URL"]))
+    errors = Path("feedback", answer.get("submit_id", "-"), "errors.txt")
+    log.append([name, answer.get("status"), info["state"]["remaining_budget"],
+                json.loads(errors.read_text())["message"] if errors.exists() else answer.get("error", {}).get("message")])
+
+case("ids out of range", [64])
+case("backwards", "3-1")
+case("empty", [])
+policy.unlink(); case("missing policy")
+policy.symlink_to("/etc/passwd"); case("policy is a link"); policy.unlink()
+policy.write_text(good)
+(system / "link").symlink_to("/etc"); case("link beside"); (system / "link").unlink()
+with open(system / "big", "wb") as big: big.truncate(2 << 30)
+case("two gigabytes"); (system / "big").unlink()
+policy.write_text("class Policy(:\\n"); case("syntax error")
+policy.write_text("import gymnasium\\nclass Policy: ...\\n"); case("simulator")
+policy.write_text("class Other: ...\\n"); case("no class")
+policy.write_text(good.replace("self.action =", "raise ValueError('in init')\\n        self.action =")); case("init raises")
+policy.write_text(good.replace("return self.action", "return {'no': [object]}")); case("nonsense action")
+policy.write_text(good.replace("return self.action", "while True: pass")); case("never returns")
+policy.write_text(good.replace("return self.action", "raise RuntimeError('at once')")); case("act raises")
+Path("log.json").write_text(json.dumps(log))
+"""
+
+
+def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path, tmp_path: Path) -> None:
+    exit_code, _, err = run_on(
+        operator_file, tmp_path, agent(tmp_path, BAD_INPUT), "--budget", "20", "--limit", "act_wall_s=1"
+    )
+    assert exit_code == 0, err
+    folder = run_dir(tmp_path)
+    log = {
+        name: (status, left, message)
+        for name, status, left, message in json.loads((folder / "workspace" / "log.json").read_text())
+    }
+    expected = {
+        "ids out of range": ("invalid_env_instance", 20, "0 to 63"),
+        "backwards": ("invalid_env_instance", 20, "'1-3'"),
+        "empty": ("budget_invalid", 20, "0 episodes"),
+        "missing policy": ("missing_policy", 19, "policy.py"),
+        "policy is a link": ("missing_policy", 18, "symbolic link"),
+        "link beside": ("import_error", 17, "link is a symbolic link"),
+        "two gigabytes": ("import_error", 16, "2,147,483,648"),
+        "syntax error": ("import_error", 15, "invalid syntax"),
+        "simulator": ("denied_import", 14, "gymnasium"),
+        "no class": ("import_error", 13, "Policy"),
+        "init raises": ("init_error", 12, "in init"),
+        "nonsense action": ("ok", 11, None),
+        "never returns": ("ok", 10, None),
+        "act raises": ("ok", 9, None),
+    }
+    for name, (status, left, said) in expected.items():
+        assert log[name][:2] == (status, left), (name, log[name])
+        if said is not None:
+            assert said in log[name][2], (name, log[name])
+    feedback = folder / "workspace" / "feedback"
+    told = {}
+    for index, name in ((8, "nonsense action"), (9, "never returns"), (10, "act raises")):
+        errors = (feedback / f"submit_{index:03d}").glob("episodes/*/error.txt")
+        told[name] = [json.loads(error.read_text())["category"] for error in errors]
+    assert told == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
+    rows = (feedback / "submit_008/episodes").glob("*/trajectory.jsonl")
+    assert all(json.loads(line)["info"]["action_invalid"] for path in rows for line in path.open())
+    record = record_in(folder)
+    assert [one.status for one in record.rejected_submits] == ["invalid_env_instance"] * 2 + [
+        "budget_invalid"
+    ]
+    assert set(record.outcome.val_scores) == {"8", "9", "10"}
+
+
+def test_without_an_ok_submit_there_is_no_score_and_the_exit_code_says_so(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = "open('system/policy.py', 'w').write('1 / 0')\nsubmit([0, 1])"
+    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 3
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", None, None)
+    assert outcome.budget_used == 2
+    assert "no_ok_submit" in out
+
+
+def test_replay_submits_the_given_policies_in_order_with_even_shares(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"
+    for name, push in (("b", 0.5), ("a", -0.5)):
+        (tmp_path / "given" / name / "system").mkdir(parents=True)
+        (tmp_path / "given" / name / "system" / "policy.py").write_text(policy.format(push))
+    exit_code, _, err = run_on(operator_file, tmp_path, "replay:given", "--budget", "5")
+    assert exit_code == 0, err
+    folder = run_dir(tmp_path)
+    assert folder.parts[-3] == "replay-given"
+    sources = [(folder / f"checkpoints/submit_00{i}/system/policy.py").read_text() for i in range(2)]
+    assert "-0.5" in sources[0]
+    assert "-0.5" not in sources[1]
+    summaries = [
+        decode_summary((folder / f"workspace/feedback/submit_00{i}/summary.json").read_bytes())
+        for i in range(2)
+    ]
+    assert [summary.env_instances for summary in summaries] == [(0, 1, 2), (0, 1)]
+
+
+def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    stop_at_once = agent(tmp_path, "")
+    assert run_on(operator_file, tmp_path, stop_at_once)[0] == 3
+    before = (run_dir(tmp_path) / "run.json").read_bytes()
+    code, _, err = run_on(operator_file, tmp_path, stop_at_once)
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    assert "--overwrite" in err
+    assert (run_dir(tmp_path) / "run.json").read_bytes() == before
+    assert run_on(operator_file, tmp_path, stop_at_once, "--overwrite")[0] == 3
+    assert (run_dir(tmp_path) / "run.json").read_bytes() != before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, number: signal.Signals) -> None:
+    waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
+    arguments = ["local", "--env", "toy/line", "--agent", waits, "--exp-id", "t", *SMALL]
+    with command(tmp_path, *arguments) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        running.process.send_signal(number)
+        code, _, err = running.finish()
+        assert code == 130
+        assert "Traceback" not in err
+        assert marked(running.mark) == []
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.status, outcome.closed_reason) == ("error", "cancelled")
+    assert not (run_dir(tmp_path) / ".gateway").exists()
+
+
+def test_a_killed_local_command_takes_everything_with_it(tmp_path: Path) -> None:
+    waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
+    arguments = ["local", "--env", "toy/line", "--agent", waits, "--exp-id", "t", *SMALL]
+    with command(tmp_path, *arguments) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        assert len(marked(running.mark)) >= 5
+        running.process.kill()
+        wait_until(lambda: not marked(running.mark))
+
+
+def test_try_shows_returns_and_where_the_trajectories_are(operator_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "policy.py").write_text(
+        "class Policy:\n"
+        "  def __init__(self, obs_space, action_space, env_meta): pass\n"
+        "  def reset(self, i): print('hello from', i)\n"
+        "  def act(self, obs): return [obs[2] - obs[0]]\n"
+    )
+    where = ["--env", "toy/line", "--credentials", str(operator_file)]
+    with command(tmp_path, "try", "mine", "--cases", "0-1,5", "--json", *where) as running:
+        code, out, err = running.finish()
+    assert code == 0, err
+    (result,) = json.loads(out)
+    assert [episode["case"] for episode in result["episodes"]] == [0, 1, 5]
+    first = Path(result["episodes"][0]["folder"])
+    assert len((first / "trajectory.jsonl").read_text().splitlines()) == result["episodes"][0]["length"]
+    assert "hello from" in (first / "stdout.txt").read_text()
+    (tmp_path / "mine" / "policy.py").write_text("import nothing_like_it\n")
+    with command(tmp_path, "try", "mine", "--cases", "0", *where) as running:
+        code, out, _ = running.finish()
+    assert code == 1
+    assert "nothing_like_it" in out
+
+
+def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:
+    where = ["--env", "toy", "--cases", "0-3", "--json", "--credentials", str(operator_file)]
+    with command(tmp_path, "random", *where) as running:
+        code, out, err = running.finish()
+    assert code == 0, err
+    assert [(result["env"], len(result["episodes"])) for result in json.loads(out)] == [
+        ("toy/line", 4),
+        ("toy/maze", 4),
+    ]
