@@ -1,10 +1,12 @@
 """What an agent's own log tells of each submit: its messages, the feedback it read, the images it made.
 
 `logs/agent.jsonl` holds a harness's raw stream, one JSON value a line. Three forms are known: Claude Code's
-`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and the turn
-protocol of command agents (`{"turn", "text", "stop"}`). Lines in any other form, and lines that are no JSON, are passed over.
+`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and what command
+agents give: the turn protocol (`{"turn", "text", "stop"}`) and plain lines (`{"type": "stdout", "text"}`). Lines in any other
+form, and lines that are no JSON, are passed over.
 
-A submit's place in the stream is where its answer (`submit_id`, or its summary) first shows in a tool's output. Where
+A submit's place in the stream is where its answer (`submit_id`, or its summary) first shows in a tool's output, or a plain
+line begins with its name. Where
 the log never shows answers but stamps its lines, times decide. Where it does neither, nothing is attributed: messages
 are then listed apart rather than guessed into place.
 """
@@ -28,6 +30,7 @@ MAX_MESSAGE_CHARS = 6000
 _FEEDBACK = re.compile(r"feedback/[\w./*?\[\]{},-]*")
 _IMAGE = re.compile(r"[\w./-]+\.(?:png|jpe?g|gif|webp)\b", re.IGNORECASE)
 _ANSWER = re.compile(r"submit_(?:id|index)[\\\"'\s:=]+(?:submit_)?0*(\d+)")
+_NAMED = re.compile(r"submit_0*(\d{1,9})\b")
 _WRAPPERS = ("event", "line", "payload", "data", "raw")
 _TIMES = ("timestamp", "at", "time", "ts")
 
@@ -183,6 +186,9 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
                 yield from _claude_block(block, kind == "assistant", at)
     elif kind == "item.completed" and isinstance(value.get("item"), dict):
         yield from _codex_item(value["item"], at)
+    elif kind == "stdout" and isinstance(value.get("text"), str):
+        named = _NAMED.match(value["text"])
+        yield LogEvent(message=_clip(value["text"]), answers=(int(named.group(1)),) if named else (), at=at)
     elif isinstance(value.get("turn"), int) and isinstance(value.get("text"), str):
         yield LogEvent(message=_clip(value["text"]), at=at)
 

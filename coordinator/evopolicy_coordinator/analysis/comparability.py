@@ -51,9 +51,6 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
     "validation split": lambda run: run.record.versions.data_valid_hash[:12],
     "held-out split": lambda run: run.record.versions.data_heldout_hash[:12],
     "environment version": lambda run: run.record.versions.env,
-    "fingerprint": lambda run: " ".join(
-        f"{k}={v}" for k, v in sorted(run.record.versions.fingerprint.items())
-    ),
 }
 
 
@@ -68,6 +65,7 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
         out += _differences(_BY_SUITE, suite, together)
     for env in ordered_environments(by_env):
         out += _differences(_BY_ENVIRONMENT, env, by_env[env])
+        out += _differences({"fingerprint": _fingerprint_beside(by_env[env])}, env, by_env[env])
     return out
 
 
@@ -76,6 +74,15 @@ def refuse_mixtures(runs: Iterable[Run]) -> None:
     found = mixtures(runs)
     if found:
         raise MixedRunsError(found)
+
+
+def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
+    """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words."""
+    items = [set(run.record.versions.fingerprint.items()) for run in runs]
+    common = set.intersection(*items)
+    return lambda run: " ".join(
+        f"{k}={v}" for k, v in sorted(set(run.record.versions.fingerprint.items()) - common)
+    )
 
 
 def _differences(checks: dict[str, Callable[[Run], str]], where: str, runs: list[Run]) -> list[Mixture]:

@@ -3,7 +3,10 @@
 A *transition* goes from one score-bearing submit (ok, with a validation mean) to the next. With the source bundle's
 numeric-constant-stripped topology (`topology`) it is, in this order:
 
-- `retest`: the source bundle is byte-identical to the previous one. (Data files outside it may have changed: said apart.)
+- `retest`: nothing changed, the source bundle is byte-identical to the previous one and so is all of `system/`.
+- `data`: the source bundle is byte-identical, and other files of `system/` changed (weights, tables, unreachable modules).
+  Those are outside the paper's boundary, so this is neither edit type; it is no retest either, as the policy may act
+  otherwise. Where checkpoints' digests are unknown such submits count as retests.
 - `parametric`: bytes changed, and the topology is the immediately previous one.
 - `rollback`: the topology is not the previous one, and an earlier score-bearing submit of this run had it.
 - `synthesis`: the topology is new to this run.
@@ -49,8 +52,6 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
     """Edit size; None for the first, and where an ok submit without a score lies between."""
     back_to: int | None = None
     """For a rollback: the latest earlier submit with that topology."""
-    data_changed: bool = False
-    """For a retest: other files of `system/` changed while the source bundle did not."""
 
 
 class EditRates(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,6 +66,8 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
     hits_parametric: int = 0
     n_rollback: int = 0
     n_retest: int = 0
+    n_data: int = 0
+    """Submits that changed files outside the source bundle only."""
     n_first: int = 0
     n_not_ok: int = 0
     """Accepted submits that are not ok."""
@@ -93,7 +96,7 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
             continue
         assert submit.source is not None
         assert submit.val_mean is not None
-        edit, data_changed = _edit(previous, submit, seen)
+        edit = _edit(previous, submit, seen)
         hit = submit.val_mean > best
         best = max(best, submit.val_mean)
         out.append(
@@ -111,7 +114,6 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
                 mean_improved=_improved(previous, submit),
                 changed_lines=submit.changed_lines if previous is not None and not skipped else None,
                 back_to=seen.get(submit.source.topology) if edit == "rollback" else None,
-                data_changed=data_changed,
             )
         )
         seen[submit.source.topology] = submit.index
@@ -120,15 +122,15 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
     return out
 
 
-def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> tuple[EditType, bool]:
+def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> EditType:
     assert submit.source is not None
     if previous is None or previous.source is None:
-        return "first", False
+        return "first"
     if submit.source.digest == previous.source.digest:
-        return "retest", submit.bundle_digest != previous.bundle_digest
+        return "retest" if submit.bundle_digest == previous.bundle_digest else "data"
     if submit.source.topology == previous.source.topology:
-        return "parametric", False
-    return ("rollback" if submit.source.topology in seen else "synthesis"), False
+        return "parametric"
+    return "rollback" if submit.source.topology in seen else "synthesis"
 
 
 def _improved(previous: Submit | None, submit: Submit) -> bool | None:

@@ -72,6 +72,7 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
                 is_repeat = is_repeat or Path(folder) in found
                 found.add(Path(folder))
                 names.clear()
+            names[:] = [name for name in names if not name.startswith(".")]
         if len(found) == before and not is_repeat:
             reason = "no run directory here" if root.is_dir() else "no such folder"
             missing.append(LeftOut(path=path, reason=reason))

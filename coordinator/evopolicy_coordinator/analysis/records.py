@@ -15,7 +15,7 @@ import msgspec
 from evopolicy_common.run_record import RunRecord
 from evopolicy_coordinator.analysis.topology import Features
 
-EditType = Literal["first", "synthesis", "parametric", "rollback", "retest"]
+EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "data"]
 """What a score-bearing submit is to the score-bearing submit before it; see `edits`."""
 
 

@@ -56,6 +56,7 @@ def _span(interval: Interval | None, digits: int) -> str | None:
 
 def _aggregate(suite: Suite, study: Study) -> Table:
     families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
+    families = families if len(families) > 1 else []
     budgets = sorted({run.budget for run in study.runs if run.env in suite.board.environments})
     whole = suite_size(suite.name) or len(suite.board.environments)
     rows: list[dict[str, Any]] = [
@@ -244,6 +245,7 @@ def _edit_types(study: Study) -> Table:
             "hit_parametric": row.rate_parametric,
             "n_rollback": row.n_rollback,
             "n_retest": row.n_retest,
+            "n_data": row.n_data,
             "n_first": row.n_first,
             "n_not_ok": row.n_not_ok,
             "n_unscored": row.n_unscored,
@@ -259,7 +261,7 @@ def _edit_types(study: Study) -> Table:
         title="Edit types",
         caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
         "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
-        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, the first score-bearing submit (it "
+        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, the first score-bearing submit (it "
         "follows none), submits that are not ok, and ok ones without a validation score.",
         columns=(
             _ENTRY,
@@ -269,7 +271,8 @@ def _edit_types(study: Study) -> Table:
             count("n_parametric", "Parametric n", "Same topology, other bytes."),
             Column(key="hit_parametric", title="Parametric hit", kind="percent"),
             count("n_rollback", "Rollback", "Back to an earlier topology."),
-            count("n_retest", "Retest", "Source bundle byte-identical."),
+            count("n_retest", "Retest", "Byte-identical."),
+            count("n_data", "Data only", "Files outside the source bundle changed, such as weights."),
             count("n_first", "First", "First score-bearing submit of a run."),
             count("n_not_ok", "Not ok", "Accepted submits without a working policy."),
             count("n_unscored", "Unscored", "Ok, without a validation mean."),
@@ -322,7 +325,8 @@ def _edit_sizes(study: Study) -> Table:
         name="edit_sizes",
         title="Edit size and improvement",
         caption="Transitions between adjacent score-bearing submits by lines added and removed in the source bundle. Visible: the "
-        "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged bundle cannot.",
+        "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
+        "only: files outside the source bundle changed, such as weights.",
         columns=(
             _ENTRY,
             Column(key="lines", title="Changed lines"),

@@ -15,8 +15,18 @@ from evopolicy_coordinator.analysis.topology import Features
 FEATURES = ("functions", "branches", "loops", "depth", "state")
 """The paper's five columns, in its order."""
 
-BINS: tuple[tuple[int, int | None], ...] = ((0, 0), (1, 5), (6, 20), (21, 60), (61, 150), (151, None))
-"""Edit sizes in changed lines, inclusive; the first bin is for unchanged source bundles alone."""
+UNCHANGED, DATA_ONLY = "unchanged", "data only"
+BINS: dict[str, tuple[int, int | None]] = {
+    UNCHANGED: (0, 0),
+    DATA_ONLY: (0, 0),
+    "1–5": (1, 5),
+    "6–20": (6, 20),
+    "21–60": (21, 60),
+    "61–150": (61, 150),
+    "151+": (151, None),
+}
+"""Edit sizes in changed lines of the source bundle, inclusive. The first bin is for unchanged bundles alone (retests); the
+second for submits that changed nothing but files outside it."""
 
 
 class SelectedStructure(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,9 +60,8 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
     """Transitions of one entry whose edit size is in one bin."""
 
     entry: str
-    low: int
-    high: int | None
-    """Inclusive; None for no upper end."""
+    label: str
+    """Key of `BINS`."""
     n: int
     n_visible: int
     """Of them, with visible means on both sides."""
@@ -62,23 +71,12 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
     """The validation best rose."""
 
     @property
-    def label(self) -> str:
-        return bin_label(self.low, self.high)
-
-    @property
     def p_visible(self) -> float | None:
         return self.visible_improved / self.n_visible if self.n_visible else None
 
     @property
     def p_validation(self) -> float | None:
         return self.validation_improved / self.n if self.n else None
-
-
-def bin_label(low: int, high: int | None) -> str:
-    """`unchanged`, `6–20`, `151+`."""
-    if high == 0:
-        return "unchanged"
-    return f"{low}+" if high is None else f"{low}–{high}"
 
 
 def selected_structures(runs: Iterable[Run]) -> list[SelectedStructure]:
@@ -134,13 +132,12 @@ def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
         by_entry.setdefault(run.entry, []).extend(found)
     rows: list[EditSizeBin] = []
     for entry in sorted(by_entry, key=lambda name: (name.casefold(), name)):
-        for low, high in BINS:
-            inside = [t for t in by_entry[entry] if low <= _size(t) <= (math.inf if high is None else high)]
+        for label in BINS:
+            inside = [t for t in by_entry[entry] if bin_of(t) == label]
             rows.append(
                 EditSizeBin(
                     entry=entry,
-                    low=low,
-                    high=high,
+                    label=label,
                     n=len(inside),
                     n_visible=sum(t.mean_improved is not None for t in inside),
                     visible_improved=sum(t.mean_improved is True for t in inside),
@@ -150,8 +147,9 @@ def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
     return rows
 
 
-def _size(transition: Transition) -> int:
-    """Changed lines; a bundle that changed without a changed line (line ends, an empty module) counts as one."""
-    if transition.edit == "retest":
-        return 0
-    return max(1, transition.changed_lines or 0)
+def bin_of(transition: Transition) -> str:
+    """The transition's key of `BINS`. A bundle that changed without a changed line (line ends, an empty module) counts as one."""
+    if transition.edit in ("retest", "data"):
+        return UNCHANGED if transition.edit == "retest" else DATA_ONLY
+    size = max(1, transition.changed_lines or 0)
+    return next(label for label, (low, high) in BINS.items() if low and low <= size <= (high or math.inf))

@@ -15,12 +15,13 @@ from evopolicy_coordinator.analysis.palette import EDIT_COLOURS, Look
 from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.records import rows
 from evopolicy_coordinator.analysis.scores import title_of
-from evopolicy_coordinator.analysis.structure import BINS, bin_label
+from evopolicy_coordinator.analysis.structure import BINS, DATA_ONLY
 from evopolicy_coordinator.analysis.study import Study, Timeline
 
 MAX_ROWS = 24
 """Runs that one timeline figure shows; every run's own page has its own timeline."""
 
+_HATCHES = {"parametric": "////", "data": "|||"}
 _EVENTS = {
     "hit": ("*", "raises the validation best", 8.0),
     "miss": ("o", "does not", 3.4),
@@ -85,7 +86,7 @@ def _timeline_row(panel: matplotlib.axes.Axes, place: int, line: Timeline) -> No
     for start, end, edit in phases(line.transitions):
         panel.barh(
             place, end - start, left=start, height=0.62, color=EDIT_COLOURS[edit], alpha=0.55, linewidth=0,
-            hatch="////" if edit == "parametric" else None, edgecolor="white",
+            hatch=_HATCHES.get(edit), edgecolor="white",
         )  # fmt: skip
     for transition in line.transitions:
         for kind in events_of(transition):
@@ -100,11 +101,16 @@ def _timeline_row(panel: matplotlib.axes.Axes, place: int, line: Timeline) -> No
 def _timeline_handles(lines: Sequence[Timeline]) -> list[Patch | Line2D]:
     bands = {edit for line in lines for _, _, edit in phases(line.transitions)}
     kinds = {kind for line in lines for t in line.transitions for kind in events_of(t)}
-    titles = {"first": "first policy", "synthesis": "synthesis edits", "parametric": "parametric edits"}
+    titles = {
+        "first": "first policy",
+        "synthesis": "synthesis edits",
+        "parametric": "parametric edits",
+        "data": "data files only",
+    }
     out: list[Patch | Line2D] = [
         Patch(
             facecolor=EDIT_COLOURS[edit], alpha=0.55, label=titles[edit], edgecolor="white", linewidth=0,
-            hatch="////" if edit == "parametric" else None,
+            hatch=_HATCHES.get(edit),
         )
         for edit in EDIT_COLOURS
         if edit in bands
@@ -185,6 +191,8 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     entries = list(dict.fromkeys(row.entry for row in study.edit_sizes))
     figure, axes = new_figure(8.2, 3.2, ncols=2, sharey=True)
     largest = max(row.n for row in study.edit_sizes)
+    has_data = any(row.n for row in study.edit_sizes if row.label == DATA_ONLY)
+    labels = [label for label in BINS if label != DATA_ONLY or has_data]
     with matplotlib.rc_context(RC):
         for panel, (key, count, title) in zip(
             axes[0],
@@ -195,11 +203,11 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
             for i, entry in enumerate(entries):
                 look = looks[entry]
                 shift = (i - (len(entries) - 1) / 2) * min(0.12, 0.5 / max(1, len(entries)))
-                own = {(row.low, row.high): row for row in study.edit_sizes if row.entry == entry}
+                own = {row.label: row for row in study.edit_sizes if row.entry == entry}
                 points = [
-                    (place + shift, getattr(own[edges], key), getattr(own[edges], count))
-                    for place, edges in enumerate(BINS)
-                    if edges in own and getattr(own[edges], key) is not None
+                    (place + shift, getattr(own[label], key), getattr(own[label], count))
+                    for place, label in enumerate(labels)
+                    if label in own and getattr(own[label], key) is not None
                 ]
                 panel.plot(
                     [x for x, _, _ in points], [y for _, y, _ in points],
@@ -210,7 +218,7 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     s=[14 + 130 * n / largest for _, _, n in points],
                     color=look.colour, marker=look.marker, alpha=0.8, linewidths=0,
                 )  # fmt: skip
-            panel.set_xticks(range(len(BINS)), [bin_label(*edges) for edges in BINS])
+            panel.set_xticks(range(len(labels)), labels)
             panel.set_ylim(-0.04, 1.04)
             panel.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25", "50", "75", "100"])
         axes[0][0].set_ylabel("Transitions that improve (%)")
@@ -224,8 +232,9 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
         name="edit_size",
         title="Edit size and improvement",
         caption="Transitions between adjacent score-bearing submits by size of the edit; a mark's area grows with their number. "
-        "An unchanged bundle cannot raise the validation best; its visible mean can change, as it may play other cases.",
-        alt=f"Probability of improvement over six edit sizes for {len(entries)} agents.",
+        "An unchanged policy cannot raise the validation best; its visible mean can change, as it may play other cases. Data only: "
+        "files outside the source bundle changed, such as weights.",
+        alt=f"Probability of improvement over {len(labels)} edit sizes for {len(entries)} agents.",
         data=rows(study.edit_sizes),
         figure=figure,
         group="edits",

@@ -324,7 +324,9 @@ def _change(row: TraceRow) -> str:
     if transition is not None and transition.edit == "rollback":
         return f"to the topology of s{transition.back_to:03d}, {submit.changed_lines} lines changed"
     if transition is not None and transition.edit == "retest":
-        return "other files changed, not the policy's source" if transition.data_changed else "same bytes"
+        return "same bytes"
+    if transition is not None and transition.edit == "data":
+        return "other files of system/ changed, not the source bundle"
     if submit.changed_lines is None:
         return ""
     return f"{submit.changed_lines} lines changed"

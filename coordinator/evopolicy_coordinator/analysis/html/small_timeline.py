@@ -10,7 +10,7 @@ from evopolicy_coordinator.analysis.palette import EDIT_COLOURS
 from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.records import Submit
 
-_WIDTH, _LEFT, _RIGHT = 900.0, 12.0, 12.0
+_WIDTH, _LEFT, _RIGHT = 900.0, 14.0, 20.0
 _BAND_TOP, _BAND_HEIGHT, _MARKS, _AXIS, _HEIGHT = 16.0, 30.0, 62.0, 78.0, 112.0
 
 

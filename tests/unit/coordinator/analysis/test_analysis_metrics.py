@@ -31,20 +31,19 @@ VERSIONS = [
     Version(policy(gain=1.0, planner=True), (20.0,) * 8, 80.0),  # synthesis, hit
     Version(
         {**policy(gain=1.0, planner=True), "notes.py": "x = 1\n"}, (20.0,) * 8, 80.0
-    ),  # dead module: retest
+    ),  # a dead module: data only
 ]
 
 
 def test_transitions_are_classified_and_hits_raise_the_validation_best(tmp_path: Path) -> None:
     found = classify(read_run(write_run(tmp_path, VERSIONS)).submits)
     assert [t.edit for t in found] == [
-        "first", "parametric", "synthesis", "rollback", "retest", "parametric", "synthesis", "retest",
+        "first", "parametric", "synthesis", "rollback", "retest", "parametric", "synthesis", "data",
     ]  # fmt: skip
     assert [t.hit for t in found] == [True, True, False, True, False, False, True, False]
     assert [t.previous for t in found] == [None, 0, 1, 3, 4, 5, 6, 7]
     assert [t.best for t in found] == [10.0, 20.0, 20.0, 40.0, 40.0, 40.0, 80.0, 80.0]
     assert found[3].back_to == 1
-    assert [t.data_changed for t in found if t.edit == "retest"] == [False, True]
     assert [t.val_drop for t in found] == [False, False, True, False, False, True, False, False]
     assert [t.mean_improved for t in found] == [None, True, False, True, False, False, True, False]
 
@@ -55,19 +54,10 @@ def test_rates_count_what_is_excluded_and_why(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS[:1], env="toy/line")
     rates = {(row.entry, row.demand): row for row in edit_rates(load_runs([tmp_path]).runs)}
     tuning = rates["Agent A", "tuning"]
-    assert (tuning.n_synthesis, tuning.hits_synthesis, tuning.n_parametric, tuning.hits_parametric) == (
-        2,
-        1,
-        2,
-        1,
-    )
-    assert (tuning.n_rollback, tuning.n_retest, tuning.n_first, tuning.n_not_ok, tuning.n_unscored) == (
-        1,
-        2,
-        1,
-        1,
-        0,
-    )
+    rated = (tuning.n_synthesis, tuning.hits_synthesis, tuning.n_parametric, tuning.hits_parametric)
+    assert rated == (2, 1, 2, 1)
+    assert (tuning.n_rollback, tuning.n_retest, tuning.n_data) == (1, 1, 1)
+    assert (tuning.n_first, tuning.n_not_ok, tuning.n_unscored) == (1, 1, 0)
     assert tuning.rate_synthesis == 0.5
     assert rates["Agent A", "synthesis"].rate_parametric == 1.0
     assert rates["Agent A", "synthesis"].rate_synthesis is None
@@ -127,7 +117,7 @@ def test_structure_is_averaged_over_runs_then_environments(tmp_path: Path) -> No
 
 def test_edit_sizes_are_binned_with_unchanged_bundles_apart(tmp_path: Path) -> None:
     bins = {row.label: row for row in edit_size_bins([read_run(write_run(tmp_path, VERSIONS))])}
-    assert bins["unchanged"].n == 2
+    assert (bins["unchanged"].n, bins["data only"].n) == (1, 1)
     assert bins["unchanged"].p_validation == 0.0
     assert bins["unchanged"].visible_improved == 0
     small = bins[

@@ -144,6 +144,16 @@ def test_log_without_answers_or_times_is_not_guessed_into_place(tmp_path: Path) 
     assert reading.unplaced == ("I start simple.", "It is too slow.", "submit 2", "Back to work.")
 
 
+def test_plain_lines_that_begin_with_a_submits_name_tell_its_place(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, SAID[:2], log=None))
+    log = tmp_path / "agent.jsonl"
+    lines = ["gain 1.0", "submit_000: ok, mean 3.5", "gain 2.0 looks better", "submit_001: ok", "bye"]
+    log.write_text("".join(json.dumps({"type": "stdout", "text": line}) + "\n" for line in lines))
+    reading = read_agent_log(log, run.submits)
+    assert [one.attribution for one in reading.by_submit.values()] == ["gain 1.0", "gain 2.0 looks better"]
+    assert reading.unplaced == ("submit_001: ok", "bye")
+
+
 def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path, SAID[:2], log=None))
     log = tmp_path / "agent.jsonl"
