@@ -6,7 +6,7 @@ from evopolicy_common import trajectory
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_gateway.formatting import cut_text, failure_line, trajectory_row
-from evopolicy_gateway.storage import named_columns, npy_bytes, npz_bytes
+from evopolicy_gateway.storage import named_columns, npy_bytes, npz_bytes, storage_for
 
 
 def episode_files(
@@ -27,9 +27,14 @@ def episode_files(
     return files
 
 
-def trajectory_files(packed: bytes, storage: ObsStorage) -> dict[str, bytes]:
-    """`trajectory.jsonl` and, where observations are stored outside it, `observations.npy` or `.npz`."""
+def trajectory_files(packed: bytes, storage: ObsStorage | None) -> dict[str, bytes]:
+    """`trajectory.jsonl` and, where observations are stored outside it, `observations.npy` or `.npz`.
+
+    `storage` None: as the observations themselves suggest.
+    """
     episode = trajectory.decode(packed)
+    if storage is None:
+        storage = storage_for(episode.obs)
     inline = storage == "inline"
     lines = [
         trajectory_row(

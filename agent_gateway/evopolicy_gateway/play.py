@@ -102,7 +102,11 @@ class RunPlay:
         """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
         plan = self._plan
         plan.claim()
-        created = await self._operations.create(plan.settings, uuid.uuid4().hex)
+        try:
+            created = await self._operations.create(plan.settings, uuid.uuid4().hex)
+        except BaseException:
+            self._folder.root.rmdir()
+            raise
         self._folder.state.mkdir(mode=0o700)
         found = msgspec.structs.replace(self._credentials, token=created.capability)
         credentials.write(found, self._folder.credentials)
@@ -111,8 +115,8 @@ class RunPlay:
         try:
             agent_s = await self._agents_side()
             finished = await self._finish(created.run)
-        except BaseException:
-            await self._give_up(created.run)
+        except BaseException as error:
+            await self._give_up(created.run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
         return await record.write(self._folder, plan, finished, self._operations, self.last, agent_s)
 
@@ -239,10 +243,10 @@ class RunPlay:
                 return progress.finished
         raise AssertionError("waiting ends with the finished run")
 
-    async def _give_up(self, run: str) -> None:
+    async def _give_up(self, run: str, why: str | None) -> None:
         """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""
         with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
             async with asyncio.timeout(10.0):
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
-                await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0)
+                await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)

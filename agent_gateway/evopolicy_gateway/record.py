@@ -56,8 +56,12 @@ async def write(
     operations: Operations,
     last: Progress | None,
     agents_side_s: float,
+    error: str | None = None,
 ) -> RunRecord:
-    """Writes everything and removes the gateway's folder. StorageError when the disk refuses."""
+    """Writes everything and removes the gateway's folder. StorageError when the disk refuses.
+
+    `error` tells why a run was cancelled, when that was not the operator's wish.
+    """
     selected: Bundle | None = None
     for submit in finished.submits:
         bundle = None if submit.bundle is None else await _bundle(folder, submit.bundle, operations)
@@ -66,6 +70,8 @@ async def write(
             selected = bundle
     if selected is not None:
         await asyncio.to_thread(_put_in_place, folder.system, selected)
+    if error is not None and finished.status == "cancelled":
+        finished = msgspec.structs.replace(finished, error=error)
     return await asyncio.to_thread(_write_record, folder, plan, finished, last, agents_side_s)
 
 
@@ -154,7 +160,9 @@ def _outcome(finished: RunFinished) -> Outcome:
     completed = finished.status == "completed"
     # What no submit was charged for is not a result: a cancelled run has none.
     status: RunStatus = "error" if finished.status == "cancelled" else finished.status
-    error = "cancelled by the operator" if finished.status == "cancelled" else finished.error
+    error = finished.error
+    if finished.status == "cancelled" and error is None:
+        error = "cancelled by the operator"
     auxiliary: dict[str, Any] = {
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,

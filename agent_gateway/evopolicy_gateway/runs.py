@@ -14,7 +14,7 @@ from rich.table import Table
 
 from evopolicy_common import transport
 from evopolicy_common.credentials import Credentials
-from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.run_record import RunRecord
 from evopolicy_gateway.local_cluster import local_cluster
 from evopolicy_gateway.operations import Operations, find_credentials
@@ -52,6 +52,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     budget_used: int = 0
     closed_reason: str = ""
     wall_s: float = 0.0
+    wrong_option: bool = False
+    """It was never opened, for an option's sake."""
 
 
 @contextlib.asynccontextmanager
@@ -103,6 +105,8 @@ async def play_all(plans: Sequence[Plan], where: Cluster, parallel: int, console
                         group.create_task(one(index, plan))
 
             await unless_failed(asyncio.create_task(everything()), failed)
+    if all(result.wrong_option for result in results.values()):
+        raise ConfigError(results[0].error or "")
     return [results[index] for index in range(len(plans))]
 
 
@@ -140,6 +144,14 @@ async def _play(plan: Plan, operations: Operations, gateway: Credentials, watch:
     play = RunPlay(plan, operations, gateway, watch)
     try:
         return _result(plan, await play.play())
+    except ConfigError as error:
+        return RunResult(
+            env=plan.settings.env,
+            run_directory=str(plan.folder.root),
+            status="error",
+            error=str(error),
+            wrong_option=True,
+        )
     except EvopolicyError as error:
         watch.note(plan.settings.env, f"failed: {error}")
         return RunResult(

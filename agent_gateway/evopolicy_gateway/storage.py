@@ -13,6 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evopolicy_common.messages.environment import ObsStorage
+
+MIN_PICTURE_SIDE = 16
+"""Height × width × channels of bytes is a picture from this side on; smaller ones are symbols."""
+
 
 def npy_bytes(array: NDArray[Any]) -> bytes:
     """One array, format version 1.0 or later, C order."""
@@ -38,6 +43,19 @@ def named_columns(columns: Any) -> dict[str, NDArray[Any]]:
     A leaf is named by its path: keys and positions joined by `/`; the only leaf of a plain array is named "".
     """
     return {path: _array(leaf) for path, leaf in _leaves(columns, "")}
+
+
+def storage_for(columns: Any) -> ObsStorage:
+    """Where these columns belong: beside the rows where there is a picture among them."""
+    leaves = dict(_leaves(columns, ""))
+    if not any(_is_pictures(leaf) for leaf in leaves.values()):
+        return "inline"
+    return "npy" if list(leaves) == [""] else "npz"
+
+
+def _is_pictures(leaf: Any) -> bool:
+    shape = leaf.shape[1:] if isinstance(leaf, np.ndarray) and leaf.dtype == np.uint8 else ()
+    return len(shape) == 3 and min(shape[:2]) >= MIN_PICTURE_SIDE
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:

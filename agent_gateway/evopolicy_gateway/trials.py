@@ -160,8 +160,7 @@ async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: O
 
 def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
     target.mkdir()
-    # Whatever the space: pictures in rows of text help nobody, so those alone lie beside the rows.
-    files = {} if packed is None else trajectory_files(packed, "inline")
+    files = {} if packed is None else trajectory_files(packed, None)
     files["stdout.txt"] = cut_text(outcome.stdout)
     files["stderr.txt"] = cut_text(outcome.stderr)
     if outcome.failure is not None:

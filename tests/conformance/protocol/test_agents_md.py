@@ -39,8 +39,8 @@ def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
         assert json.loads(info)["state"]["remaining_budget"] == 12
         answer = json.loads(submit)
         assert answer["status"] == "ok"
-        summary, _, rows = read.partition("}\n")
-        assert json.loads(summary + "}") == answer["summary"]
+        summary, _, rows = read.partition("\n}\n")
+        assert json.loads(summary + "\n}") == answer["summary"]
         assert [json.loads(row)["t"] for row in rows.splitlines()] == [0, 1]
         program, interface = blocks(text, "python")
         assert (await output([sys.executable, "-c", program], workspace)).startswith("submit_001 ok -3.5")

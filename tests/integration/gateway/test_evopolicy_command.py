@@ -373,7 +373,9 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path
         told[name] = [json.loads(error.read_text())["category"] for error in errors]
     assert told == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
     rows = (feedback / "submit_008/episodes").glob("*/trajectory.jsonl")
-    assert all(json.loads(line)["info"]["action_invalid"] for path in rows for line in path.open())
+    assert all(
+        json.loads(line)["info"]["action_invalid"] for path in rows for line in path.read_text().splitlines()
+    )
     record = record_in(folder)
     assert [one.status for one in record.rejected_submits] == ["invalid_env_instance"] * 2 + [
         "budget_invalid"
