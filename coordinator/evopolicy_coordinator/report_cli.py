@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
@@ -22,8 +22,9 @@ from evopolicy_coordinator.analysis.comparability import MixedRunsError
 from evopolicy_coordinator.analysis.reader import load_runs
 from evopolicy_coordinator.analysis.scores import ScoreTable, read_score_csv
 from evopolicy_coordinator.analysis.study import Study, study_of
-from evopolicy_coordinator.analysis.write import Progress as Tell
-from evopolicy_coordinator.analysis.write import write_report
+
+if TYPE_CHECKING:
+    from evopolicy_coordinator.analysis.write import Progress as Tell
 
 NOTHING, USAGE, MIXED = 1, 2, 3
 
@@ -68,6 +69,9 @@ def report(
     ] = False,
 ) -> None:
     """Turn run directories into a leaderboard, figures and diagnostics."""
+    # Here, not above: it needs jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    from evopolicy_coordinator.analysis.write import write_report
+
     try:
         with _progress() as tell:
             study = _study(runs, allow_mixed, jobs or os.cpu_count() or 1, tell)

@@ -187,8 +187,8 @@ def _normalised(suite: Suite) -> Table:
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
         "on the same cases, 1 the best agent on that environment. A dash: no agent beats random, no reference, or no score.",
         columns=(
-            _DEMAND,
             _ENV,
+            _DEMAND,
             *(Column(key=agent, title=agent, kind="number", digits=2) for agent in agents),
         ),
         rows=tuple(rows),
@@ -320,6 +320,7 @@ def _edit_sizes(study: Study) -> Table:
             "p_validation": row.p_validation,
         }
         for row in study.edit_sizes
+        if row.n
     ]
     return Table(
         name="edit_sizes",

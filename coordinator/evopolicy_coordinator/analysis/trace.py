@@ -15,7 +15,7 @@ import msgspec
 
 from evopolicy_coordinator.analysis.agent_log import Evidence, LogReading, read_agent_log
 from evopolicy_coordinator.analysis.edits import Transition, classify
-from evopolicy_coordinator.analysis.records import Run, Submit
+from evopolicy_coordinator.analysis.records import Run, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.sources import read_python_files
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
@@ -36,6 +36,8 @@ class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
     """None when the log does not tell."""
     images: tuple[Path, ...]
     """Images that the agent made before this submit."""
+    video: Path | None
+    """The first recorded episode of its feedback; None where the run recorded none."""
 
 
 class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,10 +69,17 @@ def trace(run: Run) -> Trace:
             transition=transitions.get(submit.index),
             evidence=reading.by_submit.get(submit.index),
             images=tuple(images.get(submit.index, ())),
+            video=_first_video(run, submit),
         )
         for submit in run.submits
     ]
     return Trace(run=run, rows=tuple(rows), unplaced=reading.unplaced)
+
+
+def _first_video(run: Run, submit: Submit) -> Path | None:
+    workspace = run.path / (run.record.artifacts.workspace or "workspace")
+    episodes = checkpoint_folder(workspace, "feedback", submit.index) / "episodes"
+    return next((path for path in sorted(episodes.glob("ep_*/video.mp4"))), None)
 
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:

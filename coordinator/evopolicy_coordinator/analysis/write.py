@@ -149,12 +149,15 @@ def _write_trace(found: Trace, out: Path, look: Look | None) -> None:
     folder.mkdir(exist_ok=True)
     name = slug(found.run)
     image_links: dict[int, list[tuple[str, str]]] = {}
+    videos: dict[int, str] = {}
     for row in found.rows:
         for number, path in enumerate(row.images):
             target = folder / name / f"{row.submit.label}-{number}{path.suffix.lower()}"
             if _copy(path, target):
                 image_links.setdefault(row.submit.index, []).append((path.name, f"{name}/{target.name}"))
-    page = trace_page(found, look=look, image_links=image_links)
+        if row.video is not None and _copy(row.video, folder / name / f"{row.submit.label}.mp4"):
+            videos[row.submit.index] = f"{name}/{row.submit.label}.mp4"
+    page = trace_page(found, look=look, image_links=image_links, videos=videos)
     (folder / f"{name}.html").write_text(page, encoding="utf-8", errors="replace")
 
 

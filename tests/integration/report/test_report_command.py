@@ -205,6 +205,20 @@ def test_replays_are_copied_and_missing_ones_said(tmp_path: Path) -> None:
     )
 
 
+def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
+    folder = write_run(
+        tmp_path / "runs", [Version(policy(), (1.0,), 1.0), Version(policy(gain=2.0), (1.0,), 2.0)]
+    )
+    video = folder / "workspace/feedback/submit_001/episodes/ep_001/video.mp4"
+    video.parent.mkdir(parents=True)
+    video.write_bytes(MP4)
+    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    (page,) = (tmp_path / "report/traces").glob("*.html")
+    (target,) = [target for target in links_of(page).targets if target.endswith(".mp4")]
+    assert target.endswith("s001.mp4")
+    assert (page.parent / target).read_bytes() == MP4
+
+
 def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(png())
     folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], replays={"a.mp4": MP4})

@@ -58,6 +58,7 @@ def timeline(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> 
             )  # fmt: skip
         panel.set_ylim(len(cut) - 0.4, -0.6)
         panel.set_xlim(0, budget)
+        panel.locator_params(axis="x", integer=True)
         panel.set_xlabel("Train episodes consumed")
         panel.grid(axis="y", visible=False)
         figure.legend(handles=_timeline_handles(cut), loc="outside upper center", ncols=4)
@@ -189,7 +190,7 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     if not any(row.n for row in study.edit_sizes):
         return None
     entries = list(dict.fromkeys(row.entry for row in study.edit_sizes))
-    figure, axes = new_figure(8.2, 3.2, ncols=2, sharey=True)
+    figure, axes = new_figure(9.2, 3.2, ncols=2, sharey=True)
     largest = max(row.n for row in study.edit_sizes)
     has_data = any(row.n for row in study.edit_sizes if row.label == DATA_ONLY)
     labels = [label for label in BINS if label != DATA_ONLY or has_data]
@@ -218,7 +219,7 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     s=[14 + 130 * n / largest for _, _, n in points],
                     color=look.colour, marker=look.marker, alpha=0.8, linewidths=0,
                 )  # fmt: skip
-            panel.set_xticks(range(len(labels)), labels)
+            panel.set_xticks(range(len(labels)), [label.replace(" ", "\n") for label in labels])
             panel.set_ylim(-0.04, 1.04)
             panel.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25", "50", "75", "100"])
         axes[0][0].set_ylabel("Transitions that improve (%)")

@@ -92,7 +92,10 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
         for panel in panels[len(envs) :]:
             panel.set_visible(False)
         figure.supxlabel("Train episodes consumed", fontsize=9)
-        figure.supylabel("Best validation mean return so far", fontsize=9)
+        figure.supylabel(
+            "Best validation mean return so far" if n_rows > 1 else "Best validation mean\nreturn so far",
+            fontsize=9,
+        )
         handles = [_handle(entry, looks) for entry in shown]
         if suite.table.reference is not None:
             handles.append(Line2D([], [], color=REFERENCE, linestyle=":", label=suite.table.reference))

@@ -258,9 +258,14 @@ def _trace_index(study: Study, links: Mapping[str, str]) -> dict[str, Any]:
 
 
 def trace_page(
-    trace: Trace, *, look: Look | None, image_links: Mapping[int, Sequence[tuple[str, str]]]
+    trace: Trace,
+    *,
+    look: Look | None,
+    image_links: Mapping[int, Sequence[tuple[str, str]]],
+    videos: Mapping[int, str],
 ) -> str:
-    """One run's page. `image_links` has, by submit index, (name, path relative to the page) of its copied images."""
+    """One run's page. `image_links` has, by submit index, (name, path relative to the page) of its copied images, `videos`
+    the path of its copied feedback video."""
     run = trace.run
     outcome = run.record.outcome
     transitions = [row.transition for row in trace.rows if row.transition is not None]
@@ -288,14 +293,18 @@ def trace_page(
         budget=run.budget,
         timeline=Markup(svg),
         log_note=note,
-        rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ())) for row in trace.rows],
+        rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index)) for row in trace.rows],
         unplaced=trace.unplaced,
         checkpoints=checkpoints,
     )  # fmt: skip
 
 
 def _trace_row(
-    row: TraceRow, trace: Trace, anchors: Mapping[str, str], images: Sequence[tuple[str, str]]
+    row: TraceRow,
+    trace: Trace,
+    anchors: Mapping[str, str],
+    images: Sequence[tuple[str, str]],
+    video: str | None,
 ) -> dict[str, Any]:
     submit, transition, evidence = row.submit, row.transition, row.evidence
     messages = list(evidence.messages) if evidence is not None else []
@@ -312,6 +321,7 @@ def _trace_row(
         "quote": messages[-1] if messages else "",
         "more": messages[:-1][-20:],
         "images": [{"name": name, "href": href} for name, href in images],
+        "video": video,
         "edit": transition.edit if transition is not None else "",
         "change": _change(row),
         "outcome": _outcome(submit, row, trace),
