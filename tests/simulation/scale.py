@@ -222,15 +222,16 @@ class Load:
         group = f"{run}/{rest.rpartition('/')[0]}"
         if "/train" in group and group not in self.core.groups:
             self._go_on(run)
+        if run in self._submitted and run not in self.core.runs:
+            del self._submitted[run]
+            self._create()
 
     def _go_on(self, run: str) -> None:
-        """A submit is over: the next, or the run's end and a new run."""
+        """A submit is over: the next, or the run's end; when it is scored, a new run begins."""
         if self._submitted[run] < SUBMITS:
             self._submit(run)
         else:
-            del self._submitted[run]
             self.tell(events.RunClosed(request=self.request(), run=run, reason="budget_spent"))
-            self._create()
 
     def run(self) -> None:
         """Until so many jobs are done, train and hidden; workers beat in turn, each every `BEAT_S` simulated seconds."""

@@ -6,10 +6,24 @@ from typing import Any, TypeVar
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, FailureCategory, Job, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.episode import (
+    EpisodeOutcome,
+    FailureCategory,
+    Job,
+    PolicyFailure,
+    ResourceLimits,
+)
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import Effect, Log, Persist, ReadEvaluation, ReadFinished, ReadResults, Reply
+from evopolicy_coordinator.core.effects import (
+    Effect,
+    Log,
+    Persist,
+    ReadEvaluation,
+    ReadFinished,
+    ReadResults,
+    Reply,
+)
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import (
     EvaluationRow,
@@ -42,9 +56,17 @@ def fingerprint(version: str = "1") -> wire.Fingerprint:
 
 
 def outcome_of(index: int, value: float = 1.0, failure: FailureCategory | None = None) -> EpisodeOutcome:
-    failed = None if failure is None else PolicyFailure(category=failure, step_index=None, message="it failed")
+    failed = (
+        None if failure is None else PolicyFailure(category=failure, step_index=None, message="it failed")
+    )
     return EpisodeOutcome(
-        index=index, episode_return=value, length=3, terminated=True, truncated=False, failure=failed, wall_s=1.0
+        index=index,
+        episode_return=value,
+        length=3,
+        terminated=True,
+        truncated=False,
+        failure=failed,
+        wall_s=1.0,
     )
 
 
@@ -163,7 +185,13 @@ class Rig:
         )
 
     def register(
-        self, worker: str = "w1", *, slots: int = 2, version: str = "1", envs: tuple[str, ...] = (ENV,), **more: Any
+        self,
+        worker: str = "w1",
+        *,
+        slots: int = 2,
+        version: str = "1",
+        envs: tuple[str, ...] = (ENV,),
+        **more: Any,
     ) -> str:
         session = f"{worker}-s{self.request()}"
         reply = self.tell(
@@ -180,10 +208,18 @@ class Rig:
         assert isinstance(reply, wire.Registered)
         return session
 
-    def submit(self, *ids: int, run: str = "r1", key: str = "k0", bundle: str | None = BUNDLE, **more: Any) -> Any:
+    def submit(
+        self, *ids: int, run: str = "r1", key: str = "k0", bundle: str | None = BUNDLE, **more: Any
+    ) -> Any:
         return self.tell(
             events.SubmitRequested(
-                request=self.request(), stimulus_id=f"submit-{key}", run=run, key=key, env_instances=ids, bundle=bundle, **more
+                request=self.request(),
+                stimulus_id=f"submit-{key}",
+                run=run,
+                key=key,
+                env_instances=ids,
+                bundle=bundle,
+                **more,
             )
         )
 
@@ -191,7 +227,12 @@ class Rig:
         """The leases that a poll gets; None while it waits."""
         reply = self.tell(
             events.LeaseRequested(
-                request=self.request(), worker=session.split("-")[0], session=session, n=n, wait_s=wait_s, **more
+                request=self.request(),
+                worker=session.split("-")[0],
+                session=session,
+                n=n,
+                wait_s=wait_s,
+                **more,
             )
         )
         if reply is None and wait_s == 0.0:
@@ -202,12 +243,18 @@ class Rig:
 
     def beat(self, session: str, *held: wire.Lease, running: bool = True, wait_s: float = 0.0) -> Any:
         leases = tuple(
-            wire.HeldLease(lease_id=each.lease_id, job_id=each.job.job_id, attempt=each.attempt, running=running)
+            wire.HeldLease(
+                lease_id=each.lease_id, job_id=each.job.job_id, attempt=each.attempt, running=running
+            )
             for each in held
         )
         return self.tell(
             events.HeartbeatReceived(
-                request=self.request(), worker=session.split("-")[0], session=session, held=leases, wait_s=wait_s
+                request=self.request(),
+                worker=session.split("-")[0],
+                session=session,
+                held=leases,
+                wait_s=wait_s,
             )
         )
 
@@ -218,7 +265,9 @@ class Rig:
             )
         )
 
-    def play(self, session: str, *leases: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None) -> Any:
+    def play(
+        self, session: str, *leases: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None
+    ) -> Any:
         """Hand in outcomes of leases."""
         return self.hand_in(session, *(done(lease, value, failure) for lease in leases))
 
@@ -260,7 +309,9 @@ def done(lease: wire.Lease, value: float = 1.0, failure: FailureCategory | None 
 
 
 def result(lease: wire.Lease, kind: wire.ResultKind, **more: Any) -> wire.JobResult:
-    return wire.JobResult(lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, kind=kind, **more)
+    return wire.JobResult(
+        lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, kind=kind, **more
+    )
 
 
 def split_of(job: Job) -> str:

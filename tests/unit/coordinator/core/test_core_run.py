@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from core_rig import Rig, split_of
+
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.worker import Refused
 from evopolicy_coordinator.core import events
@@ -51,6 +52,11 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
 
 def test_a_request_of_an_unknown_run_is_refused() -> None:
     rig = Rig()
-    for answer in (rig.submit(0), rig.results(), rig.close(), rig.tell(events.StateRequested(request="s", run="r1"))):
+    for answer in (
+        rig.submit(0),
+        rig.results(),
+        rig.close(),
+        rig.tell(events.StateRequested(request="s", run="r1")),
+    ):
         assert isinstance(answer, Refused)
         assert answer.status == "unknown_run"

@@ -1,0 +1,256 @@
+"""Validation, selection, held-out, the random reference; evaluations; and that each goes on after a restart."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import pytest
+from core_rig import BUNDLE, Rig, done, result, split_of
+from hypothesis import given, settings
+
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import Job, ResourceLimits
+from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import ReadEvaluation
+from evopolicy_coordinator.core.records import EvaluationRow, SubmitRow
+
+
+def value_of(job: Job) -> float:
+    """Validation prefers the second bundle."""
+    if split_of(job) == "validation":
+        return 9.0 if job.bundle == "b" * 64 else 1.0
+    return 3.0
+
+
+def two_submits(rig: Rig, session: str) -> None:
+    rig.create()
+    rig.submit(0, bundle="a" * 64)
+    rig.work_off(session, value_of)
+    rig.submit(1, bundle="b" * 64, key="k1")
+    rig.work_off(session, value_of)
+    rig.submit(2, bundle="c" * 64, key="k2")
+
+
+def test_the_best_on_hidden_validation_is_selected() -> None:
+    rig = Rig()
+    session = rig.register()
+    two_submits(rig, session)
+    rig.work_off(session, value_of)
+    rig.close()
+    rig.work_off(session, value_of)
+    assert rig.finished().best_submit_index == 1
+    assert rig.finished().policy_failures == {"validation": 0, "heldout": 0}
+
+
+def test_closing_with_a_submit_in_flight_waits_for_it() -> None:
+    rig = Rig()
+    session = rig.register()
+    two_submits(rig, session)
+    rig.close()
+    assert rig.submit(0, key="late").status == "run_closed"
+    rig.work_off(session, value_of)
+    assert [each.status for each in rig.finished().submits] == ["ok", "ok", "ok"]
+
+
+def test_a_run_without_an_ok_submit_says_so_and_still_has_its_random_reference() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    rig.close()
+    rig.work_off(session, lambda job: -2.0)
+    finished = rig.finished()
+    assert (finished.status, finished.best_submit_index, finished.final_score) == ("no_ok_submit", None, None)
+    assert finished.random_heldout_returns == (-2.0,) * 3
+
+
+def test_a_checkpoint_quarantined_while_hidden_is_ineligible_and_only_the_end_tells() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session, 8))
+    before = rig.tell(events.StateRequested(request="s1", run="r1"))
+    for _ in range(3):
+        rig.pass_time(10.0)
+        rig.beat(session)
+        rig.hand_in(session, *(result(each, "slot_died") for each in rig.poll(session, 8)))
+    assert rig.row(SubmitRow, "r1", 0).status == "ok"
+    assert rig.tell(events.StateRequested(request="s2", run="r1")) == before
+    rig.close()
+    rig.work_off(session)
+    finished = rig.finished()
+    assert (finished.status, list(finished.validation_ineligible)) == ("error", [0])
+
+
+def test_a_checkpoint_quarantined_on_held_out_gives_way_to_the_next() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    two_submits(rig, session)
+    rig.work_off(session, value_of)
+    rig.close()
+    for _ in range(12):
+        rig.pass_time(3.0)
+        rig.beat(session)
+        for lease in rig.poll(session, 8):
+            dies = split_of(lease.job) == "heldout" and lease.job.bundle == "b" * 64
+            rig.hand_in(session, result(lease, "slot_died") if dies else done(lease, value_of(lease.job)))
+    finished = rig.finished()
+    assert (finished.status, finished.best_submit_index) == ("completed", 2)
+    assert list(finished.validation_ineligible) == [1]
+
+
+def test_hidden_jobs_tell_a_policy_nothing_of_the_split_they_are_from() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create(n_valid=5)
+    rig.submit(0, 1)
+    train = rig.poll(session, 8)
+    rig.play(session, *train)
+    hidden = rig.poll(session, 8)
+    assert {str(each.job.env_meta) for each in hidden} == {str(train[0].job.env_meta)}
+    assert [each.job.episodes[0].episode_index for each in hidden] == [0, 1, 0, 1, 0]
+    assert {each.job.limits for each in hidden} == {train[0].job.limits}
+    assert {each.job.video for each in hidden} == {False}
+
+
+def test_progress_tells_an_operator_which_phase_a_run_is_in() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create()
+    seen = []
+
+    def look() -> None:
+        progress = rig.tell(events.RunWaited(request=rig.request(), run="r1", wait_s=0.0))
+        assert isinstance(progress, RunProgress)
+        seen.append((progress.phase, progress.done, progress.total))
+
+    look()
+    rig.submit(0)
+    rig.play(session, *rig.poll(session, 8))
+    rig.close()
+    look()
+    leases = rig.poll(session, 8)
+    rig.play(session, *(each for each in leases if split_of(each.job) == "validation"))
+    look()
+    rig.play(session, *rig.poll(session, 8))
+    look()
+    assert seen == [("open", 0, 16), ("validation", 0, 2), ("heldout", 0, 3), ("random", 0, 3)]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=6))
+def test_a_restart_at_any_step_changes_nothing_of_the_result(stops: list[int]) -> None:
+    def play(restarts: set[int]) -> object:
+        rig = Rig()
+        session = rig.register(slots=2)
+        rig.create()
+        plan = [((0, 1, 1), "a" * 64, "k0"), ((2,), "b" * 64, "k1"), ((3, 4), "c" * 64, "k2")]
+        step = 0
+        for ids, bundle, key in [*plan, ((), "", "close")]:
+            if key == "close":
+                rig.close()
+            else:
+                rig.submit(*ids, bundle=bundle, key=key)
+            idle = 0
+            while idle < 30:
+                step += 1
+                if step in restarts:
+                    rig.load()
+                    session = rig.register(slots=2)
+                    if key != "close":
+                        rig.submit(*ids, bundle=bundle, key=key)
+                rig.pass_time(1.0)
+                rig.beat(session)
+                leases = rig.poll(session, 2)
+                idle = 0 if leases else idle + 1
+                rig.hand_in(
+                    session,
+                    *(done(each, float(len(each.job.job_id)) + value_of(each.job)) for each in leases),
+                )
+        finished = rig.finished()
+        return (
+            finished.best_submit_index,
+            finished.val_scores,
+            finished.heldout_returns,
+            finished.budget_used,
+        )
+
+    assert play(set(stops)) == play(set())
+
+
+def ask(rig: Rig, key: str = "e") -> object:
+    return rig.tell(
+        events.EvaluationRequested(
+            request=rig.request(),
+            evaluation=f"ev-{key}",
+            key=key,
+            env="toy/line",
+            bundle=BUNDLE,
+            split="train",
+            case_ids=(4, 4),
+            cases=(Case(seed=4), Case(seed=4)),
+            secret=b"x",
+            record="full",
+            tier="bwrap",
+            limits=ResourceLimits(),
+        )
+    )
+
+
+def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:
+    answer = rig.tell(
+        events.EvaluationPolled(request=rig.request(), evaluation="ev-e", cursor=cursor, wait_s=wait_s)
+    )
+    assert isinstance(answer, ReadEvaluation)
+    return answer
+
+
+def test_an_evaluation_plays_cases_outside_any_run() -> None:
+    rig = Rig()
+    assert ask(rig) == EvaluationStarted(evaluation="ev-e")
+    assert ask(rig) == EvaluationStarted(evaluation="ev-e")
+    assert "a worker that offers" in page(rig, 0).waits_for
+    session = rig.register()
+    rig.load()
+    session = rig.register()
+    rig.pass_time(5.0)
+    first, second = rig.poll(session)
+    assert first.job.episodes[0].policy_seed != second.job.episodes[0].policy_seed
+    rig.play(session, first)
+    assert (page(rig, 0).upto, page(rig, 0).finished, page(rig, 0).total) == (1, False, 2)
+    rig.play(session, second)
+    assert (page(rig, 1).upto, page(rig, 1).finished) == (2, True)
+    assert rig.row(EvaluationRow, "ev-e").finished
+    rig.load()
+    assert page(rig, 0).finished
+    assert not rig.core.groups
+
+
+def test_an_unknown_evaluation_is_refused() -> None:
+    rig = Rig()
+    answer = rig.tell(events.EvaluationPolled(request="p", evaluation="none", cursor=0, wait_s=0.0))
+    assert answer.status == "unknown_evaluation"
+
+
+def test_a_run_that_cannot_be_is_refused() -> None:
+    rig = Rig()
+    for wrong in (
+        {"budget": 0},
+        {"least": 0},
+        {"least": 5, "most": 4},
+        {"n_valid": 0},
+        {"n_held": 0},
+        {"least": 17, "most": 20},
+    ):
+        answer = rig.create("r9", **wrong)
+        assert answer.status == "bad_settings", wrong
+    assert not rig.rows
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_the_same_key_gives_the_same_run(again: bool) -> None:
+    rig = Rig()
+    first = rig.create("r1", key="same")
+    if again:
+        rig.load()
+    assert rig.create("r2", key="same") == first

@@ -1,0 +1,318 @@
+"""Leases: attempts, fencing, heartbeats, expiry, adoption, retries, suspects; and when nothing may expire."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from core_rig import Rig, done, outcome_of, result
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
+
+GROUP = "r1/s0/train"
+
+
+def one_job(*workers: str, slots: int = 2, **settings: Any) -> tuple[Rig, list[str], wire.Lease]:
+    """A rig in which the first worker holds the lease of the only job."""
+    rig = Rig(**settings)
+    sessions = [rig.register(worker, slots=slots) for worker in workers]
+    rig.create()
+    rig.submit(0)
+    (lease,) = rig.poll(sessions[0], slots)
+    return rig, sessions, lease
+
+
+def keep(rig: Rig, seconds: float, *beats: tuple[str, tuple[wire.Lease, ...]]) -> None:
+    """Let time pass while these workers beat with these leases."""
+    for _ in range(int(seconds / 2.0)):
+        for session, leases in beats:
+            rig.beat(session, *leases)
+        rig.pass_time(2.0)
+
+
+def test_a_lease_lives_as_long_as_heartbeats_name_it() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    keep(rig, 120.0, (first, (lease,)), (second, ()))
+    assert rig.core.jobs[f"{GROUP}/0"].lease is not None
+    assert rig.poll(second) == []
+
+
+def test_a_lease_of_a_silent_worker_goes_to_another_under_the_next_attempt() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    rig.beat(first, lease)
+    keep(rig, 18.0, (second, ()))
+    (again,) = rig.poll(second, wait_s=5.0)
+    assert (again.job, again.attempt) == (lease.job, lease.attempt + 1)
+    assert rig.core.jobs[f"{GROUP}/0"].failures == 1
+
+
+def test_a_worker_that_was_frozen_is_told_that_its_lease_is_gone() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    keep(rig, 20.0, (second, ()))
+    assert rig.beat(first, lease).cancelled == (lease.lease_id,)
+
+
+def test_a_result_of_an_expired_attempt_is_taken_while_the_job_is_open_and_stops_the_other() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    keep(rig, 18.0, (second, ()))
+    (again,) = rig.poll(second, wait_s=5.0)
+    assert isinstance(rig.play(first, lease, value=4.0), wire.HandInReply)
+    assert rig.row(OutcomeRow, GROUP, 0).attempt == lease.attempt
+    assert rig.beat(second, again).cancelled == (again.lease_id,)
+
+
+def test_a_late_limit_verdict_is_not_counted() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    keep(rig, 18.0, (second, ()))
+    rig.play(first, lease, failure="act_timeout")
+    assert rig.core.groups[GROUP].done == 0
+    (again,) = rig.poll(second, wait_s=5.0)
+    rig.play(second, again)
+    assert rig.row(OutcomeRow, GROUP, 0).outcome.failure is None
+
+
+def test_a_limit_verdict_in_time_is_a_result() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.pass_time(2.0)
+    rig.beat(first, lease)
+    rig.play(first, lease, failure="act_timeout")
+    failure = rig.row(OutcomeRow, GROUP, 0).outcome.failure
+    assert failure is not None
+    assert failure.category == "act_timeout"
+
+
+def test_a_limit_verdict_after_a_silence_is_played_again() -> None:
+    rig, _, lease = one_job("w1")
+    rig.load()
+    session = rig.register("w1")
+    rig.beat(session, lease)
+    used = PolicyFailure(category="oom", step_index=3, message="", limit=1.0, used=2.0)
+    episode = outcome_of(0)
+    rig.hand_in(
+        session,
+        result(lease, "done", episodes=(wire.EpisodeOutcome(**{**fields(episode), "failure": used}),)),
+    )
+    assert rig.core.groups[GROUP].done == 0
+    assert len(rig.poll(session, wait_s=1.0)) == 1
+
+
+def fields(outcome: Any) -> dict[str, Any]:
+    return {name: getattr(outcome, name) for name in outcome.__struct_fields__}
+
+
+def test_the_same_hand_in_twice_is_committed_once() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.play(first, lease, value=4.0)
+    assert isinstance(rig.play(first, lease, value=4.0), wire.HandInReply)
+    assert rig.row(SubmitRow, "r1", 0).mean_return == 4.0
+
+
+def test_a_different_result_of_a_done_episode_is_reported_as_nondeterminism() -> None:
+    rig = Rig()
+    first, second = rig.register("w1"), rig.register("w2")
+    rig.create()
+    rig.submit(0, 1)
+    leases = rig.poll(first, 2)
+    keep(rig, 18.0, (second, ()))
+    again = rig.poll(second, 2)
+    rig.play(second, *again, value=2.0)
+    assert rig.row(SubmitRow, "r1", 0).status is None  # one of the two backs off
+    (late,) = [lease for lease in leases if lease.job.job_id == again[0].job.job_id]
+    rig.play(first, late, value=2.0)
+    assert rig.core.runs["r1"].state.nondeterministic_results == 0
+    rig.play(first, late, value=3.0)
+    assert rig.core.runs["r1"].state.nondeterministic_results == 1
+
+
+def test_an_attempt_that_another_worker_was_given_is_ignored() -> None:
+    rig, (_, second), lease = one_job("w1", "w2")
+    rig.play(second, lease)
+    assert rig.core.groups[GROUP].done == 0
+    forged = result(lease, "done", episodes=(outcome_of(0),))
+    invented = wire.JobResult(**{**fields(forged), "attempt": 7, "lease_id": f"{GROUP}/0#7"})
+    rig.hand_in(second, invented)
+    assert rig.core.groups[GROUP].done == 0
+
+
+def test_a_lease_that_never_arrived_is_given_to_another_soon() -> None:
+    rig, (first, second), _ = one_job("w1", "w2")
+    rig.pass_time(16.0)
+    keep(rig, 10.0, (first, ()), (second, ()))
+    assert len(rig.poll(second)) == 1
+
+
+def test_after_the_loop_stood_still_nothing_expires_for_one_time_to_live() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.pass_time(1.0)
+    rig.now += 60.0
+    rig._carry_out(rig.core.handle_deadline(rig.now))
+    rig.pass_time(10.0)
+    assert rig.core.jobs[f"{GROUP}/0"].lease is not None
+    assert rig.beat(first, lease).cancelled == ()
+
+
+def test_a_liveliness_hint_is_no_proof() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.pass_time(20.0)  # past the start, when nothing expires
+    rig.beat(first, lease)
+    rig.tell(events.LivenessLost(worker="w1"))
+    rig.pass_time(2.0)
+    rig.beat(first, lease)
+    rig.pass_time(6.0)
+    assert rig.core.fleet.workers["w1"].state == "active"
+    rig.tell(events.LivenessLost(worker="w1"))
+    rig.pass_time(6.0)
+    assert rig.core.fleet.workers["w1"].state == "lost"
+
+
+def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_not() -> None:
+    rig = Rig()
+    first = rig.register("w1", slots=1)
+    rig.create()
+    rig.submit(0)
+    rig.play(first, *rig.poll(first, 1))
+    rig.work_off(first)
+    rig.core.runs["r1"].flow.episode_s = 0.01
+    rig.submit(1, 2, 3, key="k1")
+    leases = rig.poll(first, 1)
+    assert len(leases) == 3  # short episodes come in a batch
+    rig.tell(
+        events.HeartbeatReceived(
+            request="beat",
+            worker="w1",
+            session=first,
+            held=tuple(
+                wire.HeldLease(
+                    lease_id=each.lease_id,
+                    job_id=each.job.job_id,
+                    attempt=each.attempt,
+                    running=each is leases[0],
+                )
+                for each in leases
+            ),
+        )
+    )
+    second = rig.register("w2", slots=4)
+    keep(rig, 18.0, (second, ()))
+    alone = [job.job_id for job in rig.core.jobs.values() if job.alone]
+    assert alone == [leases[0].job.job_id]
+    got = rig.poll(second, 4, wait_s=5.0)
+    assert [each.job.job_id for each in got] == alone
+    assert rig.poll(second, 4) == []  # nothing beside it
+    rig.play(second, *got)
+    assert len(rig.poll(second, 4)) == 2
+
+
+def test_a_busy_worker_is_emptied_for_a_suspect() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    rig.beat(first, lease)
+    rig.create("r2")
+    rig.submit(0, 1, 2, 3, run="r2", key="x")
+    others = rig.poll(second, 2)
+    keep(rig, 18.0, (second, tuple(others)))
+    assert rig.poll(second, 2) == []  # the rest of r2 waits: the suspect is next
+    assert rig.core.fleet.workers["w2"].reserved is not None
+    rig.play(second, others[0])
+    assert rig.poll(second, 2) == []
+    rig.play(second, others[1])
+    assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
+
+
+def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_the_operator() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    rig.hand_in(first, result(lease, "failed", error="disk full"))
+    rig.pass_time(1.0)
+    assert rig.poll(first) == []
+    assert len(rig.poll(second)) == 1
+    assert rig.core.runs["r1"].state.infrastructure_retries == 1
+    assert rig.core.runs["r1"].ledger.reserved == 1
+
+
+def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
+    rig, (first,), lease = one_job("w1")
+    for _ in range(3):
+        rig.hand_in(first, result(lease, "failed"))
+        rig.pass_time(3.0)
+        rig.beat(first)
+        got = rig.poll(first)
+        if not got:
+            break
+        (lease,) = got
+    assert rig.core.fleet.workers["w1"].benched_until > rig.now
+    for _ in range(4):
+        rig.pass_time(2.0)
+        rig.beat(first)
+    assert len(rig.poll(first, wait_s=3.0)) == 1
+
+
+def test_a_job_given_back_is_no_failure() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.hand_in(first, result(lease, "returned"))
+    (again,) = rig.poll(first)
+    assert again.attempt == 2
+    assert rig.core.runs["r1"].state.infrastructure_retries == 0
+
+
+def test_leases_are_adopted_after_a_restart_and_played_once() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.load()
+    assert rig.beat(first, lease).status == "unknown_worker"
+    session = rig.register("w1")
+    assert rig.poll(session) == []  # what may be running waits for who claims it
+    assert rig.beat(session, lease).cancelled == ()
+    rig.pass_time(8.0)
+    rig.beat(session, lease)
+    assert rig.poll(session) == []
+    rig.play(session, lease, value=6.0)
+    assert rig.row(SubmitRow, "r1", 0).mean_return == 6.0
+
+
+def test_what_nobody_claims_after_a_restart_is_leased_under_a_higher_attempt() -> None:
+    rig, _, lease = one_job("w1")
+    rig.load()
+    session = rig.register("w2")
+    rig.pass_time(5.0)
+    (again,) = rig.poll(session)
+    assert again.attempt == 1_000_001 > lease.attempt
+    assert again.job == lease.job
+
+
+def test_a_result_that_outlives_the_coordinator_is_taken() -> None:
+    rig, _, lease = one_job("w1")
+    rig.load()
+    session = rig.register("w1")
+    rig.play(session, lease, value=6.0)
+    assert rig.row(OutcomeRow, GROUP, 0).outcome.episode_return == 6.0
+
+
+def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest() -> None:
+    rig = Rig()
+    first = rig.register("w1")
+    rig.create()
+    rig.submit(0, 1)
+    lease, other = rig.poll(first, 2)
+    keep(rig, 16.0, (first, (lease, other)))
+    again = rig.register("w1")
+    for _ in range(3):
+        rig.beat(again, lease)
+        rig.pass_time(2.0)
+    assert rig.core.jobs[lease.job.job_id].lease is not None
+    assert rig.core.jobs[other.job.job_id].lease is None
+    assert rig.hand_in(first, done(lease)).status == "unknown_worker"
+
+
+def test_a_held_back_heartbeat_is_answered_at_once_when_a_lease_is_to_stop() -> None:
+    rig, (first,), lease = one_job("w1")
+    assert rig.beat(first, lease, wait_s=5.0) is None
+    request = rig._requests
+    rig.tell(events.RunCancelled(request="cancel", run="r1"))
+    assert rig.replies[request].cancelled == (lease.lease_id,)
+
+
+def test_a_job_that_is_played_for_ever_is_taken_away() -> None:
+    rig, (first, second), lease = one_job("w1", "w2", job_deadline_s=100.0)
+    keep(rig, 900.0, (first, (lease,)), (second, ()))
+    assert lease.lease_id in rig.beat(first, lease).cancelled
+    assert len(rig.poll(second)) == 1

@@ -1,0 +1,238 @@
+"""Who gets what: priorities, fair share, batches, warmth, preemption, placement, drain."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from core_rig import BUNDLE, Rig, result, split_of
+
+from evopolicy_common.messages import operator
+from evopolicy_coordinator.core import events
+
+
+def validating(rig: Rig, session: str, n: int = 1) -> None:
+    """Bring run r1 to where its early validation waits."""
+    rig.create(n_valid=8)
+    rig.submit(*range(n))
+    for _ in range(n):
+        (lease,) = rig.poll(session, 1)
+        rig.play(session, lease)
+
+
+def test_train_goes_before_early_validation_of_any_run() -> None:
+    rig = Rig()
+    session = rig.register(slots=4)
+    validating(rig, session)
+    rig.create("r2")
+    rig.submit(0, 1, run="r2", key="x")
+    splits = [split_of(lease.job) for lease in rig.poll(session, 4)]
+    assert splits == ["train", "train", "validation", "validation"]
+
+
+def test_a_closed_runs_validation_goes_before_early_validation() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    validating(rig, session)
+    rig.create("r2")
+    rig.submit(0, run="r2", key="x")
+    rig.play(session, *rig.poll(session, 1))
+    rig.close("r2")
+    assert rig.poll(session, 1)[0].job.job_id.startswith("r2/")
+
+
+def test_two_runs_share_the_slots_whatever_they_have_waiting() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    rig.create("r1", budget=64, most=64)
+    rig.create("r2", budget=64, most=64)
+    rig.submit(*range(40), run="r1")
+    rig.submit(*range(8), run="r2", key="x")
+    got: Counter[str] = Counter()
+    for _ in range(8):
+        leases = rig.poll(session, 2)
+        got.update(lease.job.job_id.split("/")[0] for lease in leases)
+        rig.play(session, *leases)
+    assert got == {"r1": 8, "r2": 8}
+
+
+def test_a_run_that_was_idle_earns_nothing_by_it() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    rig.create("r1", budget=64, most=64)
+    rig.submit(*range(40), run="r1")
+    for _ in range(10):
+        rig.play(session, *rig.poll(session, 2))
+    rig.create("r2", budget=64, most=64)
+    rig.submit(*range(20), run="r2", key="x")
+    got: Counter[str] = Counter()
+    for _ in range(5):
+        leases = rig.poll(session, 2)
+        got.update(lease.job.job_id.split("/")[0] for lease in leases)
+        rig.play(session, *leases)
+    assert abs(got["r1"] - got["r2"]) <= 2
+
+
+def test_a_submit_spreads_over_all_waiting_workers() -> None:
+    rig = Rig()
+    sessions = [rig.register(f"w{index}", slots=2) for index in range(3)]
+    rig.create()
+    for session in sessions:
+        assert rig.poll(session, 4, wait_s=9.0) is None
+    requests = list(range(rig._requests - 2, rig._requests + 1))
+    rig.submit(*range(6))
+    given = [len(rig.replies[request].leases) for request in requests]
+    assert given == [2, 2, 2]
+
+
+def test_short_episodes_come_in_batches_and_no_idle_worker_goes_without() -> None:
+    rig = Rig()
+    first, second = rig.register("w1", slots=1), rig.register("w2", slots=1)
+    rig.create(budget=128, most=128)
+    rig.core.runs["r1"].flow.episode_s = 0.005
+    rig.submit(*range(20))
+    assert len(rig.poll(first, 2)) == 10  # half of what waits, for half of the slots
+    assert len(rig.poll(second, 2)) > 1
+
+
+def test_long_episodes_are_leased_to_free_slots_only() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    rig.create()
+    rig.submit(*range(8))
+    leases = rig.poll(session, 4)
+    assert len(leases) == 2
+    assert rig.poll(session, 2, wait_s=9.0) is None
+    request = rig._requests
+    rig.play(session, leases[0])
+    assert len(rig.replies[request].leases) == 1
+
+
+def test_new_work_goes_to_the_worker_that_has_its_bundle_warm() -> None:
+    rig = Rig()
+    cold, warm = rig.register("w1"), rig.register("w2")
+    rig.create()
+    rig.poll(cold, 2, wait_s=9.0)
+    rig.poll(warm, 2, wait_s=9.0, warm_bundles=(BUNDLE,))
+    request = rig._requests
+    rig.submit(0)
+    assert len(rig.replies[request].leases) == 1
+
+
+def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_back_later() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    validating(rig, session)
+    (hidden,) = rig.poll(session, 1)
+    assert rig.beat(session, hidden, wait_s=9.0) is None
+    request = rig._requests
+    rig.submit(5, key="k1")
+    assert rig.replies[request].cancelled == (hidden.lease_id,)
+    rig.hand_in(session)
+    (train,) = rig.poll(session, 1)
+    assert split_of(train.job) == "train"
+    rig.play(session, train)
+    assert split_of(rig.poll(session, 1)[0].job) == "validation"
+    assert rig.core.runs["r1"].state.infrastructure_retries == 0
+
+
+def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
+    rig = Rig(preemptions_max=2)
+    session = rig.register(slots=1)
+    rig.create(n_valid=1, n_held=1)
+    rig.submit(0)
+    rig.work_off(session)
+    rig.close()
+    rig.create("r2")
+    stopped = 0
+    (hidden,) = rig.poll(session, 1)
+    for index in range(10):
+        rig.submit(0, run="r2", key=f"x{index}", bundle=f"{index}" * 64)
+        reply = rig.beat(session, hidden)
+        stopped += bool(reply.cancelled)
+        rig.hand_in(session, result(hidden, "returned" if reply.cancelled else "done", episodes=()))
+        while hidden is not None:
+            hidden = next(iter(rig.poll(session, 1)), None)
+            if hidden is None or hidden.job.job_id.startswith("r1/"):
+                break
+            rig.play(session, hidden)
+        if hidden is None:
+            break
+    assert stopped >= 2
+    assert all(job.preemptions <= 2 for job in rig.core.jobs.values() if job.group.run == "r1")
+
+
+def test_a_worker_gets_only_what_it_can_play() -> None:
+    rig = Rig()
+    rig.register("w1", envs=("toy/line",))
+    other = rig.register("w2", envs=("toy/maze",))
+    weak = rig.register("w3", tiers=("none",))
+    rig.create()
+    rig.submit(0)
+    assert rig.poll(other) == []
+    assert rig.poll(weak) == []
+
+
+def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise() -> None:
+    rig = Rig()
+    rig.register("w1", version="1")
+    rig.create()
+    rig.submit(0)
+    other = rig.register("w2", version="2")
+    assert rig.poll(other) == []
+    rig.pass_time(20.0)
+    rig.beat(other)
+    (run,) = rig.core.status(rig.now).runs
+    assert "same versions" in run.waits_for
+    worker = next(each for each in rig.core.status(rig.now).workers if each.worker == "w2")
+    assert "r1" in worker.refused
+    named = worker.fingerprint
+    wrong = rig.tell(events.RunRepinned(request="a", run="r1", fingerprint_class="nope", reason="x"))
+    assert wrong.status == "unknown_class"
+    rig.tell(
+        events.RunRepinned(request="b", run="r1", fingerprint_class=named, reason="the old host is gone")
+    )
+    assert len(rig.poll(other)) == 1
+    assert "the old host is gone" in rig.core.runs["r1"].state.overrides[0]
+
+
+def test_a_draining_worker_gets_no_more_work_also_after_a_restart() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    rig.submit(0, 1)
+    (lease, _) = rig.poll(session, 2)
+    answer = rig.tell(events.WorkerStateSet(request="drain", worker="w1", state="draining"))
+    assert isinstance(answer, operator.Done)
+    assert rig.beat(session, lease).drain
+    rig.play(session, lease)
+    assert rig.poll(session, 1) == []
+    rig.load()
+    session = rig.register()
+    rig.pass_time(5.0)
+    assert rig.beat(session).drain
+    assert rig.poll(session) == []
+    rig.tell(events.WorkerStateSet(request="back", worker="w1", state="active"))
+    assert len(rig.poll(session)) == 1
+
+
+def test_a_second_poll_answers_the_first_with_no_leases() -> None:
+    rig = Rig()
+    session = rig.register()
+    assert rig.poll(session, wait_s=9.0) is None
+    first = rig._requests
+    rig.poll(session, wait_s=9.0)
+    assert rig.replies[first].leases == ()
+    rig.pass_time(10.0)
+    assert len(rig.core.timers) == 1  # the worker's own
+
+
+def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
+    rig = Rig(stall_s=10.0)
+    rig.register(envs=("toy/line",))
+    rig.create()
+    rig.submit(0)
+    rig.pass_time(40.0)
+    (stall,) = rig.core.status(rig.now).stalls
+    assert "r1/s0/train" in stall
+    assert "a worker that offers toy/line" in stall
+    assert rig.core.story("r1/s0/train")

@@ -1,0 +1,201 @@
+"""Submits: what is refused, what is charged, the gate at index 0, verdicts, long polls, idempotency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from core_rig import BUNDLE, Rig, done, outcome_of, result
+
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
+from evopolicy_common.messages.worker import Refused
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import ReadResults
+from evopolicy_coordinator.core.records import SubmitRow
+
+
+def started(**settings: Any) -> tuple[Rig, str]:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create(**settings)
+    return rig, session
+
+
+@pytest.mark.parametrize(
+    ("ids", "status"),
+    [
+        ((), "budget_invalid"),
+        ((64,), "invalid_env_instance"),
+        ((-1,), "invalid_env_instance"),
+        ((0,) * 17, "budget_invalid"),
+    ],
+)
+def test_rejected_request_costs_no_budget(ids: tuple[int, ...], status: str) -> None:
+    rig, _ = started()
+    answer = rig.submit(*ids)
+    assert isinstance(answer, Refused)
+    assert answer.status == status
+    state = rig.tell(events.StateRequested(request="state", run="r1")).state
+    assert (state.remaining_budget, state.n_submits) == (16, 0)
+    assert not [row for row in rig.rows.values() if isinstance(row, SubmitRow)]
+
+
+def test_the_same_key_gives_the_same_submit_and_another_request_under_it_a_conflict() -> None:
+    rig, session = started()
+    first = rig.submit(0, 1)
+    assert rig.submit(0, 1) == first
+    rig.work_off(session)
+    rig.load()
+    assert rig.submit(0, 1) == first
+    assert rig.submit(0, 2).status == "key_conflict"
+    assert rig.submit(0, 1, bundle="b" * 64).status == "key_conflict"
+
+
+def test_a_second_submit_while_one_runs_is_refused_and_names_the_first() -> None:
+    rig, _ = started()
+    rig.submit(0)
+    answer = rig.submit(1, key="k1")
+    assert (answer.status, "submit 0" in answer.message) == ("busy", True)
+
+
+def test_a_run_without_a_worker_waits_to_be_opened() -> None:
+    rig = Rig()
+    rig.create()
+    assert rig.tell(events.RunOpened(request="early", run="r1")).status == "no_worker"
+    rig.register()
+    assert isinstance(rig.tell(events.RunOpened(request="late", run="r1")), gateway.RunOpened)
+
+
+def test_nothing_is_released_before_the_episode_at_index_0_shows_a_policy() -> None:
+    rig, session = started()
+    rig.submit(0, 1, 2)
+    leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
+    rig.play(session, leases[1])
+    assert rig.results().upto == 0
+    poll = rig.request()
+    waiting = events.ResultsRequested(request=poll, run="r1", submit_index=0, cursor=0, wait_s=9.0)
+    assert rig.tell(waiting) is None
+    rig.play(session, leases[0])
+    page = rig.replies[poll]
+    assert isinstance(page, ReadResults)
+    assert page.upto == 2
+
+
+def test_a_bundle_without_a_policy_ends_the_submit_with_its_verdict_and_is_charged_in_full() -> None:
+    rig, session = started()
+    rig.submit(0, 1, 2)
+    leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
+    rig.play(session, leases[1], failure="import_error")
+    assert rig.row(SubmitRow, "r1", 0).status is None
+    rig.play(session, leases[0], failure="import_error")
+    row = rig.row(SubmitRow, "r1", 0)
+    assert (row.status, row.released, row.n_kept, row.mean_return) == ("import_error", 0, 0, None)
+    assert row.failure is not None
+    assert rig.core.runs["r1"].ledger.settled == 3
+    reply = rig.beat(session, leases[2])
+    assert reply.cancelled == (leases[2].lease_id,)
+
+
+def test_a_later_episode_without_a_policy_is_only_that_episodes_failure() -> None:
+    rig, session = started()
+    rig.submit(0, 1)
+    for lease in rig.poll(session, 8):
+        rig.play(session, lease, failure="init_error" if lease.job.episodes[0].index else None)
+    assert rig.row(SubmitRow, "r1", 0).status == "ok"
+
+
+def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
+    rig, _ = started()
+    failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
+    answer = rig.submit(0, 1, bundle=None, bundle_error=failure)
+    assert answer.remaining_budget == 14
+    row = rig.row(SubmitRow, "r1", 0)
+    assert (row.status, row.failure, rig.core.runs["r1"].ledger.settled) == ("missing_policy", failure, 2)
+    assert rig.results().upto == 0
+    assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
+
+
+def test_three_strikes_quarantine_a_bundle_and_a_lost_worker_is_none() -> None:
+    rig, session = started()
+    rig.submit(0)
+    for strike in range(3):
+        assert rig.row(SubmitRow, "r1", 0).status is None, strike
+        rig.pass_time(60.0)
+        session = rig.register(slots=8)
+        (lease,) = rig.poll(session, 1, wait_s=1.0)
+        rig.hand_in(session, result(lease, "slot_died", error="oops"))
+    row = rig.row(SubmitRow, "r1", 0)
+    assert row.status == "quarantined"
+    assert row.failure is not None
+    assert "3 attempts" in row.failure.message
+
+
+def test_a_strike_survives_a_restart() -> None:
+    rig, session = started()
+    rig.submit(0)
+    (lease,) = rig.poll(session, 1)
+    rig.hand_in(session, result(lease, "slot_died"))
+    rig.load()
+    assert len(rig.core.groups["r1/s0/train"].strikes) == 1
+
+
+def test_a_limit_on_the_whole_submit_keeps_the_episodes_before_the_first_unfinished() -> None:
+    rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
+    rig.pass_time(20.0)
+    rig.beat(session)
+    rig.submit(0, 1, 2, 3)
+    leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
+    rig.play(session, leases[0], leases[1], leases[3])
+    for _ in range(10):
+        rig.pass_time(4.0)
+        rig.beat(session, leases[2])
+    row = rig.row(SubmitRow, "r1", 0)
+    assert (row.status, row.n_kept, row.released) == ("rollout_timeout", 2, 3)
+
+
+def test_scope_submit_is_one_job_and_hidden_cases_come_in_chunks_of_the_same_length() -> None:
+    rig, session = started(policy_scope="submit", n_valid=5)
+    rig.submit(4, 4, 9)
+    (lease,) = rig.poll(session, 8)
+    assert [spec.case.seed for spec in lease.job.episodes] == [4, 4, 9]
+    assert len({spec.policy_seed for spec in lease.job.episodes}) == 3
+    rig.hand_in(session, done(lease))
+    hidden = rig.poll(session, 8)
+    assert [[spec.episode_index for spec in each.job.episodes] for each in hidden] == [[0, 1, 2], [0, 1]]
+    assert {each.job.record for each in hidden} == {"actions"}
+    assert all(each.job.env_meta == lease.job.env_meta for each in hidden)
+
+
+def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
+    rig, session = started()
+    rig.submit(0)
+    bad = [
+        (outcome_of(1),),
+        (),
+        (outcome_of(0, float("nan")),),
+        (outcome_of(0), outcome_of(0)),
+    ]
+    for episodes in bad:
+        rig.pass_time(10.0)
+        rig.beat(session)
+        (lease,) = rig.poll(session, 1, wait_s=0.5)
+        rig.hand_in(session, result(lease, "done", episodes=episodes))
+        assert rig.core.groups["r1/s0/train"].done == 0
+    assert rig.core.runs["r1"].state.infrastructure_retries == 4
+
+
+def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None:
+    rig, session = started()
+    rig.submit(0, 1)
+    (first, _) = rig.poll(session, 2)
+    waiting = events.ResultsRequested(request="page", run="r1", submit_index=0, cursor=0, wait_s=9.0)
+    assert rig.tell(waiting) is None
+    rig.tell(events.RunCancelled(request="cancel", run="r1"))
+    assert isinstance(rig.replies["page"], ReadResults)
+    assert (rig.finished().status, rig.finished().budget_used) == ("cancelled", 0)
+    assert rig.row(SubmitRow, "r1", 0).refunded
+    assert rig.beat(session, first).cancelled == (first.lease_id,)
+    assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_finished"
+    state = rig.tell(events.StateRequested(request="state", run="r1")).state
+    assert (state.is_finalized, state.remaining_budget) == (True, 16)
