@@ -29,12 +29,12 @@ WHEEL_BASE = 3.2
 LOOK_AHEAD_S, LOOK_AHEAD_MIN = 0.22, 7.0
 """The point to steer for is as far as the car goes in this time, and no nearer than this (units)."""
 STEER_GAIN = 1.6
-GRIP = 75.0
+GRIP = 150.0
 """Sideways acceleration that bends are taken with (units/s²)."""
 BRAKING = 35.0
 """Deceleration that is counted on (units/s²)."""
 TOP_SPEED = 62.0
-GAS, BRAKE = 0.6, 0.5
+GAS, BRAKE = 0.9, 0.5
 
 
 class Policy:

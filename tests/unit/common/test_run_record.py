@@ -20,7 +20,28 @@ from evopolicy_common.run_record import (
 )
 from evopolicy_common.summary import Summary, decode_summary, encode_summary, utc_text
 
-FIELDS = ["schema_version", "submit_index", "env", "status", "n_episodes", "first_global_episode", "env_instances", "remaining_budget", "submit_started_at", "submit_completed_at", "wall_time_seconds", "returns", "mean_return", "std_return", "min_return", "max_return", "episode_lengths", "mean_episode_length", "timeouts", "errors"]
+FIELDS = [
+    "schema_version",
+    "submit_index",
+    "env",
+    "status",
+    "n_episodes",
+    "first_global_episode",
+    "env_instances",
+    "remaining_budget",
+    "submit_started_at",
+    "submit_completed_at",
+    "wall_time_seconds",
+    "returns",
+    "mean_return",
+    "std_return",
+    "min_return",
+    "max_return",
+    "episode_lengths",
+    "mean_episode_length",
+    "timeouts",
+    "errors",
+]
 
 NOT_OK = Summary(
     schema_version=1,

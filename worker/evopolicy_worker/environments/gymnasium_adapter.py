@@ -22,6 +22,7 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker.environments import settings, spaces
+from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.info import plain_info
@@ -88,10 +89,15 @@ class GymnasiumFamily:
 class GymnasiumEnvironment(Environment):
     """One Gymnasium environment of a family. Made fresh again for a case where reuse could show."""
 
-    def __init__(self, entry: Entry, family: GymnasiumFamily, *, render: bool = False) -> None:
+    def __init__(
+        self, entry: Entry, family: GymnasiumFamily, *, render: bool = False, accelerations: bool = False
+    ) -> None:
         self._entry = entry
         self._family = family
         self._render = render
+        self._accelerate = accelerations
+        self.accelerations: tuple[str, ...] = ()
+        """Names of those in use."""
         settings.apply(render=render)
         with _quiet():
             family.load()
@@ -157,6 +163,8 @@ class GymnasiumEnvironment(Environment):
         while type(env).__name__ in _PLAIN_WRAPPERS:
             self._limit = min(self._limit, getattr(env, "_max_episode_steps", None) or self._limit)
             env = env.env  # type: ignore[attr-defined]
+        if self._accelerate:
+            self.accelerations = tuple(accelerate(str(self._entry.gymnasium_id), env))
         self._env = env
 
 

@@ -13,6 +13,7 @@ from typing import cast
 from evopolicy_common.catalogue import Entry, entries, entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_worker.environments import settings
 from evopolicy_worker.environments.base import Environment
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
 
@@ -31,9 +32,10 @@ _FAMILIES: tuple[tuple[str, str], ...] = (
 """Pattern over suite ids, and the family's module; the first that matches counts."""
 
 
-def make(env_id: str, *, render: bool = False) -> Environment:
+def make(env_id: str, *, render: bool = False, accelerations: bool | None = None) -> Environment:
     """A new environment, ready for its first `reset`. The first of a family imports its simulator.
 
+    `accelerations`: faster ways to the same episode; None is what the process environment says, on by default.
     ConfigError for an id that the catalogue does not have; WorkerError for one whose packages are not installed.
     """
     found = entry(env_id)
@@ -47,7 +49,9 @@ def make(env_id: str, *, render: bool = False) -> Environment:
         raise WorkerError(
             f"{env_id} needs {' and '.join(family.distributions)}: install the extra `evopolicy[worker]`"
         )
-    return GymnasiumEnvironment(found, family, render=render)
+    if accelerations is None:
+        accelerations = settings.accelerations_on()
+    return GymnasiumEnvironment(found, family, render=render, accelerations=accelerations)
 
 
 def describe(env_id: str) -> EnvironmentDescription:

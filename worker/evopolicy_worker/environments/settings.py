@@ -30,14 +30,28 @@ _ONLY_AT_START = {"PYTHONHASHSEED", "LC_ALL", "TZ"}
 """Read once by a starting interpreter or C library: setting them later would only confuse children."""
 
 
-def process_environment(*, render: bool = False) -> dict[str, str]:
-    """Variables that a slot process is started with. `render=True` also selects MuJoCo's off-screen renderer."""
+_ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"
+"""`off` makes every environment play as its library does it; anything else, or nothing, leaves accelerations on."""
+
+
+def process_environment(*, render: bool = False, accelerations: bool | None = None) -> dict[str, str]:
+    """Variables that a slot process is started with. `render=True` also selects MuJoCo's off-screen renderer.
+
+    `accelerations`: whether `make` uses them in that process; None is as in this process.
+    """
     variables = dict(_ALWAYS)
+    wanted = accelerations_on() if accelerations is None else accelerations
+    variables[_ACCELERATIONS] = "on" if wanted else "off"
     if render:
         # Without it the second MuJoCo environment that draws aborts the process.
         variables["MUJOCO_GL"] = "egl"
         variables["PYOPENGL_PLATFORM"] = "egl"
     return variables
+
+
+def accelerations_on() -> bool:
+    """Whether this process's environment has accelerations on, which is the default."""
+    return os.environ.get(_ACCELERATIONS, "on").strip().lower() not in ("off", "0", "false", "no")
 
 
 def apply(*, render: bool = False) -> None:

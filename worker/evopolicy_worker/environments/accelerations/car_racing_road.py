@@ -1,0 +1,145 @@
+"""CarRacing: only what can be seen of the road and the grass is transformed and drawn.
+
+Replaces `CarRacing._render_road`. The library transforms all of some 700 polygons in Python, draws those within a
+generous distance of the canvas, and paints the background as a polygon that is larger than the canvas. Here:
+- a polygon is left out when all of its vertices lie beyond one side of the visible part, by more than MARGIN pixels:
+  each of its edges is then rejected by the drawing routine, and its interior has no visible pixel. Most are found
+  by their bounding circles, estimated in numpy with an error far below a pixel, the rest by their vertices;
+- vertices of the others are computed by the library's operations in its order, and drawn by its calls, in its order;
+- the background is filled instead of drawn as a polygon where that polygon covers the canvas.
+Serves pictures for people too: they are drawn on the same canvas, under the same panel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium.envs.box2d.car_racing import (
+    GRASS_DIM,
+    MAX_SHAPE_DIM,
+    PLAYFIELD,
+    WINDOW_H,
+    WINDOW_W,
+    CarRacing,
+)
+from numpy.typing import NDArray
+from pygame import gfxdraw
+from pygame.math import Vector2
+
+from evopolicy_worker.environments.accelerations.car_racing_view import (
+    MARGIN,
+    PANEL_ROWS,
+    ROAD_ROWS,
+    VISIBLE,
+    covers,
+)
+from evopolicy_worker.environments.accelerations.specialise import specialise
+
+_LEFT, _RIGHT = -MARGIN, WINDOW_W + MARGIN
+_TOP, _BOTTOM = PANEL_ROWS - MARGIN, WINDOW_H + MARGIN
+_FAR_RIGHT, _FAR_BOTTOM = WINDOW_W + MAX_SHAPE_DIM, WINDOW_H + MAX_SHAPE_DIM
+"""The library's own bounds, within which one of the vertices must be."""
+
+
+def _grass() -> list[list[tuple[float, float]]]:
+    """The library's patches, in its order."""
+    return [
+        [
+            (GRASS_DIM * x + GRASS_DIM, GRASS_DIM * y + 0),
+            (GRASS_DIM * x + 0, GRASS_DIM * y + 0),
+            (GRASS_DIM * x + 0, GRASS_DIM * y + GRASS_DIM),
+            (GRASS_DIM * x + GRASS_DIM, GRASS_DIM * y + GRASS_DIM),
+        ]
+        for x in range(-20, 20, 2)
+        for y in range(-20, 20, 2)
+    ]
+
+
+class _Polygons:
+    """Polygons of four vertices in world coordinates, and the circles around them."""
+
+    def __init__(self, polygons: list[Any]) -> None:
+        self.vertices = [[Vector2(vertex) for vertex in polygon] for polygon in polygons]
+        corners = np.array([list(polygon) for polygon in polygons], dtype=np.float64)
+        centres = corners.mean(axis=1)
+        self._x: NDArray[np.float64] = np.ascontiguousarray(centres[:, 0])
+        self._y: NDArray[np.float64] = np.ascontiguousarray(centres[:, 1])
+        self._radius: NDArray[np.float64] = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
+
+    def near(self, zoom: float, translation: tuple[float, float], angle: float) -> list[int]:
+        """Indices of those whose circles reach the visible part of the canvas, ascending."""
+        cos, sin = zoom * math.cos(angle), zoom * math.sin(angle)
+        reach = self._radius * zoom + MARGIN
+        x = self._x * cos - self._y * sin + (translation[0] - WINDOW_W / 2)
+        y = self._x * sin + self._y * cos + (translation[1] - PANEL_ROWS - ROAD_ROWS / 2)
+        inside = (np.abs(x) < reach + WINDOW_W / 2) & (np.abs(y) < reach + ROAD_ROWS / 2)
+        found: list[int] = np.flatnonzero(inside).tolist()
+        return found
+
+
+_GRASS = _Polygons(_grass())
+
+
+class VisibleRoad(CarRacing):
+    """Keeps the polygons of the present track in a form in which they are quickly sorted out."""
+
+    _tiles: _Polygons
+    _tiles_of: Any = None
+    """The `road_poly` of which `_tiles` are; a reset makes a new list."""
+
+    def _render_road(self, zoom: float, translation: Any, angle: float) -> None:
+        if self._tiles_of is not self.road_poly:
+            self._tiles = _Polygons([polygon for polygon, _ in self.road_poly])
+            self._tiles_of = self.road_poly
+        surface: Any = self.surf
+        if covers(zoom, translation, angle):
+            surface.fill(self.bg_color, VISIBLE)
+        else:
+            field = [
+                (PLAYFIELD, PLAYFIELD),
+                (PLAYFIELD, -PLAYFIELD),
+                (-PLAYFIELD, -PLAYFIELD),
+                (-PLAYFIELD, PLAYFIELD),
+            ]
+            self._draw_colored_polygon(surface, field, self.bg_color, zoom, translation, angle, clip=False)
+        for index in _GRASS.near(zoom, translation, angle):
+            _draw(surface, _GRASS.vertices[index], self.grass_color, zoom, translation, angle)
+        tiles = self._tiles
+        for index in tiles.near(zoom, translation, angle):
+            # A tile's color changes when the car touches it.
+            color = [int(c) for c in self.road_poly[index][1]]
+            _draw(surface, tiles.vertices[index], color, zoom, translation, angle)
+
+
+def _draw(
+    surface: Any,
+    vertices: list[Vector2],
+    color: Any,
+    zoom: float,
+    translation: tuple[float, float],
+    angle: float,
+) -> None:
+    """The library's `_draw_colored_polygon`, less what cannot be seen."""
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = polygon = [
+        (turned[0] * zoom + translation[0], turned[1] * zoom + translation[1])
+        for turned in [vertex.rotate_rad(angle) for vertex in vertices]
+    ]
+    if (
+        (x0 < _LEFT and x1 < _LEFT and x2 < _LEFT and x3 < _LEFT)
+        or (x0 > _RIGHT and x1 > _RIGHT and x2 > _RIGHT and x3 > _RIGHT)
+        or (y0 < _TOP and y1 < _TOP and y2 < _TOP and y3 < _TOP)
+        or (y0 > _BOTTOM and y1 > _BOTTOM and y2 > _BOTTOM and y3 > _BOTTOM)
+    ):
+        return
+    if any(
+        -MAX_SHAPE_DIM <= x <= _FAR_RIGHT and -MAX_SHAPE_DIM <= y <= _FAR_BOTTOM for x, y in polygon
+    ):
+        gfxdraw.aapolygon(surface, polygon, color)
+        gfxdraw.filled_polygon(surface, polygon, color)
+
+
+def accelerate(env: Any) -> None:
+    """Draw the road of this bare CarRacing environment faster."""
+    specialise(env, VisibleRoad)

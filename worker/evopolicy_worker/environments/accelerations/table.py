@@ -1,0 +1,84 @@
+"""Which accelerations there are, of which environments, and the versions of the libraries they were proved on.
+
+This module imports no simulator, and an acceleration's own module is imported only when its versions fit.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import structlog
+
+log = structlog.get_logger(__name__)
+
+PROVED: Mapping[str, tuple[str, ...]] = {
+    "gymnasium": ("1.4.0",),
+    "highway-env": ("1.12.1",),
+    "minigrid": ("3.2.0",),
+    "numpy": ("2.4.6",),
+    "pygame-ce": ("2.5.8",),
+}
+"""Versions with which the exhaustive comparison was run and found no difference, by distribution."""
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """One replacement: a module of this package whose `accelerate(env)` changes that bare Gymnasium environment."""
+
+    name: str
+    """The module's name."""
+    gymnasium_ids: tuple[str, ...]
+    distributions: tuple[str, ...]
+    """Whose versions must be among the proved ones."""
+
+    def serves(self, gymnasium_id: str) -> bool:
+        return gymnasium_id in self.gymnasium_ids
+
+    def apply(self, env: Any) -> None:
+        module = importlib.import_module(f"{__package__}.{self.name}")
+        module.accelerate(env)
+
+
+ACCELERATIONS: tuple[Acceleration, ...] = (
+    Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
+    Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
+)
+"""In the order of application."""
+
+_told: set[str] = set()
+
+
+def accelerate(gymnasium_id: str, env: Any) -> list[str]:
+    """Apply to a bare environment all accelerations that serve it and are usable; their names, in order."""
+    applied = []
+    for acceleration in ACCELERATIONS:
+        if acceleration.serves(gymnasium_id) and usable(acceleration):
+            acceleration.apply(env)
+            applied.append(acceleration.name)
+    return applied
+
+
+def usable(acceleration: Acceleration) -> bool:
+    """Whether the installed versions are proved ones; a warning, once per acceleration, when they are not."""
+    installed = {name: _version(name) for name in acceleration.distributions}
+    unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
+    if unproved and acceleration.name not in _told:
+        _told.add(acceleration.name)
+        log.warning(
+            "acceleration is off: not proved with the installed version",
+            acceleration=acceleration.name,
+            installed=unproved,
+            proved={name: PROVED[name] for name in unproved},
+        )
+    return not unproved
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "none"
