@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import signal
 from collections.abc import AsyncIterator, Mapping
@@ -13,6 +12,7 @@ from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
 from evopolicy_gateway.leash import leashed
 
 _CHUNK = 64 << 10
+_LAST_WORDS_S = 1.0
 
 
 class AgentProcess:
@@ -76,10 +76,13 @@ class AgentProcess:
 
     async def close(self) -> None:
         """Stops reading; to be called when the program is gone."""
+        # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+        await asyncio.wait([self._stderr], timeout=_LAST_WORDS_S)
         self._stderr.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._stderr
+        await asyncio.gather(self._stderr, return_exceptions=True)
         self.hang_up()
+        # asyncio closes the pipes of a process only when all their other ends are closed.
+        self._process._transport.close()  # type: ignore[attr-defined]
 
     async def _drain_stderr(self) -> None:
         assert self._process.stderr is not None

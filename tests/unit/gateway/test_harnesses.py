@@ -1,0 +1,176 @@
+"""Agents by name, and the turn protocol with real programs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.harnesses import entry_name, make
+from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
+from evopolicy_gateway.harnesses.agent_process import environment_of
+from evopolicy_gateway.harnesses.base import AgentError, Ending, Stage
+from evopolicy_gateway.harnesses.command import CommandHarness
+
+PATIENCE_S = 30.0
+
+
+def play(tmp_path: Path, code: str) -> tuple[Ending, list[dict[str, Any]], list[tuple[int, str]]]:
+    """How a Python program with that code ended, its log, and what it said."""
+    turns: list[tuple[int, str]] = []
+    log = AgentLog(tmp_path / "logs" / "agent.jsonl")
+    stage = Stage(
+        workspace=tmp_path,
+        urls={"EVOPOLICYGYM_INFO_URL": "http://127.0.0.1:9/nobody"},
+        environment=environment_of({"EVOPOLICYGYM_INFO_URL": "u"}),
+        log=log,
+        on_turn=lambda turn, text: turns.append((turn, text)),
+    )
+
+    async def main() -> Ending:
+        async with asyncio.timeout(PATIENCE_S):
+            return await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
+
+    ending = asyncio.run(main())
+    log.close()
+    lines = (tmp_path / "logs" / "agent.jsonl").read_text().splitlines()
+    return ending, [json.loads(line) for line in lines], turns
+
+
+def test_a_program_that_never_reads_plays_until_it_exits(tmp_path: Path) -> None:
+    ending, log, turns = play(tmp_path, "print('working'); print('{not json'); print('[1]')")
+    assert (ending.reason, ending.turns) == ("agent_stopped", 0)
+    assert [line["text"] for line in log if line["type"] == "stdout"] == ["working", "{not json", "[1]"]
+    assert turns == []
+
+
+def test_a_program_that_fails_is_told_with_its_status(tmp_path: Path) -> None:
+    ending, log, _ = play(tmp_path, "import sys; sys.exit('out of luck')")
+    assert ending.reason == "agent_failed"
+    assert ending.detail.endswith("exit status 1")
+    assert {"type": "stderr", "text": "out of luck"} in log
+
+
+def test_turns_go_on_until_the_program_says_stop(tmp_path: Path) -> None:
+    code = """
+import json, sys
+for line in sys.stdin:
+    turn = json.loads(line)["turn"]
+    print(json.dumps({"turn": 99, "text": "not this turn", "stop": True}))
+    print(json.dumps({"turn": turn, "text": f"did {turn}", "stop": turn == 2}), flush=True)
+"""
+    ending, log, turns = play(tmp_path, code)
+    assert (ending.reason, ending.turns) == ("agent_stopped", 3)
+    assert turns == [(1, "did 0"), (2, "did 1"), (3, "did 2")]
+    prompts = [line for line in log if line.get("type") == "prompt"]
+    assert [prompt["turn"] for prompt in prompts] == [0, 1, 2]
+    assert "AGENTS.md" in prompts[0]["message"]
+
+
+def test_answers_in_pieces_and_lines_without_end_are_read(tmp_path: Path) -> None:
+    code = f"""
+import json, sys, time
+sys.stdin.readline()
+sys.stdout.write("x" * {3 * MAX_LINE_BYTES} + "\\n")
+text = json.dumps({{"turn": 0, "text": "in pieces", "stop": True}})
+for part in (text[:7], text[7:20], text[20:] + "\\n"):
+    sys.stdout.write(part); sys.stdout.flush(); time.sleep(0.05)
+sys.stdout.write("no newline at the end")
+"""
+    ending, log, turns = play(tmp_path, code)
+    assert ending.turns == 1
+    assert turns == [(1, "in pieces")]
+    assert all(len(line.get("text", "")) <= MAX_LINE_BYTES for line in log)
+
+
+def test_a_child_that_holds_the_pipes_does_not_hold_up_the_end(tmp_path: Path) -> None:
+    code = """
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+open("child", "w").write(str(child.pid))
+"""
+    try:
+        ending, _, _ = play(tmp_path, code)
+        assert ending.reason == "agent_stopped"
+    finally:
+        os.kill(int((tmp_path / "child").read_text()), 9)
+
+
+def test_a_flood_of_output_does_not_block_the_program(tmp_path: Path) -> None:
+    code = "import sys\nfor _ in range(2000): print('y' * 1000); print('z' * 1000, file=sys.stderr)"
+    ending, log, _ = play(tmp_path, code)
+    assert ending.reason == "agent_stopped"
+    assert sum(line["type"] == "stdout" for line in log) == 2000
+
+
+def test_the_log_stops_growing_at_its_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evopolicy_gateway.harnesses.agent_log.MAX_LOG_BYTES", 1000)
+    log = AgentLog(tmp_path / "agent.jsonl")
+    for _ in range(200):
+        log.raw(b'{"a": 1}', "stdout")
+    log.close()
+    lines = (tmp_path / "agent.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["type"] == "log_full"
+    assert (tmp_path / "agent.jsonl").stat().st_size < 1200
+
+
+def test_an_agent_sees_the_urls_and_nothing_of_this_projects_variables(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("EVOPOLICY_STATE", "/secret")
+    monkeypatch.setenv("OPENAI_API_KEY", "theirs")
+    environment = environment_of({"EVOPOLICYGYM_INFO_URL": "u"})
+    assert environment["EVOPOLICYGYM_INFO_URL"] == "u"
+    assert environment["OPENAI_API_KEY"] == "theirs"
+    assert "EVOPOLICY_STATE" not in environment
+
+
+def test_a_program_that_cannot_be_started_is_told(tmp_path: Path) -> None:
+    log = AgentLog(tmp_path / "agent.jsonl")
+    stage = Stage(
+        workspace=tmp_path / "missing", urls={}, environment={}, log=log, on_turn=lambda turn, text: None
+    )
+    with pytest.raises(AgentError, match="cannot start"):
+        asyncio.run(CommandHarness("command", ["/bin/true"]).play(stage))
+    log.close()
+
+
+@pytest.mark.parametrize(
+    "agent",
+    [
+        "",
+        "evolv",
+        "evolve:x",
+        "replay",
+        "replay:",
+        "replay:nowhere",
+        "command:",
+        "command: ",
+        "command:no-such-program-x",
+        "command:'open",
+    ],
+)
+def test_what_is_no_agent_is_refused_with_what_there_is(agent: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--agent"):
+        make(agent, tmp_path)
+
+
+def test_files_in_a_command_are_meant_from_where_it_was_given(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("")
+    (tmp_path / "link").symlink_to(sys.executable)
+    harness = make("command:./link mine.py --flag 'two words'", tmp_path)
+    assert isinstance(harness, CommandHarness)
+    assert harness._program == [str(tmp_path / "link"), str(tmp_path / "mine.py"), "--flag", "two words"]
+
+
+def test_entries_are_named_after_their_agents(tmp_path: Path) -> None:
+    assert entry_name("evolve") == "evolve"
+    assert entry_name("random") == "random"
+    assert entry_name(f"replay:{tmp_path}/gaits/") == "replay-gaits"
+    assert entry_name("command:/opt/agents/run.sh --fast") == "command-run.sh"

@@ -1,0 +1,257 @@
+"""Options as settings, control lines, `run.json` from a finished run, what watchers print."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_common.messages.operator import RunFinished, RunProgress, RunSettings, SubmitRecord
+from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.run_record import decode_run_record, encode_run_record
+from evopolicy_gateway import control
+from evopolicy_gateway.control import Progress
+from evopolicy_gateway.journal import Rejected
+from evopolicy_gateway.layout import Staged
+from evopolicy_gateway.options import RunOptions, cases_of, limits_of, one_environment
+from evopolicy_gateway.play import Plan
+from evopolicy_gateway.record import run_record
+from evopolicy_gateway.runs import RunResult, exit_code, report
+from evopolicy_gateway.watch import watching
+
+SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
+
+
+def options(**fields: Any) -> RunOptions:
+    usual: dict[str, Any] = {
+        **dict.fromkeys(RunOptions.__struct_fields__),
+        "agent": "evolve",
+        "entry": "evolve",
+        "repeat": 0,
+        "policy_scope": "episode",
+        "observations": "arrays",
+        "tier": "bwrap",
+        "video": "off",
+        "limits": (),
+    }
+    return RunOptions(**usual | fields)
+
+
+def plan(tmp_path: Path, **fields: Any) -> Plan:
+    usual: dict[str, Any] = {
+        "settings": SETTINGS,
+        "agent": "evolve",
+        "runs": tmp_path,
+        "started_in": tmp_path,
+        "wall_limit_s": 60.0,
+    }
+    return Plan(**usual | fields)
+
+
+def finished(**fields: Any) -> RunFinished:
+    usual: dict[str, Any] = {
+        "run": "r-1",
+        "settings": SETTINGS,
+        "status": "completed",
+        "error": None,
+        "close_reason": "budget_spent",
+        "agent": {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None},
+        "final_score": 2.0,
+        "best_submit_index": 1,
+        "val_scores": {0: 1.0, 1: 1.5},
+        "heldout_returns": (1.0, 3.0),
+        "validation_ineligible": {2: "brought its slot down"},
+        "policy_failures": {"validation": 0, "heldout": 1},
+        "random_heldout_returns": (0.0, 1.0),
+        "episode_budget": 8,
+        "budget_used": 8,
+        "split_hashes": {"train": "a", "validation": "b", "heldout": "c"},
+        "split_secret": True,
+        "env_version": "line-1",
+        "deterministic": True,
+        "fingerprint": Fingerprint(code_version="1", python="3.11", packages={"numpy": "2.4"}, cpu="x"),
+        "created_at": 100.0,
+        "closed_at": 110.0,
+        "finished_at": 112.5,
+        "submits": (
+            SubmitRecord(
+                submit_index=0,
+                status="ok",
+                bundle=None,
+                env_instances=(0,),
+                remaining_budget=0,
+                mean_return=1.0,
+                val_mean=1.0,
+                started_at=101.0,
+                completed_at=102.0,
+            ),
+        ),
+        "wall_s": {"queue": 0.5, "rollout": 3.0, "finalise": 2.5},
+    }
+    return RunFinished(**usual | fields)
+
+
+STAGED = Staged(
+    agents_md_hash="h",
+    initial_policy_hash="i",
+    n_train=64,
+    min_episodes_per_submit=1,
+    max_episodes_per_submit=8,
+)
+
+
+def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> None:
+    rejected = [
+        Rejected(status="budget_invalid", message="no", at=105.0, after_submits=1),
+        Rejected(status="conflict", message="busy", at=106.0, after_submits=1),
+    ]
+    last = Progress(episode_budget=8, remaining_budget=0, n_submits=3, in_flight_s=4.0, feedback_s=0.5)
+    record = run_record(plan(tmp_path), finished(), STAGED, rejected, last, 9.0)
+    assert decode_run_record(encode_run_record(record)) == record
+    assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0
+    assert record.outcome.heldout_std_return == 1.0
+    assert record.outcome.val_scores == {"0": 1.0, "1": 1.5}
+    assert record.outcome.quarantined_submits == (2,)
+    assert record.outcome.random_reference is not None
+    assert record.outcome.random_reference.mean_return == 0.5
+    assert (record.agent.turns, record.agent.retries) == (2, 1)
+    assert record.agent.settings["effort"] == "high"
+    assert (record.timing.wall_s, record.timing.agent_s, record.timing.feedback_s) == (12.5, 5.0, 0.5)
+    assert [one.message for one in record.rejected_submits] == ["no"]
+    assert record.experiment_dimensions.n_heldout == 2
+    assert record.versions.fingerprint["numpy"] == "2.4"
+
+
+@pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])
+def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
+    done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
+    outcome = run_record(plan(tmp_path), done, None, [], None, 0.0).outcome
+    assert outcome.status == ("error" if status == "cancelled" else status)
+    assert outcome.final_score is None
+    assert outcome.heldout_returns == ()
+    assert (outcome.error is not None) == (status == "cancelled")
+
+
+def test_a_runs_folder_is_claimed_once_and_replaced_only_on_demand(tmp_path: Path) -> None:
+    first = plan(tmp_path)
+    first.claim()
+    first.folder.run_json.write_text("{}")
+    with pytest.raises(ConfigError, match=r"finished run.*--overwrite"):
+        first.claim()
+    plan(tmp_path, overwrite=True).claim()
+    assert list(first.folder.root.iterdir()) == []
+    (first.folder.root / "thesis.tex").write_text("precious")
+    with pytest.raises(ConfigError, match="not a run's folder"):
+        plan(tmp_path, overwrite=True).claim()
+    assert (first.folder.root / "thesis.tex").exists()
+
+
+def test_limits_are_the_usual_ones_but_for_those_named() -> None:
+    limits = limits_of(["act_wall_s=2.5", "memory_bytes=2e9", "submit_wall_s=60"])
+    assert limits == ResourceLimits(act_wall_s=2.5, memory_bytes=2_000_000_000, submit_wall_s=60.0)
+    assert isinstance(limits.memory_bytes, int)
+    for wrong in (
+        "act_wall_s",
+        "act_wall=1",
+        "act_wall_s=x",
+        "act_wall_s=0",
+        "act_wall_s=-1",
+        "act_wall_s=nan",
+        "cpu_s=inf",
+    ):
+        with pytest.raises(ConfigError, match="--limit"):
+            limits_of([wrong])
+
+
+@given(st.lists(st.integers(0, 10**6 - 1), min_size=1, max_size=20))
+def test_cases_are_read_as_ids_and_ranges(ids: list[int]) -> None:
+    assert cases_of(",".join(map(str, ids))) == tuple(ids)
+
+
+def test_wrong_option_values_name_the_option() -> None:
+    for wrong in ("", "3-1", "x", "0-99999999"):
+        with pytest.raises(ConfigError, match="--cases"):
+            cases_of(wrong)
+    with pytest.raises(ConfigError, match="16 environments"):
+        one_environment("core16")
+    for field, text in (("policy_scope", "run"), ("observations", "x"), ("tier", "docker"), ("video", "on")):
+        with pytest.raises(ConfigError, match=f"--{field.replace('_', '-')} '{text}'"):
+            options(**{field: text}).settings("toy/line", "t")
+
+
+def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
+    progress = Progress(episode_budget=8, remaining_budget=3, n_submits=1, last_mean=1.5)
+    assert control.event_of(control.line(progress)) == progress
+    for junk in (b"", b"{}", b'{"event": "other"}', b"plain text"):
+        with pytest.raises(ProtocolError):
+            control.event_of(junk)
+
+
+def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
+    out = io.StringIO()
+    with watching(Console(file=out, width=200)) as watch:
+        progress = Progress(
+            episode_budget=8,
+            remaining_budget=4,
+            n_submits=1,
+            last_submit_id="submit_000",
+            last_status="ok",
+            last_mean=-1.25,
+        )
+        for _ in range(3):
+            watch.progress("toy/line", progress)
+        watch.progress("toy/line", msgspec.structs.replace(progress, waits_for="a worker"))
+        watch.turn("toy/line", 1, "first line\nsecond")
+        for done in range(3):
+            watch.phase("toy/line", RunProgress(phase="heldout", done=done, total=3))
+    assert out.getvalue().splitlines() == [
+        "toy/line: submit_000 ok, mean return -1.25; 4 of 8 episodes left",
+        "toy/line: waiting for a worker",
+        "toy/line: turn 1: first line",
+        "toy/line: held-out",
+    ]
+
+
+def test_watchers_on_a_terminal_draw_a_table() -> None:
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=160)
+    with watching(console) as watch:
+        watch.note("toy/line", "run r-1")
+        watch.progress(
+            "toy/line",
+            Progress(
+                episode_budget=8,
+                remaining_budget=4,
+                n_submits=2,
+                submit_id="submit_001",
+                n_episodes=4,
+                n_done=1,
+            ),
+        )
+        watch.phase("toy/line", RunProgress(phase="validation", done=1, total=2))
+    text = out.getvalue()
+    for needed in ("run r-1", "4/8", "validating 1/2"):
+        assert needed in text
+
+
+def test_exit_codes_and_the_report_tell_how_runs_ended() -> None:
+    completed = RunResult(
+        env="a", run_directory="/r/a", status="completed", final_score=1.0, random_score=0.5
+    )
+    nothing = RunResult(env="b", run_directory="/r/b", status="no_ok_submit")
+    failed = RunResult(env="c", run_directory="/r/c", status="error", error="worker lost")
+    assert exit_code([completed]) == 0
+    assert exit_code([completed, nothing]) == 3
+    assert exit_code([completed, nothing, failed]) == 1
+    out = io.StringIO()
+    report([completed, nothing, failed], Console(file=out, width=100))
+    for needed in ("no_ok_submit", "worker lost", "run directory: /r/a"):
+        assert needed in out.getvalue()

@@ -1,0 +1,145 @@
+"""The agents `replay` and `random`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evopolicy_gateway.agents.client import ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.replay import play, policies_in, shares, stage
+from evopolicy_gateway.agents.uniform import POLICY
+from evopolicy_gateway.agents.uniform import play as play_uniform
+
+
+class FakeClient:
+    """The gateway's answers, without a gateway."""
+
+    def __init__(self, budget: int = 10, least: int = 1, most: int = 10) -> None:
+        self.budget, self.least, self.most = budget, least, most
+        self.asked: list[list[int]] = []
+
+    def info(self) -> dict[str, Any]:
+        return {
+            "env_meta": {"n_env_instances": 3},
+            "state": {"remaining_budget": self.budget},
+            "min_episodes_per_submit": self.least,
+            "max_episodes_per_submit": self.most,
+        }
+
+    def submit(self, env_instances: list[int]) -> Verdict | Refusal:
+        self.asked.append(env_instances)
+        if not env_instances:
+            return Refusal(status="budget_invalid", message="none")
+        return Verdict(
+            submit_id=f"submit_{len(self.asked) - 1:03d}", status="ok", summary={"mean_return": 0.0}
+        )
+
+
+def policy(folder: Path, text: str = "x") -> Path:
+    folder.mkdir(parents=True)
+    (folder / "policy.py").write_text(text)
+    return folder
+
+
+@given(st.integers(0, 300), st.integers(1, 40), st.integers(1, 20), st.integers(20, 300))
+def test_shares_are_even_bounded_and_within_the_budget(budget: int, n: int, least: int, most: int) -> None:
+    parts = shares(budget, n, least, most)
+    assert sum(parts) <= budget
+    assert len(parts) <= n
+    assert all(least <= part <= most for part in parts)
+    assert not parts or max(parts) - min(parts) <= 1
+    assert parts == sorted(parts, reverse=True)
+    if parts and max(parts) < most:
+        assert sum(parts) == budget
+    assert (parts == []) == (budget < least)
+
+
+def test_policies_are_found_in_sorted_order_in_both_forms(tmp_path: Path) -> None:
+    policy(tmp_path / "b")
+    policy(tmp_path / "a" / "system")
+    (tmp_path / "c").mkdir()
+    (tmp_path / "file").write_text("")
+    assert policies_in(tmp_path) == [tmp_path / "a" / "system", tmp_path / "b"]
+    assert policies_in(tmp_path / "b") == [tmp_path / "b"]
+
+
+def test_staging_replaces_everything_and_keeps_links_for_the_service_to_judge(tmp_path: Path) -> None:
+    source = policy(tmp_path / "p")
+    (source / "link").symlink_to("/etc")
+    (source / "__pycache__").mkdir()
+    system = policy(tmp_path / "system", "old")
+    (system / "stale").mkdir()
+    stage(source, system)
+    assert sorted(path.name for path in system.iterdir()) == ["link", "policy.py"]
+    assert os.readlink(system / "link") == "/etc"
+
+
+def test_replay_submits_each_policy_with_its_share(tmp_path: Path) -> None:
+    for name in "abc":
+        policy(tmp_path / "given" / name, name)
+    client = FakeClient(budget=10)
+    assert play(client, tmp_path / "given", tmp_path) == 3  # type: ignore[arg-type]
+    assert client.asked == [[0, 1, 2, 0], [0, 1, 2], [0, 1, 2]]
+    assert (tmp_path / "system" / "policy.py").read_text() == "c"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ProtocolError, match="no policy"):
+        play(client, tmp_path / "empty", tmp_path)  # type: ignore[arg-type]
+
+
+SPACES: list[dict[str, Any]] = [
+    {"type": "Discrete", "n": 3, "start": -1},
+    {"type": "Box", "shape": [2], "dtype": "float32", "low": [-1.0, 0.5], "high": [1.0, 2.0]},
+    {"type": "Box", "shape": [3], "dtype": "float64", "low": ["-inf"] * 3, "high": [0.0, 5.0, "inf"]},
+    {"type": "Box", "shape": [2, 20], "dtype": "int64", "min": 1, "max": 9},
+    {"type": "MultiDiscrete", "nvec": [[2], [3]], "start": [[1], [2]]},
+    {"type": "MultiBinary", "n": [1, 2]},
+    {"type": "Text", "min_length": 2, "max_length": 5},
+    {"type": "Tuple", "spaces": [{"type": "Discrete", "n": 2}]},
+    {"type": "Dict", "spaces": {"a": {"type": "MultiBinary", "n": 1}}},
+]
+
+
+def inside(space: dict[str, Any], action: Any) -> bool:
+    kind = space["type"]
+    if kind == "Discrete":
+        return bool(space.get("start", 0) <= action < space.get("start", 0) + space["n"])
+    if kind == "Box":
+        low = np.array(space.get("low", space.get("min")), dtype=float)
+        high = np.array(space.get("high", space.get("max")), dtype=float)
+        array = np.array(action)
+        return array.shape == tuple(space["shape"]) and bool(np.all(low <= array) and np.all(array <= high))
+    if kind == "MultiDiscrete":
+        start, nvec = np.array(space.get("start", 0)), np.array(space["nvec"])
+        return bool(np.all(start <= action) and np.all(np.array(action) < start + nvec))
+    if kind == "MultiBinary":
+        return set(np.ravel(action)) <= {0, 1}
+    if kind == "Text":
+        return bool(space["min_length"] <= len(action) <= space["max_length"])
+    if kind == "Tuple":
+        return all(inside(part, item) for part, item in zip(space["spaces"], action, strict=True))
+    return all(inside(part, action[key]) for key, part in space["spaces"].items())
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_the_uniform_policy_acts_inside_every_space_and_not_always_alike(space: dict[str, Any]) -> None:
+    scope: dict[str, Any] = {}
+    exec(POLICY, scope)
+    player = scope["Policy"]({}, space, {})
+    player.reset(0)
+    actions = [player.act(None) for _ in range(60)]
+    assert all(inside(space, action) for action in actions)
+    assert len({repr(action) for action in actions}) > 1
+
+
+def test_the_random_agent_spends_what_one_submit_may(tmp_path: Path) -> None:
+    (tmp_path / "system").mkdir()
+    client = FakeClient(budget=10, most=4)
+    assert play_uniform(client, tmp_path)  # type: ignore[arg-type]
+    assert client.asked == [[0, 1, 2, 0]]
+    assert (tmp_path / "system" / "policy.py").read_text() == POLICY

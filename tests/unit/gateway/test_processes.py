@@ -1,0 +1,104 @@
+"""Ending whole process trees, in a process of its own that may adopt orphans."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from evopolicy_gateway import leash
+from evopolicy_gateway.processes import descendants, end_orphans
+
+KEEPER = """
+import os, subprocess, sys, time
+from evopolicy_gateway import processes
+processes.become_subreaper()
+stubborn = "import os, signal, time; signal.signal(15, signal.SIG_IGN); {} open(os.environ['N'] + str(os.getpid()), 'w'); time.sleep(1000)"
+kinds = ["", "os.setsid() if os.getpgrp() != os.getpid() else 0;", "os.fork() and os._exit(0);",
+         "os.fork() and os._exit(0); os.setsid(); os.fork() and os._exit(0);", "[os.fork() for _ in range(3)];"]
+spared = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
+mine = [subprocess.Popen([sys.executable, "-c", stubborn.format(kind)]) for kind in kinds]
+wanted = 1 + 1 + 1 + 1 + 8
+while len(os.listdir(os.environ["N"])) < wanted:
+    time.sleep(0.01)
+left = processes.end_descendants(0.05, spare={spared.pid})
+assert left == [], left
+assert processes.descendants(os.getpid()) == [spared.pid]
+spared.kill()
+spared.wait()
+assert processes.end_descendants(0.0) == []
+try:
+    os.waitpid(-1, os.WNOHANG)
+except ChildProcessError:
+    print("nothing left")
+"""
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_nothing_below_survives_however_it_hides(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KEEPER],
+        env={**os.environ, "N": f"{tmp_path}/"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout == "nothing left\n", done.stderr
+    assert not any(alive(int(path.name)) for path in tmp_path.iterdir())
+
+
+def test_a_process_that_is_no_subreaper_ends_nobodys_children() -> None:
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
+    try:
+        end_orphans(())
+        assert child.poll() is None
+        assert child.pid in descendants(os.getpid())
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_a_leashed_program_ends_with_its_parent() -> None:
+    parent = """
+import subprocess, sys, time
+from evopolicy_gateway.leash import leashed
+child = subprocess.Popen(leashed([sys.executable, "-c", "print('up', flush=True); import time; time.sleep(1000)"]))
+print(child.pid, flush=True)
+time.sleep(1000)
+"""
+    process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = sorted(process.stdout.readline().strip() for _ in range(2))
+    child = int(said[0])
+    assert said[1] == "up"
+    assert alive(child)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    deadline = time.monotonic() + 20
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(child)
+
+
+def test_a_leash_whose_holder_is_gone_starts_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, leash.__file__, "1", "9", "/bin/echo", "started"], capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, b"")
+
+
+def test_a_program_that_is_not_there_is_told_in_one_line() -> None:
+    done = subprocess.run(leash.leashed(["/no/such/program"]), capture_output=True, text=True, check=False)
+    assert done.returncode == 127
+    assert done.stderr == "cannot start /no/such/program: No such file or directory\n"
