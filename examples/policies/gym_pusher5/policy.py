@@ -19,16 +19,16 @@ PUSH_HEIGHT, CLEAR_HEIGHT = -0.275, -0.19
 """z of the wrist while it pushes, and while it passes over the cylinder."""
 BAR_TO_CYLINDER = 0.075
 """Distance of the wrist from the cylinder's middle when the bar touches it."""
-FINGER_SLACK = 0.03
+FINGER_SLACK = 0.015
 """How far the cylinder's middle is beside the fork's when a finger touches it."""
-LEAD = 0.05
+LEAD = 0.1
 """How far ahead of touching the wrist is drawn while it pushes (m)."""
 ARRIVED = 0.008
 """The cylinder is pushed no further when it is this near to the goal (m)."""
-ABOVE = 0.05
+ABOVE = 0.08
 """Sideways distance from the place behind the cylinder from which the wrist comes down (m)."""
-STIFFNESS = np.array([5.0, 5.0, 2.0, 4.0, 0.5, 0.5, 0.3])
-DAMPING = np.array([2.0, 2.0, 0.6, 1.0, 0.1, 0.1, 0.1])
+STIFFNESS = np.array([2.5, 2.5, 1.0, 2.0, 0.25, 0.25, 0.15])
+DAMPING = np.array([1.4, 1.4, 0.42, 0.7, 0.07, 0.07, 0.07])
 WRIST_FLEX_MIN = -1.094
 
 
