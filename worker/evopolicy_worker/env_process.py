@@ -100,12 +100,12 @@ class EnvProcess:
             return messages.Played(outcomes=(), cancelled=True)
         except SlotDiedError as error:
             return messages.Fault(kind="died", message=str(error))
-        except SandboxError as error:
-            return messages.Fault(kind="sandbox", message=str(error))
         except Exception as error:
             if progress.cancelled:
+                # Whatever it met on its way out.
                 return messages.Played(outcomes=(), cancelled=True)
-            return messages.Fault(kind="worker", message=fault_of(error))
+            kind = "sandbox" if isinstance(error, SandboxError) else "worker"
+            return messages.Fault(kind=kind, message=fault_of(error))
         finally:
             self._progress = None
             self._monitor.ticking = False

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
 
-INIT, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5
+INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")

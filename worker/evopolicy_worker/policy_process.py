@@ -11,6 +11,7 @@ import contextlib
 import math
 import os
 import sys
+import threading
 import time
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, Re
 from evopolicy_worker import frames
 from evopolicy_worker.monitor import Monitor, Watch
 from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import Child, Zygote, wait_dead
+from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 
 MAX_DESCRIPTORS = 256
 MAX_FILES = 4096
@@ -51,6 +52,8 @@ DENIED = frozenset(
 )
 """What a policy is told it may not import: simulators and our own code; the sandbox does not show them."""
 _GRACE_S = 1.0
+_SEAL_S = 60.0
+"""For what is our own work before the bundle is imported."""
 _DEATH_S = 10.0
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
@@ -108,7 +111,9 @@ class PolicyProcess:
         self._watch = Watch(child, limits, count_threads=not self._enclosed)
         self._base_bytes = _address_space(child.host_pid)
         self._write: frames.Writer = list
+        self._exit: Exit | None = None
         self._finished: Ended | None = None
+        self._closing = threading.Lock()
         self._requests = child.requests
         self._replies = child.replies
         self.dead = False
@@ -162,7 +167,10 @@ class PolicyProcess:
             ):
                 file.write("1000")
         self._monitor.watch(self._watch)
-        self._expect_ok(frames.init_frame(init, bundle.data), "init", limits.init_wall_s)
+        self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
+        frame = [frames.REQUEST_HEADER.pack(0, frames.LOAD, 0)]
+        self._watch.spent_s = 0.0
+        self._expect_ok(frame, "init", limits.init_wall_s)
 
     def begin_episode(self, *, first: bool) -> None:
         """Wall, CPU time and output count from here; the first episode's include the import."""
@@ -226,14 +234,16 @@ class PolicyProcess:
             self._monitor.watch(None)
             self._watch.drain()
             watch = self._watch
-            cpu_s = max(0.0, self._exit.cpu_s - watch.cpu_start_s)
-            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
-            self._child.close()
+            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), self._cpu_of_episode())
+            with self._closing:
+                self._child.close()
         return self._finished
 
     def kill(self) -> None:
         """SIGKILL from any thread; the loop finds out by itself."""
-        self._child.kill()
+        with self._closing:
+            if self._finished is None:
+                self._child.kill()
 
     # What passes over the pipes.
 
@@ -291,7 +301,8 @@ class PolicyProcess:
 
     def _told(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
         """The failure that the policy's process reports of itself."""
-        if tag == frames.FAULT:
+        if what == "seal":
+            # None of the bundle's code has run: this is ours.
             self._bury()
             raise SandboxError(
                 f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
@@ -355,20 +366,24 @@ class PolicyProcess:
         alive = not wait_dead(self._child.pidfd, 0.05)
         self._bury()
         verdict = self._watch.verdict
+        if self._watch.what == "seal":
+            how = (
+                verdict.message if verdict is not None else self._exit.describe() if self._exit else "is gone"
+            )
+            raise SandboxError(f"a policy's process could not seal itself: it {how}")
         if verdict is not None:
             return self._failed(
                 self._fatal(verdict.category), verdict.message, limit=verdict.limit, used=verdict.used
             )
         if alive:
             return self._failed(self._fatal("killed"), "the policy closed the pipe that it answers on")
-        if (
-            os.WIFSIGNALED(self._exit.status)
-            and self._exit.cpu_s - self._watch.cpu_start_s > self._limits.cpu_s
-        ):
-            used = self._exit.cpu_s - self._watch.cpu_start_s
+        exit_ = self._exit
+        assert exit_ is not None
+        used = self._cpu_of_episode()
+        if os.WIFSIGNALED(exit_.status) and used > self._limits.cpu_s:
             text = f"the policy used more than {self._limits.cpu_s:g} s of CPU time"
             return self._failed(self._fatal("cpu_limit"), text, limit=self._limits.cpu_s, used=used)
-        return self._failed(self._fatal("killed"), f"the policy's process {self._exit.describe()}")
+        return self._failed(self._fatal("killed"), f"the policy's process {exit_.describe()}")
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:
         """Before there is a Policy, whatever ends the process means that the bundle yields none."""
@@ -382,6 +397,10 @@ class PolicyProcess:
         if not wait_dead(self._child.pidfd, _DEATH_S):
             raise SandboxError(f"a policy's process does not end within {_DEATH_S:g} s of SIGKILL")
         self._exit = self._zygote.wait(self._child)
+
+    def _cpu_of_episode(self) -> float:
+        """CPU time that the dead process had used since the episode began, seconds; 0.0 when nobody knows."""
+        return max(0.0, self._exit.cpu_s - self._watch.cpu_start_s) if self._exit is not None else 0.0
 
     def _memory_used(self) -> float | None:
         """The most that it had beside Python's own, bytes; None when that cannot be read."""

@@ -56,7 +56,8 @@ class Jail(msgspec.Struct, frozen=True, kw_only=True):
 def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed: bool = True) -> Jail:
     """The jail of that tier. SandboxError, with what to do, when this machine cannot build it.
 
-    `sealed=False` leaves a defence off, for tests that show what it defends against.
+    `sealed=False` leaves off what a policy's process does to itself (limits, Landlock, the filter), for tests that
+    show what these defend against.
     """
     files = python_files.find(allowed_packages)
     config: dict[str, object] = {
@@ -64,6 +65,7 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
         "namespaces": tier == "bwrap",
         "packages": _PACKAGES,
         "warm": [name for name in allowed_packages if name != "numpy"],
+        "limits": sealed,
         "seals": tier != "none" and sealed,
         "landlock": None,
         "filter": seccomp.policy_filter().hex() if tier != "none" else "",

@@ -30,6 +30,14 @@ def family(pid: int) -> list[int]:
     return [pid, *(member for child in children(pid) for member in family(child))]
 
 
+def runs(pid: int) -> bool:
+    """Whether the process is there and not just waiting for its parent to take note of its end."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
 def pid_of(slot: Slot) -> int:
     assert slot._process is not None
     return slot._process.pid
@@ -107,10 +115,7 @@ def test_the_death_of_a_slots_process_is_told_and_start_makes_it_new(slots: Slot
         with pytest.raises(SlotDiedError):
             await asyncio.wait_for(task, 30)
         await slot.start()
-        for pid in members:
-            assert (
-                not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2]
-            )
+        assert not [pid for pid in members if runs(pid)]
         return await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
 
     (outcome,) = slots.run(work())
@@ -126,7 +131,7 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
     slots.run(slot.close())
     slots.run(slot.close())
     for _ in range(200):
-        left = [pid for pid in members if Path(f"/proc/{pid}").exists()]
+        left = [pid for pid in members if runs(pid)]
         if not left:
             break
         slots.run(asyncio.sleep(0.02))

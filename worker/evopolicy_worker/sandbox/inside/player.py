@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 REQUESTS, REPLIES = 3, 4
-INIT, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5
+INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
@@ -43,6 +43,9 @@ def play(init: dict[str, Any]) -> NoReturn:
     os.environ["HOME"] = init["home"]
     os.environ["TMPDIR"] = init["home"] + "/tmp"
     sys.path.insert(0, init["home"] + "/system")
+    # From here on what this process says may be the policy's.
+    reply(OK, b"")
+    read_exactly(bytearray(REQUEST_HEADER.size))
     stage = "import"
     try:
         module = importlib.import_module("policy")

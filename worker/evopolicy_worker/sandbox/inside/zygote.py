@@ -245,9 +245,9 @@ def write_bundle(init: dict[str, Any], data: memoryview) -> None:
 
 def seal(config: dict[str, Any], init: dict[str, Any]) -> None:
     """From here on this process can do less than any other; nothing of it can be undone."""
-    limits = init["limits"]
-    for name, value in limits.items():
-        resource.setrlimit(getattr(resource, name), (value, value))
+    if config["limits"]:
+        for name, value in init["limits"].items():
+            resource.setrlimit(getattr(resource, name), (value, value))
     if config["seals"]:
         drop_capabilities()
         check(libc.prctl(38, 1, 0, 0, 0), "no_new_privs")

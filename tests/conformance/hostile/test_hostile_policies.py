@@ -1,0 +1,194 @@
+"""Every attack of the corpus gets its verdict, the slot plays honestly afterwards, and each is seen to succeed undefended."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from corpus import BREAKERS, NO_SANDBOX, POLICIES, PROBE, PROBES, Breaker, Probe
+from slots import HONEST, Slots, make_job, rows
+
+import evopolicy_worker
+from evopolicy_common.messages.episode import EpisodeOutcome
+
+SEED = 1_987_654_321
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    """What there is to attack, all of it on this machine's loopback."""
+    folder = tmp_path_factory.mktemp("target")
+    secret = folder / "seeds.json"
+    secret.write_text("the hidden seeds")
+    site = Path(json.__file__).parent if False else Path(pytest.__file__).parents[1]
+    listeners = []
+    tcp = socket.create_server(("127.0.0.1", 0))
+    unix = socket.socket(socket.AF_UNIX)
+    unix.bind(str(folder / "listener"))
+    abstract = socket.socket(socket.AF_UNIX)
+    abstract.bind(f"\0evopolicy-{folder.name}-{id(folder)}")
+    for listener in (tcp, unix, abstract):
+        listener.listen()
+        listeners.append(listener)
+        threading.Thread(target=serve, args=(listener,), daemon=True).start()
+    yield {
+        "secret_file": str(secret),
+        "worker_code": evopolicy_worker.__file__,
+        "simulators": str(site / "gymnasium"),
+        "tcp": tcp.getsockname()[1],
+        "unix": str(folder / "listener"),
+        "abstract": abstract.getsockname().decode()[1:] if False else abstract.getsockname()[1:].decode(),
+    }
+    for listener in listeners:
+        listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
+
+
+def serve(listener: socket.socket) -> None:
+    while True:
+        try:
+            connection, _ = listener.accept()
+        except OSError:
+            return
+        with connection:
+            connection.sendall(b"hello")
+
+
+def probe(slots: Slots, name: str, told: dict[str, Any], **options: Any) -> EpisodeOutcome:
+    attack = (POLICIES / f"{name}.py").read_text()
+    return slots.play({"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(told)}, **options)
+
+
+def doors(outcome: EpisodeOutcome) -> dict[str, list[str]]:
+    """What the probe printed, by `held` and `THROUGH`."""
+    found: dict[str, list[str]] = {"held": [], "THROUGH": []}
+    for line in outcome.stdout.decode().splitlines():
+        verdict, _, rest = line.partition(": ")
+        found[verdict].append(rest.partition(" - ")[0])
+    return found
+
+
+def serves_honestly(slots: Slots, tier: str = "bwrap") -> bool:
+    outcome = slots.play(HONEST, tier=tier)
+    return outcome.failure is None and outcome.length == 60 and outcome.stdout == b""
+
+
+@pytest.mark.parametrize("attack", PROBES, ids=lambda attack: attack.name)
+def test_nothing_gets_through(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
+    outcome = probe(slots, attack.name, target)
+    assert outcome.failure is None
+    assert doors(outcome)["THROUGH"] == [], outcome.stdout.decode()
+    assert len(doors(outcome)["held"]) > 0
+    assert serves_honestly(slots)
+
+
+@pytest.mark.parametrize(
+    "attack", [attack for attack in PROBES if attack.off], ids=lambda attack: attack.name
+)
+def test_without_its_defence_each_door_is_open(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
+    assert attack.off is not None
+    found = doors(probe(slots, attack.name, target, **attack.off))
+    assert set(found["held"]) <= attack.stays_shut
+    assert found["THROUGH"]
+
+
+@pytest.mark.parametrize("attack", BREAKERS, ids=lambda attack: attack.name)
+def test_a_breaker_gets_its_verdict(slots: Slots, attack: Breaker) -> None:
+    outcome = slots.play(attack.source, limits=attack.limits)
+    assert (outcome.failure.category if outcome.failure else None) == attack.verdict, outcome.failure
+    assert outcome.length == 60
+    assert len(outcome.stdout) <= 65536
+    if outcome.failure is not None and attack.off is not None:
+        assert outcome.failure.limit is not None
+    assert serves_honestly(slots)
+
+
+@pytest.mark.parametrize(
+    "attack", [attack for attack in BREAKERS if attack.off], ids=lambda attack: attack.name
+)
+def test_with_a_higher_limit_the_same_code_succeeds(slots: Slots, attack: Breaker) -> None:
+    assert attack.off is not None
+    assert slots.play(attack.source, limits=attack.off).failure is None
+
+
+@pytest.mark.parametrize(
+    "attack", [attack for attack in BREAKERS if attack.unsealed], ids=lambda attack: attack.name
+)
+def test_without_the_seal_the_same_code_succeeds(slots: Slots, attack: Breaker) -> None:
+    failure = slots.play(attack.source, limits=attack.limits, sealed=False).failure
+    assert failure is None, failure
+
+
+def test_nothing_of_an_episode_is_left_for_the_next(slots: Slots) -> None:
+    probe(slots, "leave_traces", {})
+    assert doors(probe(slots, "find_traces", {}))["THROUGH"] == []
+    # Undefended, files and shared memory of the first are there for the second.
+    probe(slots, "leave_traces", {}, **NO_SANDBOX)
+    found = doors(probe(slots, "find_traces", {}, **NO_SANDBOX))["THROUGH"]
+    assert {"in /tmp", "in shared memory", "in System V memory"} <= set(found)
+
+
+def test_the_cases_seed_is_nowhere_in_the_policys_process(slots: Slots) -> None:
+    told = {"masked_seed": SEED ^ 0x5A5A5A5A}
+    found = doors(probe(slots, "find_seed", told, seed=SEED))
+    assert found == {"held": ["in an object", "in random's state", "in numpy's state"], "THROUGH": []}
+    # The search does find what is there: the same policy, given the number.
+    source = PROBE.replace("import attack", f"import attack\nGIVEN = [{SEED}]")
+    files: dict[str, str | bytes] = {
+        "policy.py": source,
+        "attack.py": (POLICIES / "find_seed.py").read_text(),
+        "target.json": json.dumps(told),
+    }
+    assert doors(slots.play(files, seed=SEED))["THROUGH"] == ["in an object"]
+
+
+def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> None:
+    source = (POLICIES / "see_all.py").read_text()
+    train = slots.play(source, record="full").stdout
+    hidden = slots.play(source, record="actions").stdout
+    assert train == hidden
+    assert len(train) > 1000
+
+
+def test_no_pickle_is_ever_opened(slots: Slots, tmp_path: Path) -> None:
+    (attack,) = [attack for attack in BREAKERS if attack.name == "a pickle"]
+    for tier in ("bwrap", "none"):
+        outcome = slots.play(attack.source, tier=tier)
+        assert rows(outcome)[3].action == "<P>"
+        assert not Path("/tmp/evopolicy-pickled").exists()
+
+
+@pytest.mark.parametrize("way", ["files", "shm", "abstract", "lock", "record"])
+def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
+    heard = {}
+    for tier in ("bwrap", "none"):
+        pair = [slots.slot(tier), second_slot(slots, tier)]
+        attack = (POLICIES / "talk.py").read_text()
+        plays = []
+        for slot, role in zip(pair, ("tell", "listen"), strict=True):
+            told = json.dumps({"role": role, "way": way})
+            folder = slots.bundle({"policy.py": PROBE, "attack.py": attack, "target.json": told})
+            plays.append(slot.play(make_job(tier=tier), folder, lambda episodes, steps: None))
+        (_,), (listener,) = slots.run(both(plays[0], plays[1]))
+        heard[tier] = doors(listener)["THROUGH"] != []
+    assert heard == {"bwrap": False, "none": True}
+
+
+def second_slot(slots: Slots, tier: str) -> Any:
+    found = vars(slots).setdefault("second", {})
+    if tier not in found:
+        found[tier] = slots.new(tier)  # type: ignore[arg-type]
+        slots.run(found[tier].start())
+        slots._slots[f"second {tier}", True] = found[tier]
+    return found[tier]
+
+
+async def both(one: Any, two: Any) -> Any:
+    import asyncio
+
+    return await asyncio.gather(one, two)
