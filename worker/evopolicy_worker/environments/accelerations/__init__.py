@@ -8,8 +8,8 @@ Rules that this package owns:
 - It touches only the environment that it was given (`specialise` swaps the class of that one object for a subclass);
   library modules and classes stay as they are.
 - It is used only with versions it was proved on (`PROVED`): with any other it stands aside, and says so once.
-- `tests/conformance/environments/test_accelerations.py` compares each with the plain environment. `python -m
-  evopolicy_worker.environments.accelerations` does so for any number of seeds, with random actions and competent ones.
+- `tests/conformance/environments/test_accelerations.py` compares each with the plain environment;
+  `acceleration_checks.py` beside it does so for any number of seeds, with random actions and competent ones.
 
 They are on by default; `make(env_id, accelerations=False)` or `EVOPOLICY_ACCELERATIONS=off` switches them off.
 """

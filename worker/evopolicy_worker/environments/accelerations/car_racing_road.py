@@ -66,7 +66,9 @@ class _Polygons:
         centres = corners.mean(axis=1)
         self._x: NDArray[np.float64] = np.ascontiguousarray(centres[:, 0])
         self._y: NDArray[np.float64] = np.ascontiguousarray(centres[:, 1])
-        self._radius: NDArray[np.float64] = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
+        self._radius: NDArray[np.float64] = np.sqrt(
+            ((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1)
+        )
 
     def near(self, zoom: float, translation: tuple[float, float], angle: float) -> list[int]:
         """Indices of those whose circles reach the visible part of the canvas, ascending."""
@@ -103,7 +105,8 @@ class VisibleRoad(CarRacing):
                 (-PLAYFIELD, -PLAYFIELD),
                 (-PLAYFIELD, PLAYFIELD),
             ]
-            self._draw_colored_polygon(surface, field, self.bg_color, zoom, translation, angle, clip=False)
+            draw: Any = self._draw_colored_polygon
+            draw(surface, field, self.bg_color, zoom, translation, angle, clip=False)
         for index in _GRASS.near(zoom, translation, angle):
             _draw(surface, _GRASS.vertices[index], self.grass_color, zoom, translation, angle)
         tiles = self._tiles
@@ -133,9 +136,7 @@ def _draw(
         or (y0 > _BOTTOM and y1 > _BOTTOM and y2 > _BOTTOM and y3 > _BOTTOM)
     ):
         return
-    if any(
-        -MAX_SHAPE_DIM <= x <= _FAR_RIGHT and -MAX_SHAPE_DIM <= y <= _FAR_BOTTOM for x, y in polygon
-    ):
+    if any(-MAX_SHAPE_DIM <= x <= _FAR_RIGHT and -MAX_SHAPE_DIM <= y <= _FAR_BOTTOM for x, y in polygon):
         gfxdraw.aapolygon(surface, polygon, color)
         gfxdraw.filled_polygon(surface, polygon, color)
 

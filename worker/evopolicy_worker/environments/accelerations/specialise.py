@@ -9,12 +9,14 @@ from functools import cache
 from typing import Any
 
 
-def specialise(target: Any, mixin: type[Any]) -> None:
+def specialise(target: Any, mixin: Any) -> None:
     """Make `target` an instance of `mixin` in front of its present class, under that class's name."""
-    target.__class__ = specialised(type(target), mixin)
+    target.__class__ = specialised(target.__class__, mixin)
 
 
 @cache
-def specialised(cls: type[Any], mixin: type[Any]) -> type[Any]:
+def specialised(cls: Any, mixin: Any) -> Any:
     """`mixin` in front of `cls`, under the name of `cls`. The same pair gives the same class."""
-    return type(cls.__name__, (mixin, cls), {"__module__": mixin.__module__, "__qualname__": cls.__qualname__})
+    return type(
+        cls.__name__, (mixin, cls), {"__module__": mixin.__module__, "__qualname__": cls.__qualname__}
+    )

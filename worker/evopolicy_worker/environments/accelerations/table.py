@@ -43,9 +43,16 @@ class Acceleration:
         module.accelerate(env)
 
 
+_MINIGRID = (
+    "MiniGrid-DoorKey-16x16-v0",
+    "MiniGrid-FourRooms-v0",
+    "MiniGrid-KeyCorridorS4R3-v0",
+    "MiniGrid-ObstructedMaze-1Q-v1",
+)
+_HIGHWAY = ("parking-v0", "roundabout-v0")
+
 ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
-    Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
 )
 """In the order of application."""
 
