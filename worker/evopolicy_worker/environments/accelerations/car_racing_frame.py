@@ -58,32 +58,34 @@ class NarrowFrames(CarRacing):
     _canvases: _Canvases | None = None
 
     def _render(self, mode: str) -> Any:
-        car: Any = self.car
+        # The library's own attributes are untyped.
+        env: Any = self
+        car = env.car
         if mode != "state_pixels" or "t" not in self.__dict__ or not _fits(car):
             return super()._render(mode)
         if self._canvases is None:
             self._canvases = _Canvases()
         canvases = self._canvases
-        if self.clock is None:
-            self.clock = pygame.time.Clock()
+        if env.clock is None:
+            env.clock = pygame.time.Clock()
 
-        self.surf = canvases.road
+        env.surf = canvases.road
         angle = -car.hull.angle
         zoom = 0.1 * SCALE * max(1 - self.t, 0) + ZOOM * SCALE * min(self.t, 1)
         scroll = (-(car.hull.position[0]) * zoom, -(car.hull.position[1]) * zoom)
         turned = pygame.math.Vector2(scroll).rotate_rad(angle)
         translation = (WINDOW_W / 2 + turned[0], WINDOW_H / 4 + turned[1])
         if not covers(zoom, translation, angle):
-            self.surf.fill(0)
-        self._render_road(zoom, translation, angle)
-        car.draw(self.surf, zoom, translation, angle, False)
+            env.surf.fill(0)
+        env._render_road(zoom, translation, angle)
+        car.draw(env.surf, zoom, translation, angle, False)
 
-        self.surf = canvases.whole
-        self._render_indicators(WINDOW_W, WINDOW_H)
+        env.surf = canvases.whole
+        env._render_indicators(WINDOW_W, WINDOW_H)
         text = canvases.font.render(f"{self.reward:04.0f}", True, (255, 255, 255), (0, 0, 0))
         place = text.get_rect()
         place.center = (60, WINDOW_H - WINDOW_H * 2.5 / 40.0)
-        self.surf.blit(text, place)
+        env.surf.blit(text, place)
 
         scale = pygame.transform.smoothscale
         scale(canvases.visible, (STATE_W, ROAD_ROWS), canvases.narrow_road)

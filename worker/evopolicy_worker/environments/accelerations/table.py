@@ -53,6 +53,7 @@ _HIGHWAY = ("parking-v0", "roundabout-v0")
 
 ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
+    Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
 )
 """In the order of application."""
 
