@@ -54,6 +54,7 @@ _HIGHWAY = ("parking-v0", "roundabout-v0")
 ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
     Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
+    Acceleration("minigrid_view", _MINIGRID, ("minigrid",)),
 )
 """In the order of application."""
 
