@@ -55,6 +55,7 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
     Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
     Acceleration("minigrid_view", _MINIGRID, ("minigrid",)),
+    Acceleration("highway_lanes", _HIGHWAY, ("highway-env", "numpy")),
 )
 """In the order of application."""
 

@@ -1,0 +1,131 @@
+"""highway-env: coordinates along a lane, in scalars, and remembered while the same position is asked for.
+
+Replaces `local_coordinates`, `heading_at` and `on_lane` of straight, sine and circular lanes. A lane is asked by every
+vehicle about every other, so the same few positions come again and again: the last ones are remembered, by value. The
+arithmetic is the library's in its order, one number at a time (see `highway_arithmetic`); of a straight lane only
+where it runs along an axis, so that each product of its dot products is exact and fusing changes nothing. Other lanes
+keep the library's methods.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
+
+from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, wrap
+from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
+from evopolicy_worker.environments.accelerations.specialise import specialise
+
+_REMEMBERED = 64
+Coordinates = tuple[float, float]
+
+
+class _Remembering(AbstractLane):  # type: ignore[misc]
+    """Looks a position up before it is computed."""
+
+    _known: dict[tuple[float, float], Coordinates]
+
+    def local_coordinates(self, position: Any) -> Coordinates:
+        key = (float(position[0]), float(position[1]))
+        known = self._known.get(key)
+        if known is None:
+            known = self._compute(position, key[0], key[1])
+            if len(self._known) >= _REMEMBERED:
+                self._known.clear()
+            # Zeros of both signs are one key, but need not be one result.
+            if key[0] and key[1]:
+                self._known[key] = known
+        return known
+
+    def _compute(self, position: Any, x: float, y: float) -> Coordinates:
+        raise NotImplementedError
+
+    def on_lane(
+        self, position: Any, longitudinal: Any = None, lateral: Any = None, margin: float = 0
+    ) -> bool:
+        if longitudinal is None or lateral is None:
+            longitudinal, lateral = self.local_coordinates(position)
+        return bool(
+            abs(lateral) <= self.width_at(longitudinal) / 2 + margin
+            and -self.VEHICLE_LENGTH <= longitudinal < self.length + self.VEHICLE_LENGTH
+        )
+
+
+class AxisLane(_Remembering, StraightLane):  # type: ignore[misc]
+    """A straight lane along an axis: its direction has a one and a zero."""
+
+    _origin: tuple[float, float, float, float, float, float]
+
+    def _compute(self, position: Any, x: float, y: float) -> Coordinates:
+        start_x, start_y, along_x, along_y, across_x, across_y = self._origin
+        dx, dy = x - start_x, y - start_y
+        # The sum of a dot product starts at zero, so it is never the negative one.
+        return dx * along_x + dy * along_y + 0.0, dx * across_x + dy * across_y + 0.0
+
+
+class AxisSineLane(AxisLane, SineLane):  # type: ignore[misc]
+    """A sine lane along an axis."""
+
+    def _compute(self, position: Any, x: float, y: float) -> Coordinates:
+        longitudinal, lateral = AxisLane._compute(self, position, x, y)
+        wave = float(np.sin(self.pulsation * longitudinal + self.phase))
+        return longitudinal, lateral - self.amplitude * wave
+
+    def heading_at(self, longitudinal: float) -> float:
+        slope = self.amplitude * self.pulsation * np.cos(self.pulsation * longitudinal + self.phase)
+        return float(self.heading + np.arctan(slope))
+
+
+class ScalarCircularLane(_Remembering, CircularLane):  # type: ignore[misc]
+    """A circular lane."""
+
+    _start: float
+
+    def _compute(self, position: Any, x: float, y: float) -> Coordinates:
+        delta = position - self.center
+        start = self._start
+        phi = start + wrap(float(np.arctan2(delta[1], delta[0])) - start)
+        distance = math.sqrt(delta.dot(delta))
+        return self.direction * (phi - start) * self.radius, self.direction * (self.radius - distance)
+
+    def heading_at(self, longitudinal: float) -> float:
+        phi = self.direction * longitudinal / self.radius + self._start
+        return float(phi + PI / 2 * self.direction)
+
+
+class ScalarLanes(Scene):
+    """An environment of which the lanes remember."""
+
+    def _road_made(self) -> None:
+        for lane in self.road.network.lanes_list():
+            quicken(lane)
+        super()._road_made()
+
+
+def quicken(lane: Any) -> None:
+    """Give a lane the methods above, if it is of a kind that has them."""
+    kind = type(lane)
+    if kind in (StraightLane, SineLane):
+        if not (_on_axis(lane.direction) and _on_axis(lane.direction_lateral)):
+            return
+        specialise(lane, AxisSineLane if kind is SineLane else AxisLane)
+        origin = (*lane.start, *lane.direction, *lane.direction_lateral)
+        lane._origin = tuple(float(value) for value in origin)
+    elif kind is CircularLane:
+        specialise(lane, ScalarCircularLane)
+        lane._start = float(lane.start_phase)
+    else:
+        return
+    lane._known = {}
+
+
+def _on_axis(direction: Any) -> bool:
+    return sorted(abs(float(value)) for value in direction) == [0.0, 1.0]
+
+
+def accelerate(env: Any) -> None:
+    """Quicken the lanes of this bare highway-env environment."""
+    take_over(env, ScalarLanes)
