@@ -56,6 +56,7 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
     Acceleration("minigrid_view", _MINIGRID, ("minigrid",)),
     Acceleration("highway_lanes", _HIGHWAY, ("highway-env", "numpy")),
+    Acceleration("highway_closest_lane", _HIGHWAY, ("highway-env",)),
 )
 """In the order of application."""
 
