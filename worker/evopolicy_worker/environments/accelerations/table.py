@@ -57,6 +57,7 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("minigrid_view", _MINIGRID, ("minigrid",)),
     Acceleration("highway_lanes", _HIGHWAY, ("highway-env", "numpy")),
     Acceleration("highway_closest_lane", _HIGHWAY, ("highway-env",)),
+    Acceleration("highway_collisions", _HIGHWAY, ("highway-env",)),
 )
 """In the order of application."""
 
