@@ -59,6 +59,7 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("highway_closest_lane", _HIGHWAY, ("highway-env",)),
     Acceleration("highway_collisions", _HIGHWAY, ("highway-env",)),
     Acceleration("highway_vehicles", _HIGHWAY, ("highway-env", "numpy")),
+    Acceleration("highway_observations", _HIGHWAY, ("highway-env", "numpy")),
 )
 """In the order of application."""
 
