@@ -1,0 +1,135 @@
+"""The comparison of accelerated environments with plain ones; also a program, for as many seeds as one has time for.
+
+`python acceleration_checks.py --seeds 128 [ID …]` plays whole episodes of every accelerated environment, half of the
+seeds with random actions and half with a competent driver, on an accelerated and a plain environment side by side, and
+compares every bit of observation, reward, flags and info of every step, and of the state of the simulator. It says how many steps were compared and the
+ratio of the times they took, and ends with code 1 at the first difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from acceleration_drivers import Driver, competent_driver, random_driver
+from environment_checks import _digest
+
+from evopolicy_common.catalogue import entries
+from evopolicy_common.messages.environment import Case
+from evopolicy_worker.environments import Environment, make
+from evopolicy_worker.environments.accelerations import table
+
+DriverFactory = Callable[[Environment, int], Driver]
+
+
+class DifferenceError(AssertionError):
+    """An accelerated environment did not play as the plain one."""
+
+
+@dataclass
+class Comparison:
+    """What was compared, and the seconds that steps took in all."""
+
+    steps: int = 0
+    episodes: int = 0
+    plain_s: float = 0.0
+    accelerated_s: float = 0.0
+    returns: float = 0.0
+
+
+def accelerated_ids() -> list[str]:
+    """Suite ids of the environments that have accelerations, in catalogue order."""
+    served = set(itertools.chain.from_iterable(one.gymnasium_ids for one in table.ACCELERATIONS))
+    return [entry.id for entry in entries().values() if entry.gymnasium_id in served]
+
+
+def compare(
+    env_id: str, seeds: Iterable[int], factory: DriverFactory, *, steps: int | None = None
+) -> Comparison:
+    """Play the cases on both, reused from case to case; DifferenceError at the first difference."""
+    accelerated, plain = make(env_id, accelerations=True), make(env_id, accelerations=False)
+    done = Comparison()
+    try:
+        for seed in seeds:
+            obs = plain.reset(Case(seed=seed))
+            if _digest(accelerated.reset(Case(seed=seed))) != _digest(obs):
+                raise DifferenceError(f"{env_id}, seed {seed}: first observation")
+            driver = factory(plain, seed)
+            done.episodes += 1
+            for index in range(steps or plain.description.max_episode_steps):
+                action = driver(obs)
+                started = time.perf_counter()
+                expected = plain.step(action)
+                between = time.perf_counter()
+                found = accelerated.step(action)
+                done.accelerated_s += time.perf_counter() - between
+                done.plain_s += between - started
+                done.steps += 1
+                done.returns += expected.reward
+                if _digest(_state(accelerated)) != _digest(_state(plain)):
+                    raise DifferenceError(f"{env_id}, seed {seed}, step {index}: state of the simulator")
+                if _digest(tuple(found)) != _digest(tuple(expected)):
+                    raise DifferenceError(f"{env_id}, seed {seed}, step {index}: {_parts(found, expected)}")
+                obs = expected.obs
+                if expected.terminated or expected.truncated:
+                    break
+    finally:
+        accelerated.close()
+        plain.close()
+    return done
+
+
+def _state(environment: Any) -> list[Any]:
+    """What moves in the simulator, in its own precision: observations are rounded."""
+    simulator = environment._env.unwrapped
+    if hasattr(simulator, "road") and hasattr(simulator.road, "vehicles"):
+        return [
+            (vehicle.position, float(vehicle.heading), float(vehicle.speed), repr(vehicle.lane_index))
+            for vehicle in simulator.road.vehicles
+        ]
+    if hasattr(simulator, "car"):
+        hull = simulator.car.hull
+        return [(*hull.position, hull.angle, *hull.linearVelocity, hull.angularVelocity), simulator.reward]
+    return [simulator.grid.encode(), [int(place) for place in simulator.agent_pos]]
+
+
+def _parts(found: Any, expected: Any) -> str:
+    names = [
+        name for name in found._fields if _digest(getattr(found, name)) != _digest(getattr(expected, name))
+    ]
+    return ", ".join(names)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("ids", nargs="*", default=accelerated_ids())
+    parser.add_argument("--seeds", type=int, default=128, help="seeds per environment, half for each driver")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--steps", type=int, help="at most so many steps of an episode")
+    options = parser.parse_args()
+    for env_id in options.ids:
+        half = options.seeds // 2
+        for name, factory, first in (
+            ("random", random_driver, options.first),
+            ("competent", competent_driver, options.first + half),
+        ):
+            try:
+                done = compare(env_id, range(first, first + half), factory, steps=options.steps)
+            except DifferenceError as difference:
+                print(f"DIFFERENT {name}: {difference}", flush=True)
+                return 1
+            print(
+                f"same  {env_id:42} {name:9} {done.episodes:4} episodes {done.steps:7} steps, "
+                f"mean return {done.returns / done.episodes:8.2f}, {done.plain_s / done.accelerated_s:5.2f} x",
+                flush=True,
+            )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""Accelerations stand aside for unproved versions, are switched by option, and touch one environment only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import structlog
+from minigrid.core.grid import Grid
+from minigrid.core.world_object import Ball, Door, Wall
+
+from evopolicy_common.messages.environment import Case
+from evopolicy_worker.environments import make, process_environment
+from evopolicy_worker.environments.accelerations import ACCELERATIONS, PROVED, table, usable
+from evopolicy_worker.environments.accelerations.minigrid_view import _row
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
+
+MAZE = "gymnasium/MiniGrid-FourRooms-v0"
+
+
+def names(environment: Any) -> tuple[str, ...]:
+    assert isinstance(environment, GymnasiumEnvironment)
+    environment.close()
+    return environment.accelerations
+
+
+def test_an_unproved_version_switches_the_acceleration_off_and_says_so_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(table, "_told", set())
+    monkeypatch.setattr(table, "version", lambda name: "99.0")
+    with structlog.testing.capture_logs() as logs:
+        assert names(make(MAZE, accelerations=True)) == ()
+        assert names(make(MAZE, accelerations=True)) == ()
+    assert [(entry["acceleration"], entry["installed"]) for entry in logs] == [
+        ("minigrid_view", {"minigrid": "99.0"})
+    ]
+    assert logs[0]["log_level"] == "warning"
+
+
+def test_every_acceleration_is_proved_with_the_tested_versions() -> None:
+    with structlog.testing.capture_logs() as logs:
+        assert all(usable(acceleration) for acceleration in ACCELERATIONS)
+    assert logs == []
+    assert {name for one in ACCELERATIONS for name in one.distributions} == set(PROVED)
+
+
+def test_accelerations_are_switched_by_the_process_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EVOPOLICY_ACCELERATIONS", raising=False)
+    assert names(make(MAZE)) == ("minigrid_view",)
+    monkeypatch.setenv("EVOPOLICY_ACCELERATIONS", "off")
+    assert names(make(MAZE)) == ()
+    assert names(make(MAZE, accelerations=True)) == ("minigrid_view",)
+
+
+def test_a_slot_process_inherits_the_switch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EVOPOLICY_ACCELERATIONS", raising=False)
+    assert process_environment()["EVOPOLICY_ACCELERATIONS"] == "on"
+    assert process_environment(accelerations=False)["EVOPOLICY_ACCELERATIONS"] == "off"
+    monkeypatch.setenv("EVOPOLICY_ACCELERATIONS", "off")
+    assert process_environment()["EVOPOLICY_ACCELERATIONS"] == "off"
+
+
+def test_the_librarys_own_class_stays_as_it_is() -> None:
+    accelerated: Any = make(MAZE, accelerations=True)
+    plain: Any = make(MAZE, accelerations=False)
+    kind = type(plain._env)
+    assert isinstance(accelerated._env, kind)
+    assert type(accelerated._env).__name__ == kind.__name__
+    assert "gen_obs" not in kind.__dict__
+    accelerated.reset(Case(seed=1))
+    assert type(make(MAZE, accelerations=False)._env) is kind  # type: ignore[attr-defined]
+
+
+def test_rows_pass_visibility_on_as_the_librarys_mask_does() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        grid = Grid(7, 7)
+        for x in range(7):
+            for y in range(7):
+                thing = rng.integers(6)
+                if thing == 0:
+                    grid.set(x, y, Wall())
+                elif thing == 1:
+                    grid.set(x, y, Door("red", is_open=bool(rng.integers(2))))
+                elif thing == 2:
+                    grid.set(x, y, Ball())
+        cells: list[list[Any]] = [[grid.get(x, y) for x in range(7)] for y in range(7)]
+        mask = grid.process_vis((3, 6))
+        seen = 1 << 3
+        for y in range(6, -1, -1):
+            clear = sum(1 << x for x, cell in enumerate(cells[y]) if cell is None or cell.see_behind())
+            row, seen = _row(seen, clear)
+            assert [bool(row >> x & 1) for x in range(7)] == mask[:, y].tolist()
