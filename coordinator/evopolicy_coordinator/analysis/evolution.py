@@ -113,3 +113,13 @@ def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: fl
         return None
     goal = base + share * (top - base)
     return next((step.consumed for step in steps if step.best >= goal), None)
+
+
+def best_at(steps: Sequence[Step], consumed: int) -> float:
+    """The curve's value at `consumed` episodes; ValueError before its first score."""
+    reached = [step.best for step in steps if step.consumed <= consumed]
+    if not reached:
+        raise ValueError(
+            f"no score by {consumed} episodes; the first is at {steps[0].consumed if steps else None}"
+        )
+    return reached[-1]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from statistics import fmean
 
 import matplotlib
 from matplotlib.lines import Line2D
 
 from evopolicy_coordinator.analysis.edits import demand_of
-from evopolicy_coordinator.analysis.evolution import Evolution
+from evopolicy_coordinator.analysis.evolution import Evolution, best_at
 from evopolicy_coordinator.analysis.figures.style import GRID, MUTED, RC, Plot, new_figure
 from evopolicy_coordinator.analysis.normalised import DEMANDS
 from evopolicy_coordinator.analysis.palette import REFERENCE, Look
@@ -103,8 +104,9 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
     return Plot(
         name=f"score_evolution_{suite.name}",
         title=f"{suite_title(suite.name)} score evolution",
-        caption="Best hidden-validation mean so far over the consumed train budget, one curve a run; dots are rises. Reconstructed "
-        "after the run: agents never see it. Dotted: random reference on the held-out cases.",
+        caption="Best hidden-validation mean so far over the consumed train budget, one curve a run, rises marked; where an agent "
+        f"has more than {MAX_CURVES} runs, their mean and range from where all have a score. Reconstructed after the run: agents "
+        "never see it. Dotted: random reference on the held-out cases.",
         alt=f"Step curves for {len(envs)} environments and {len(shown)} agents.",
         data=rows(found),
         figure=figure,
@@ -112,25 +114,24 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
     )
 
 
+MAX_CURVES = 3
+"""Runs of one agent on one environment that are drawn one by one; more are drawn as their mean and range."""
+
+
 def _evolution_panel(
     panel: matplotlib.axes.Axes, env: str, found: list[Evolution], suite: Suite, looks: Mapping[str, Look]
 ) -> None:
     panel.set_title(title_of(env))
-    repeats = max(sum(one.entry == other.entry for other in found) for one in found)
-    thin = 1.0 if repeats == 1 else 0.55
+    by_entry: dict[str, list[Evolution]] = {}
     for one in found:
-        look = looks[one.entry]
-        x = [step.consumed for step in one.steps]
-        y = [step.best for step in one.steps]
-        panel.plot(
-            [*x, max(one.budget, x[-1])], [*y, y[-1]],
-            drawstyle="steps-post", color=look.colour, linestyle=look.dash, linewidth=1.5 * thin + 0.1, alpha=thin,
-        )  # fmt: skip
-        rises = [step for step in one.steps if step.improved]
-        panel.plot(
-            [step.consumed for step in rises], [step.best for step in rises],
-            look.marker, color=look.colour, markersize=3.4 * thin + 0.4, alpha=thin,
-        )  # fmt: skip
+        by_entry.setdefault(one.entry, []).append(one)
+    for entry, curves in by_entry.items():
+        if len(curves) > MAX_CURVES:
+            _mean_curve(panel, curves, looks[entry])
+            continue
+        thin = 1.0 if len(curves) == 1 else 0.55
+        for one in curves:
+            _one_curve(panel, one, looks[entry], thin)
     if suite.table.reference is not None:
         cell = suite.table.cells.get((suite.table.reference, env))
         if cell is not None and cell.mean is not None:
@@ -138,6 +139,38 @@ def _evolution_panel(
     panel.set_xlim(0, max(one.budget for one in found) * 1.02)
     panel.locator_params(axis="y", nbins=4)
     panel.locator_params(axis="x", nbins=4, integer=True)
+
+
+def _one_curve(panel: matplotlib.axes.Axes, one: Evolution, look: Look, thin: float) -> None:
+    x = [step.consumed for step in one.steps]
+    y = [step.best for step in one.steps]
+    panel.plot(
+        [*x, max(one.budget, x[-1])], [*y, y[-1]],
+        drawstyle="steps-post", color=look.colour, linestyle=look.dash, linewidth=1.5 * thin + 0.1, alpha=thin,
+    )  # fmt: skip
+    rises = [step for step in one.steps if step.improved]
+    panel.plot(
+        [step.consumed for step in rises], [step.best for step in rises],
+        look.marker, color=look.colour, markersize=3.4 * thin + 0.4, alpha=thin,
+    )  # fmt: skip
+
+
+def _mean_curve(panel: matplotlib.axes.Axes, curves: list[Evolution], look: Look) -> None:
+    """Mean, and band from lowest to highest, from where every run has a score."""
+    changes = sorted(
+        {step.consumed for one in curves for step in one.steps} | {max(one.budget for one in curves)}
+    )
+    start = max(one.steps[0].consumed for one in curves)
+    x = [consumed for consumed in changes if consumed >= start]
+    levels = [[best_at(one.steps, consumed) for one in curves] for consumed in x]
+    panel.fill_between(
+        x, [min(level) for level in levels], [max(level) for level in levels],
+        step="post", color=look.colour, alpha=0.13, linewidth=0,
+    )  # fmt: skip
+    panel.plot(
+        x, [fmean(level) for level in levels], drawstyle="steps-post", color=look.colour, linestyle=look.dash,
+        marker=look.marker, markersize=3.2, markevery=0.2,
+    )  # fmt: skip
 
 
 def _handle(entry: str, looks: Mapping[str, Look]) -> Line2D:

@@ -12,7 +12,7 @@ from run_dirs import Version, policy, write_run
 from evopolicy_common.run_record import Tokens
 from evopolicy_coordinator.analysis.audit import audit_signals, token_use
 from evopolicy_coordinator.analysis.edits import classify, edit_rates
-from evopolicy_coordinator.analysis.evolution import area, episodes_to, evolutions
+from evopolicy_coordinator.analysis.evolution import Step, area, best_at, episodes_to, evolutions
 from evopolicy_coordinator.analysis.reader import load_runs, read_run
 from evopolicy_coordinator.analysis.scores import RANDOM_ENTRY, score_table
 from evopolicy_coordinator.analysis.structure import edit_size_bins, selected_structures, structure_means
@@ -97,6 +97,16 @@ def test_evolution_without_a_scale_has_no_area(tmp_path: Path) -> None:
     assert episodes_to((), 0.5, 0.0, 1.0) is None
 
 
+def test_curve_is_a_step_function_of_the_consumed_budget() -> None:
+    steps = (
+        Step(index=0, consumed=4, val_mean=1.0, best=1.0, improved=True),
+        Step(index=1, consumed=9, val_mean=3.0, best=3.0, improved=True),
+    )
+    assert [best_at(steps, consumed) for consumed in (4, 8, 9, 99)] == [1.0, 1.0, 3.0, 3.0]
+    with pytest.raises(ValueError, match="no score by 3"):
+        best_at(steps, 3)
+
+
 def test_structure_is_averaged_over_runs_then_environments(tmp_path: Path) -> None:
     simple, rich = policy(), policy(integral=True, planner=True)
     write_run(tmp_path, [Version(simple, (1.0,), 1.0)])
@@ -166,8 +176,6 @@ def test_random_reference_of_one_split_counts_once(tmp_path: Path) -> None:
 
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=12), st.integers(1, 4))
 def test_area_is_between_nought_and_the_final_level(levels: list[int], width: int) -> None:
-    from evopolicy_coordinator.analysis.evolution import Step
-
     best, steps = -1.0, []
     for i, level in enumerate(levels):
         improved = level > best

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from run_dirs import Version, png, policy, write_run
 
+from evopolicy_coordinator.analysis import figures_of, study
 from evopolicy_coordinator.analysis.agent_log import read_agent_log
 from evopolicy_coordinator.analysis.edits import classify
 from evopolicy_coordinator.analysis.figures.edits import wilson
@@ -195,3 +196,19 @@ def test_diff_shows_changed_files_policy_first() -> None:
     found = diff(before, after)
     assert [one.path for one in found] == ["policy.py", "a.py", "b.py"]
     assert found[0].lines == ("@@ -1 +1 @@", "-import a", "+import b")
+
+
+def test_many_repeats_are_drawn_as_mean_and_range(tmp_path: Path) -> None:
+    for repeat in range(5):
+        versions = [
+            Version(policy(gain=1.0), (0.0,) * (4 + repeat), float(repeat)),
+            Version(policy(gain=2.0), (0.0,) * 4, 9.0),
+        ]
+        write_run(tmp_path, versions, repeat=repeat, budget=16)
+    plots = {plot.name: plot for plot in figures_of(study([tmp_path]))}
+    panel = plots["score_evolution_core16"].figure.axes[0]
+    (band,) = panel.collections
+    (line,) = [line for line in panel.lines if len(line.get_xdata()) > 2]
+    assert line.get_xdata()[0] == 8  # where the last run got its first score
+    assert line.get_ydata()[-1] == 9.0
+    assert band.get_datalim(panel.transData).ymax == 9.0
