@@ -14,7 +14,6 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 import typer
-from rich.console import Console
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors
@@ -256,7 +255,7 @@ def _plans(
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
-    console = Console(stderr=as_json)
+    console = options.console(stderr=as_json)
     results = _run(play_all(plans, where, parallel, console))
     if as_json:
         print(msgspec.json.format(msgspec.json.encode(results)).decode())

@@ -53,6 +53,14 @@ def episode_name(global_index: int, episode_budget: int) -> str:
 
 def json_bytes(value: Any) -> bytes:
     """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and odd objects as text."""
+    try:
+        data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        pass
+    else:
+        # orjson writes NaN and infinities as null: without one there was none. Nearly every row ends here.
+        if b"null" not in data:
+            return data
     plain = _plain(value)
     try:
         return orjson.dumps(plain, option=orjson.OPT_SERIALIZE_NUMPY)

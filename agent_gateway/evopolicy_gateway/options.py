@@ -9,6 +9,7 @@ from typing import Annotated, get_args
 
 import msgspec
 import typer
+from rich.console import Console
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
@@ -89,6 +90,12 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             video=_one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
             limits=limits_of(self.limits),
         )
+
+
+def console(*, stderr: bool) -> Console:
+    """For people: as wide as their terminal, and wide enough for a table where there is none."""
+    found = Console(stderr=stderr)
+    return found if found.is_terminal else Console(stderr=stderr, width=160)
 
 
 def tier_of(text: str) -> Tier:

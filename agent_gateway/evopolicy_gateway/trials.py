@@ -18,6 +18,7 @@ from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
+from evopolicy_gateway import options
 from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_gateway.formatting import cut_text
 from evopolicy_gateway.operations import Operations
@@ -61,7 +62,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
     bundle = _bundle(trial.policy)
-    console = Console(stderr=as_json)
+    console = options.console(stderr=as_json)
     results: list[TrialResult] = []
 
     async def work(operations: Operations) -> None:
@@ -99,7 +100,7 @@ async def play_random(
     as_json: bool,
 ) -> int:
     """Plays uniform random actions and prints the returns."""
-    console = Console(stderr=as_json)
+    console = options.console(stderr=as_json)
     results: list[TrialResult] = []
 
     async def work(operations: Operations) -> None:

@@ -189,31 +189,29 @@ def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
     play(tmp_path, script)
 
 
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [
-        (b"{", "budget_invalid"),
-        (b'{"env_instances": []}', "budget_invalid"),
-        (b'{"env_instances": {"a": 1}}', "budget_invalid"),
-        (b'{"env_instances": "0-6"}', "budget_invalid"),
-        (b'{"env_instances": [8]}', "invalid_env_instance"),
-        (b'{"env_instances": "5-2"}', "invalid_env_instance"),
-        (b'{"env_instances": [0.5]}', "invalid_env_instance"),
-        (b'{"env_instances": "0-999999999999"}', "invalid_env_instance"),
-    ],
-)
-def test_a_rejected_request_costs_no_budget_and_changes_nothing(
-    tmp_path: Path, body: bytes, status: str
-) -> None:
+REJECTED = [
+    (b"{", "budget_invalid"),
+    (b'{"env_instances": []}', "budget_invalid"),
+    (b'{"env_instances": {"a": 1}}', "budget_invalid"),
+    (b'{"env_instances": "0-6"}', "budget_invalid"),
+    (b'{"env_instances": [8]}', "invalid_env_instance"),
+    (b'{"env_instances": "5-2"}', "invalid_env_instance"),
+    (b'{"env_instances": [0.5]}', "invalid_env_instance"),
+    (b'{"env_instances": "0-999999999999"}', "invalid_env_instance"),
+]
+
+
+def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
-        answer = await s.http.post(s.urls.submit, content=body)
-        assert answer.status_code == 400
-        assert answer.json()["status"] == status
-        assert answer.json()["error"]["message"]
-        state = (await s.http.get(s.urls.info)).json()["state"]
-        assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
-        assert files_below(s.folder.feedback) == []
-        assert s.desk.n_rejected == 1
+        for number, (body, status) in enumerate(REJECTED, start=1):
+            answer = await s.http.post(s.urls.submit, content=body)
+            assert answer.status_code == 400
+            assert answer.json()["status"] == status
+            assert answer.json()["error"]["message"]
+            state = (await s.http.get(s.urls.info)).json()["state"]
+            assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
+            assert files_below(s.folder.feedback) == []
+            assert s.desk.n_rejected == number
 
     double = play(tmp_path, script)
     assert double.submits == []
