@@ -22,6 +22,8 @@ from evopolicy_coordinator.core.records import OutcomeRow, Row, RunStateRow, Str
 if TYPE_CHECKING:
     from sim_scenario import Simulation
 
+QUIET_S = 600.0
+"""Longest without a commit, once there are no more faults, that slow workers and long episodes can account for."""
 VALIDATE_EVERY = 7
 """Steps between looks at the core's invariants, which are costly."""
 PREEMPT_S = 15.0
@@ -52,6 +54,7 @@ class Checkers:
         self._handed_in: set[str] = set()
         self._strikes: dict[str, int] = {}
         self._steps = 0
+        self._moved_at = 0.0
         self._core: Core | None = None
         self._early_since: dict[str, float] = {}
         self.not_counted: set[str] = set()
@@ -66,6 +69,7 @@ class Checkers:
 
     def committing(self, rows: tuple[Row, ...]) -> None:
         """A transaction is about to be written: may it?"""
+        self._moved_at = self._simulation.world.now
         arrived: Counter[str] = Counter()
         for row in rows:
             if isinstance(row, OutcomeRow):
@@ -314,6 +318,12 @@ class Checkers:
 
     def stepped(self, core: Core) -> None:
         self._steps += 1
+        quiet_s = self._simulation.world.now - max(self._moved_at, self._simulation.world.calm_at)
+        if quiet_s > QUIET_S:
+            status = core.status(self._simulation.world.now)
+            want(
+                False, "it goes on", f"nothing was committed for {quiet_s:.0f} s", status.runs, status.stalls
+            )
         if self._steps % VALIDATE_EVERY == 0:
             core.validate()
             self._preempted(core)

@@ -96,6 +96,7 @@ class SimWorker(Asker):
         self.slots, self.envs, self.version = slots, envs, version
         faults = self.world.faults
         self._reset()
+        self.beat_wait_s = self.world.chance.choice((0.0, 1.5))
         self.slowness = 4.0 if self.world.chance.random() < faults.slow_worker else 1.0
         self.later(self.world.chance.random(), self._register)
 
@@ -186,7 +187,12 @@ class SimWorker(Asker):
                 for lease_id in message.cancelled:
                     self._stop(lease_id)
 
-        fields = {"worker": self.name, "session": self.session, "held": tuple(held), "wait_s": 1.5}
+        fields = {
+            "worker": self.name,
+            "session": self.session,
+            "held": tuple(held),
+            "wait_s": self.beat_wait_s,
+        }
         self.world.send(
             self.name,
             self.simulation.coordinator.receive,
@@ -213,6 +219,8 @@ class SimWorker(Asker):
             self.polling = False
             if self._lost_session(message):
                 return
+            for lease_id in message.cancelled:
+                self._stop(lease_id)
             for lease in message.leases:
                 self.queue[lease.lease_id] = lease
             self._start()

@@ -182,6 +182,7 @@ class Supervisor:
         if lease_id in self._queue:
             lease = self._queue.pop(lease_id)
             self._put_result(lease, "returned")
+            self._capacity_freed.set()
         elif lease_id in self._running and lease_id not in self._cancelled:
             self._cancelled.add(lease_id)
             slot = self._running[lease_id]
@@ -191,12 +192,16 @@ class Supervisor:
     # Leasing.
 
     async def _lease_loop(self) -> None:
+        """Keeps a poll waiting at the coordinator, but for the time that what was leased ahead lasts by half: so the
+        slots never wait for a round trip, and short episodes still come in batches."""
+        depth = 0
         while not self._draining.is_set():
             self._capacity_freed.clear()
-            wanted = 2 * self._options.slots - len(self._queue) - len(self._running)
-            if wanted <= 0 or len(self._outbox) >= MAX_OUTBOX:
+            slots = self._options.slots
+            if len(self._queue) > max(slots, depth // 2) or len(self._outbox) >= MAX_OUTBOX:
                 await self._capacity_freed.wait()
                 continue
+            wanted = max(1, 2 * slots - len(self._queue) - len(self._running))
             session = self._session
             request = LeaseRequest(
                 worker=self._options.name,
@@ -213,9 +218,15 @@ class Supervisor:
                     raise
                 await self._register_again(session)
                 continue
+            for lease_id in reply.cancelled:
+                self._cancel(lease_id)
             for lease in reply.leases:
                 self._queue[lease.lease_id] = lease
                 self._held.put(_held(lease, running=False))
+            for lease_id in reply.cancelled:
+                self._cancel(lease_id)
+            if reply.leases:
+                depth = len(self._queue)
             self._work_arrived.set()
 
     # Playing.

@@ -83,6 +83,8 @@ class Lease(msgspec.Struct, frozen=True, kw_only=True):
 
 class Leases(Message, frozen=True, kw_only=True, tag="leases"):
     leases: tuple[Lease, ...]
+    cancelled: tuple[str, ...] = ()
+    """Leases to stop at once, told here because the poll happened to wait; heartbeats tell them too."""
 
 
 class HeldLease(msgspec.Struct, frozen=True, kw_only=True):

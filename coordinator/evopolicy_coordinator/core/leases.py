@@ -199,11 +199,9 @@ class LeaseBook:
         self._core.chronicle.tell(turn.now, turn.stimulus_id, lease.id, why)
 
     def stop(self, lease: Lease, turn: Turn, why: str) -> None:
-        """End a lease that its worker holds on to."""
+        """End a lease that its worker holds on to; it is told at the end of this step if it waits for any answer."""
         self.end(lease, turn, why)
-        worker = self._core.fleet.workers[lease.worker]
-        if worker.beat is not None:
-            self._core.fleet.answer_beat(worker, (lease.id,), turn)
+        turn.stops.setdefault(lease.worker, []).append(lease.id)
 
     def release(self, worker: Worker, lease: Lease, turn: Turn, why: str) -> None:
         """End a lease that its worker has let go of."""

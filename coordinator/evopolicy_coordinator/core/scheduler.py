@@ -92,13 +92,15 @@ class Scheduler:
         if worker.poll is not None:
             self._answer(worker, (), turn)
 
-    def _answer(self, worker: Worker, leases: tuple[wire.Lease, ...], turn: Turn) -> None:
+    def _answer(
+        self, worker: Worker, leases: tuple[wire.Lease, ...], turn: Turn, cancelled: tuple[str, ...] = ()
+    ) -> None:
         poll = worker.poll
         assert poll is not None
         self._core.fleet.unpark(worker)
         self._core.timers.disarm(("lease", worker.name))
         worker.poll = None
-        turn.reply(poll.request, wire.Leases(leases=leases))
+        turn.reply(poll.request, wire.Leases(leases=leases, cancelled=cancelled))
 
     def _serve(self, worker: Worker, turn: Turn) -> bool:
         """Answer a worker's poll if there is anything for it."""
@@ -139,12 +141,7 @@ class Scheduler:
         priority = next(each for each in range(N_PRIORITIES) if flow.n_ready[each])
         episode_s = flow.episode_s
         behind_hidden = any(worker.held[priority + 1 :])
-        if (
-            episode_s is None
-            or episode_s >= PREFETCH_BELOW_S
-            or priority == EARLY_VALIDATION
-            or behind_hidden
-        ):
+        if episode_s is None or episode_s >= PREFETCH_BELOW_S or behind_hidden:
             return at_least
         ahead = min(settings.batch_max, 1 + int(settings.batch_s / max(episode_s, 1e-4)))
         share = math.ceil(sum(flow.lane.n_ready) * worker.slots / max(1, flow.lane.slots()))
@@ -213,6 +210,18 @@ class Scheduler:
                 self._preempt(lane, turn)
         for lane in [lane for lane in turn.dirty if lane not in fed]:
             self._feed(lane, turn)
+        for name, stops in turn.stops.items():
+            self._tell(name, tuple(stops), turn)
+
+    def _tell(self, name: str, stops: tuple[str, ...], turn: Turn) -> None:
+        """Tell a worker now what to stop, if any answer of ours is due to it; else its next heartbeat brings it."""
+        worker = self._core.fleet.workers.get(name)
+        if worker is None:
+            return
+        if worker.beat is not None:
+            self._core.fleet.answer_beat(worker, stops, turn)
+        elif worker.poll is not None:
+            self._answer(worker, (), turn, stops)
 
     def reconsider(self, worker: Worker, turn: Turn) -> None:
         """A worker with a waiting poll may have become available."""
@@ -264,14 +273,17 @@ class Scheduler:
         return None
 
     def _preempt(self, lane: Lane, turn: Turn) -> None:
-        """Stop hidden jobs for the train jobs that wait in the lane."""
+        """Stop hidden jobs for the train jobs that wait in the lane.
+
+        The last that were leased go first: they have come least far, and of a batch they wait behind the others.
+        """
         core = self._core
         wanted = lane.n_ready[TRAIN] - lane.stopping
         avoided = core.queue.avoided(lane, TRAIN, turn.now)
         for priority in (EARLY_VALIDATION, HELDOUT):
             for profile in lane.profiles:
                 hidden = profile.hidden[priority]
-                for lease in list(islice(hidden, VICTIMS_MAX)):
+                for lease in list(islice(reversed(hidden), VICTIMS_MAX)):
                     job = lease.job
                     if wanted <= 0:
                         return
@@ -281,9 +293,11 @@ class Scheduler:
                         del hidden[lease]
                         continue
                     job.preemptions += 1
-                    wanted -= 1
-                    lane.stopping += 1
-                    lease.stopped_for = lane
                     worker = core.fleet.workers[lease.worker]
                     core.book.stop(lease, turn, f"preempted for {lane.key[0]}")
                     core.book.give_back(job, "returned", worker, turn, ran=False)
+                    if worker.n_live < worker.slots:
+                        # Only now a slot comes free by it: what was stopped before had still to wait for one.
+                        wanted -= 1
+                        lane.stopping += 1
+                        lease.stopped_for = lane

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class Turn:
-    """Collects the effects of one step, and the lanes in which there may be something to hand out at its end."""
+    """Collects the effects of one step, and what is to be looked at when it ends."""
 
-    __slots__ = ("_out", "_rows", "dirty", "now", "stimulus_id")
+    __slots__ = ("_out", "_rows", "dirty", "now", "stimulus_id", "stops")
 
     def __init__(self, now: float, stimulus_id: str) -> None:
         self.now = now
@@ -29,6 +29,9 @@ class Turn:
         self._rows: list[Row] = []
         self._out: list[Effect] = []
         self.dirty: dict[Lane, None] = {}
+        """Lanes in which something waits that did not before."""
+        self.stops: dict[str, list[str]] = {}
+        """Workers to the leases that they are to stop."""
 
     def persist(self, row: Row) -> None:
         self._rows.append(row)

@@ -126,6 +126,7 @@ class Fleet:
         if old is not None:
             self.count_out(old)
             worker.leases, worker.held, worker.n_live = old.leases, old.held, old.n_live
+            worker.alone = old.alone
             worker.failures, worker.benched_until = old.failures, old.benched_until
             for lease in worker.leases.values():
                 lease.orphan_until = turn.now + self._settings.adoption_s

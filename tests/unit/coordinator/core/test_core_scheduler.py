@@ -135,6 +135,19 @@ def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_bac
     assert rig.core.runs["r1"].state.infrastructure_retries == 0
 
 
+def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    validating(rig, session)
+    hidden = rig.poll(session, 2)
+    assert rig.poll(session, 2, wait_s=9.0) is None
+    request = rig._requests
+    rig.submit(3, 4, key="k1")
+    assert set(rig.replies[request].cancelled) == {lease.lease_id for lease in hidden}
+    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    assert [split_of(lease.job) for lease in rig.poll(session, 2)] == ["train", "train"]
+
+
 def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
     rig = Rig(preemptions_max=2)
     session = rig.register(slots=1)
