@@ -12,6 +12,8 @@ import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
+import msgspec
+
 from evopolicy_gateway.control import AnyEvent, Order, event_of, line
 from evopolicy_gateway.leash import leashed
 
@@ -96,8 +98,22 @@ class Child:
                 lines = file.read().decode("utf-8", "replace").strip().splitlines()
         except OSError:
             return ""
-        return lines[-1] if lines else ""
+        return _said(lines[-1]) if lines else ""
 
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
+
+
+class _LogLine(msgspec.Struct):
+    event: str
+    error: str = ""
+
+
+def _said(line: str) -> str:
+    """A log line for people: of a JSON line what happened and why."""
+    try:
+        entry = msgspec.json.decode(line, type=_LogLine)
+    except msgspec.DecodeError:
+        return line.removeprefix("error: ")
+    return f"{entry.event}: {entry.error}" if entry.error else entry.event

@@ -132,5 +132,4 @@ def _module(name: str) -> list[str]:
 
 
 def _said(child: Child) -> str:
-    words = child.last_words()
-    return words.removeprefix("error: ") or f"see {child.log}"
+    return child.last_words() or f"see {child.log}"

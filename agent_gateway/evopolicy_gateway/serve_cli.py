@@ -8,14 +8,17 @@ import math
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import orjson
+import structlog
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors, setup_logging
+from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, setup_logging
+from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.command_line import run_app
@@ -24,7 +27,8 @@ from evopolicy_gateway.gateway import Close, Gateway, folder_of
 from evopolicy_gateway.layout import RunFolder
 from evopolicy_gateway.submits import Desk
 
-app = typer.Typer(add_completion=False)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 @app.command()
@@ -49,12 +53,25 @@ def serve(
     closes the run when the budget is spent. Ctrl-C leaves the run open.
     """
     setup_logging()
-    with fail_on_our_errors():
+    with _failures_in_the_log() if controlled else fail_on_our_errors():
         folder = folder_of(run_directory)
         closed = asyncio.run(_serve(folder, tuple(connect or ()), json_output, controlled))
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
     os._exit(0 if closed or not controlled else 3)
+
+
+@contextlib.contextmanager
+def _failures_in_the_log() -> Iterator[None]:
+    """For a log that holds JSON lines only: what ends the process is one of them."""
+    try:
+        yield
+    except ConfigError as error:
+        log.error("the gateway cannot serve", error=str(error))
+        raise SystemExit(USAGE_ERROR) from error
+    except Exception as error:
+        log.exception("the gateway failed", error=str(error))
+        raise SystemExit(FAILURE) from error
 
 
 async def _serve(folder: RunFolder, connect: tuple[str, ...], json_output: bool, controlled: bool) -> bool:

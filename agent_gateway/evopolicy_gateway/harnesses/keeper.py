@@ -100,6 +100,10 @@ async def _main() -> int:
 
 if __name__ == "__main__":
     # A thread that still reads stdin must not hold up the exit.
-    code = asyncio.run(_main())
+    try:
+        code = asyncio.run(_main())
+    except Exception:
+        log.exception("the keeper failed")
+        code = 1
     sys.stdout.flush()
     os._exit(code)
