@@ -1,6 +1,8 @@
 # make demo   installs into .venv, then plays a whole run
 # make test   installs, then runs every test
 # make check  ruff and mypy
+# make bench  what an episode costs, beside a bare loop
+# make sim    the coordinator's core under a simulated network with faults
 VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
@@ -33,6 +35,14 @@ check: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check -q .
 	@$(BIN)/mypy
+
+# Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
+bench: install
+	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/runtime_bench.py $(ARGS)
+
+# The coordinator's core under seeded faults; a size or one seed: make sim ARGS="--help"
+sim: install
+	@$(BIN)/python tests/simulation/simulate.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

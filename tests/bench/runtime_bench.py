@@ -1,0 +1,245 @@
+"""`make bench`: what an episode costs through a sandboxed slot, and through the whole cluster, beside a bare loop.
+
+Prints, per Core16 environment: the bare loop's time per step; the slot's time over the bare loop's with accelerations off
+and on; and a whole submit on two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means,
+a pipe's round trip on one core, the slot's overhead per step in such round trips, and its overhead per episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from bare_loop import POLICY, seeds
+from rich.console import Console
+from rich.table import Table
+
+from evopolicy_common import catalogue
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import EpisodeSpec, Job
+from evopolicy_worker.slot import Slot
+
+HERE = Path(__file__).parent
+ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"
+AGENT = HERE / "submit_agent.py"
+
+
+def quietly(command: list[str], **environment: str) -> str:
+    """Runs a program and returns its stdout; what it says on stderr is shown only when it fails."""
+    done = subprocess.run(
+        command, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    return done.stdout
+
+
+def pipe_round_trip_s(n: int = 20_000) -> float:
+    """Seconds for one byte to a child process on the same core and back."""
+    core = sorted(os.sched_getaffinity(0))[0]
+    to_child, from_parent = os.pipe()
+    to_parent, from_child = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.sched_setaffinity(0, {core})
+        for _ in range(n):
+            os.write(from_child, os.read(to_child, 1))
+        os._exit(0)
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    started = time.perf_counter()
+    for _ in range(n):
+        os.write(from_parent, b"x")
+        os.read(to_parent, 1)
+    seconds = time.perf_counter() - started
+    os.sched_setaffinity(0, before)
+    os.waitpid(pid, 0)
+    return seconds / n
+
+
+def jobs(env: str, n: int) -> list[Job]:
+    return [
+        Job(
+            job_id=f"bench-{index}",
+            env=env,
+            bundle="0" * 64,
+            episodes=(
+                EpisodeSpec(index=index, episode_index=index, case=Case(seed=seed), policy_seed=bytes(16)),
+            ),
+        )
+        for index, seed in enumerate(seeds(n))
+    ]
+
+
+async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, int]:
+    """Seconds and steps of `n` episodes through one pinned, sandboxed slot that is warm."""
+    os.environ[ACCELERATIONS] = "on" if accelerations else "off"
+    core = sorted(os.sched_getaffinity(0))[0]
+    with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
+        bundle = Path(folder) / "bundle"
+        bundle.mkdir()
+        (bundle / "policy.py").write_text(POLICY)
+        slot = Slot(core, "bwrap", Path(folder) / "slot")
+        await slot.start()
+        try:
+            await slot.play(jobs(env, 1)[0], bundle, lambda done, steps: None)
+            started = time.perf_counter()
+            steps = 0
+            for job in jobs(env, n):
+                steps += sum(o.length for o in await slot.play(job, bundle, lambda done, steps: None))
+            return time.perf_counter() - started, steps
+        finally:
+            await slot.close()
+            del os.environ[ACCELERATIONS]
+
+
+def write_splits(env: str, n: int, folder: Path) -> None:
+    """The bare loop's seeds as train cases, and one case for each hidden split."""
+    target = folder / env.replace("/", "_")
+    target.mkdir(parents=True)
+    for split, cases in (("train", seeds(max(n, 10))), ("valid", [1]), ("heldout", [2])):
+        document = {"env": env, "split": split, "cases": [{"seed": seed} for seed in cases]}
+        (target / f"{split}.json").write_text(json.dumps(document))
+
+
+def submit_time(env: str, n: int, *, accelerations: bool) -> tuple[float, list[float]]:
+    """Seconds of one warm submit of `n` episodes on two slots up to committed feedback, and of one-episode submits."""
+    with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
+        result = Path(folder) / "result.json"
+        write_splits(env, n, Path(folder) / "data")
+        quietly(
+            [
+                sys.executable,
+                "-m",
+                "evopolicy_gateway.cli",
+                "local",
+                "--env",
+                env,
+                "--agent",
+                f"command:{sys.executable} {AGENT} {n} {result}",
+                "--budget",
+                str(n + 14),
+                "--data",
+                f"{folder}/data",
+                "--runs",
+                f"{folder}/runs",
+                "--validation",
+                "1",
+                "--heldout",
+                "1",
+            ],
+            **{ACCELERATIONS: "on" if accelerations else "off"},
+        )
+        measured = json.loads(result.read_text())
+        return measured["submit_s"], measured["single_s"]
+
+
+def measure(env: str, seconds: float, most: int, *, submits: bool) -> dict[str, Any]:
+    gymnasium_id = str(catalogue.entry(env).gymnasium_id)
+    bare = json.loads(
+        quietly([sys.executable, str(HERE / "bare_loop.py"), gymnasium_id, str(seconds), str(most)])
+    )
+    n = int(bare["episodes"])
+    row: dict[str, Any] = {"env": env, "episodes": n, "steps": bare["steps"], "bare_s": bare["seconds"]}
+    for name, accelerations in (("plain", False), ("accelerated", True)):
+        slot_s, steps = asyncio.run(slot_time(env, n, accelerations=accelerations))
+        row[f"slot_{name}_s"], row[f"slot_{name}_steps"] = slot_s, steps
+        if submits:
+            row[f"submit_{name}_s"], row[f"single_{name}_s"] = submit_time(
+                env, n, accelerations=accelerations
+            )
+    return row
+
+
+def geometric_mean(values: list[float]) -> float:
+    return math.exp(statistics.fmean(math.log(value) for value in values))
+
+
+def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) -> dict[str, Any]:
+    """Prints the table and the summary; returns the summary."""
+    table = Table(title="time over the bare loop's (below 1: faster)")
+    for heading in (
+        "environment",
+        "episodes",
+        "bare µs/step",
+        "slot",
+        "slot, acc.",
+        "submit ×2",
+        "submit, acc.",
+    ):
+        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    ratios: dict[str, list[float]] = {}
+    overheads: list[float] = []
+    for row in rows:
+        cells = [row["env"], str(row["episodes"]), f"{1e6 * row['bare_s'] / row['steps']:.0f}"]
+        for name in ("slot_plain_s", "slot_accelerated_s", "submit_plain_s", "submit_accelerated_s"):
+            if name not in row:
+                cells.append("")
+                continue
+            cores = 2 if name.startswith("submit") else 1
+            ratio = row[name] / (row["bare_s"] / cores)
+            ratios.setdefault(name, []).append(ratio)
+            cells.append(f"{ratio:.2f}")
+        overheads.append((row["slot_plain_s"] - row["bare_s"]) / row["steps"])
+        table.add_row(*cells)
+    console.print(table)
+    summary: dict[str, Any] = {name: geometric_mean(values) for name, values in ratios.items()}
+    bare = sum(row["bare_s"] / row["episodes"] for row in rows)
+    for name in ("slot_accelerated_s", "submit_accelerated_s"):
+        if name in ratios:
+            cores = 2 if name.startswith("submit") else 1
+            summary[f"sweep_{name}"] = sum(row[name] / row["episodes"] for row in rows) / (bare / cores)
+    summary["pipe_round_trip_us"] = 1e6 * round_trip_s
+    for name, value in summary.items():
+        console.print(f"{name:28} {value:8.3f}")
+    singles = [1000 * (s) for row in rows for s in row.get("single_accelerated_s", [])]
+    if singles:
+        quantiles = statistics.quantiles(singles, n=20)
+        console.print(
+            f"one-episode submit, ms: median {statistics.median(singles):.0f}, 95 % {quantiles[-1]:.0f}"
+        )
+    table = Table(title="slot overhead per step (accelerations off)")
+    table.add_column("environment")
+    table.add_column("µs", justify="right")
+    table.add_column("pipe round trips", justify="right")
+    for row, overhead in zip(rows, overheads, strict=True):
+        table.add_row(row["env"], f"{1e6 * overhead:.0f}", f"{overhead / round_trip_s:.1f}")
+    console.print(table)
+    return summary
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--env", nargs="+", default=["core16"], help="suites, ids or globs")
+    parser.add_argument("--seconds", type=float, default=4.0, help="bare time per environment (default: 4)")
+    parser.add_argument(
+        "--episodes", type=int, default=128, help="most episodes per environment (default: 128)"
+    )
+    parser.add_argument("--slots-only", action="store_true", help="leave the whole submits out")
+    parser.add_argument("--json", type=Path, help="also write all numbers to this file")
+    options = parser.parse_args()
+    console = Console()
+    round_trip_s = pipe_round_trip_s()
+    rows = []
+    for env in catalogue.resolve(options.env):
+        console.print(f"measuring {env}", style="dim")
+        rows.append(measure(env, options.seconds, options.episodes, submits=not options.slots_only))
+    summary = report(rows, round_trip_s, console)
+    if options.json:
+        options.json.write_text(json.dumps({"rows": rows, "summary": summary}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

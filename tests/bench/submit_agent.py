@@ -1,0 +1,40 @@
+"""The bench's agent: a warm-up, one-episode submits, then one submit of N episodes; writes how long each took.
+
+`python submit_agent.py N RESULT`
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+from bare_loop import POLICY
+
+
+def submit(ids: list[int]) -> float:
+    """Seconds from POST to answer; the answer comes when the feedback is committed."""
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+        data=json.dumps({"env_instances": ids}).encode(),
+        headers={"Content-Type": "application/json"},
+    )
+    started = time.perf_counter()
+    with urllib.request.urlopen(request) as answer:
+        assert json.load(answer)["status"] == "ok"
+    return time.perf_counter() - started
+
+
+def main(n: int, result: Path) -> None:
+    (Path("system") / "policy.py").write_text(POLICY)
+    submit([0, 1, 2, 3])
+    single_s = [submit([index]) for index in range(10)]
+    submit_s = submit(list(range(n)))
+    result.write_text(json.dumps({"submit_s": submit_s, "single_s": single_s}))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), Path(sys.argv[2]))
