@@ -127,7 +127,8 @@ def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> Edit
     if previous is None or previous.source is None:
         return "first"
     if submit.source.digest == previous.source.digest:
-        return "retest" if submit.bundle_digest == previous.bundle_digest else "data"
+        known = bool(submit.bundle_digest and previous.bundle_digest)
+        return "data" if known and submit.bundle_digest != previous.bundle_digest else "retest"
     if submit.source.topology == previous.source.topology:
         return "parametric"
     return "rollback" if submit.source.topology in seen else "synthesis"

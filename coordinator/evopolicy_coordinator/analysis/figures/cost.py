@@ -99,7 +99,9 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     mean = fmean(values)
                     panel.vlines(mean, place - 0.3, place + 0.3, color=look.colour, linewidth=2.2)
             panel.set_xscale("log")
-            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if _decades(panel) < 2.2 else (1.0,)))
+            panel.xaxis.set_major_locator(
+                LogLocator(subs=(1.0, 2.0, 5.0) if _decades(panel) < 2.2 else (1.0,))
+            )
             panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
             panel.grid(axis="y", visible=False)

@@ -76,6 +76,13 @@ def test_ok_submit_without_validation_is_no_transition(tmp_path: Path) -> None:
     assert row.n_unscored == 1
 
 
+def test_unchanged_source_with_an_unknown_digest_counts_as_a_retest(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, [VERSIONS[-2], VERSIONS[-1]])
+    assert [t.edit for t in classify(read_run(folder).submits)] == ["first", "data"]
+    (folder / "checkpoints/submit_001/metrics.json").unlink()
+    assert [t.edit for t in classify(read_run(folder).submits)] == ["first", "retest"]
+
+
 def test_evolution_gives_area_and_episodes_on_the_environments_scale(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS[:2], budget=32, random_mean=0.0, entry="Slow")  # 10 at 8, 20 at 16
     write_run(tmp_path, [Version(policy(), (0.0,) * 16, 40.0)], budget=32, random_mean=0.0, entry="Fast")
