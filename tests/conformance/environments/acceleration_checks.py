@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from acceleration_drivers import Driver, competent_driver, random_driver
 from environment_checks import _digest
+from gymnasium.envs.box2d.car_racing import PLAYFIELD
 
 from evopolicy_common.catalogue import entries
 from evopolicy_common.messages.environment import Case
@@ -84,6 +87,38 @@ def compare(
     return done
 
 
+def compare_car_pictures(seed: int, count: int) -> None:
+    """Observations of a car that is put anywhere, at any angle, speed and moment; DifferenceError at a difference."""
+    accelerated, plain = make("gym/racing", accelerations=True), make("gym/racing", accelerations=False)
+    rng = np.random.default_rng(seed)
+    accelerated.reset(Case(seed=seed))
+    plain.reset(Case(seed=seed))
+    simulators: list[Any] = [environment._env.unwrapped for environment in (accelerated, plain)]  # type: ignore[attr-defined]
+    for index in range(count):
+        tile = simulators[1].track[rng.integers(len(simulators[1].track))]
+        near = np.array(tile[2:4]) + rng.normal(0, 12, size=2)
+        x, y = near if rng.random() < 0.7 else rng.uniform(-1.1 * PLAYFIELD, 1.1 * PLAYFIELD, size=2)
+        angle = rng.uniform(-7, 7) if rng.random() < 0.8 else math.pi / 2 * rng.integers(-4, 5)
+        moment = rng.uniform(0, 1.5) if rng.random() < 0.5 else 20.0
+        velocity, spin = rng.normal(0, 60, size=2), rng.normal(0, 3)
+        wheels, score = rng.normal(0, 150, size=4), rng.normal(0, 800)
+        pictures = []
+        for simulator in simulators:
+            hull = simulator.car.hull
+            hull.position, hull.angle = (float(x), float(y)), float(angle)
+            hull.linearVelocity, hull.angularVelocity = tuple(velocity.tolist()), float(spin)
+            for wheel, omega in zip(simulator.car.wheels, wheels.tolist(), strict=True):
+                wheel.omega = omega
+            simulator.t, simulator.reward = float(moment), float(score)
+            pictures.append(np.ascontiguousarray(simulator._render("state_pixels")).tobytes())
+        if pictures[0] != pictures[1]:
+            raise DifferenceError(
+                f"seed {seed}, picture {index}: car at ({x}, {y}), angle {angle}, {moment} s"
+            )
+    accelerated.close()
+    plain.close()
+
+
 def _state(environment: Any) -> list[Any]:
     """What moves in the simulator, in its own precision: observations are rounded."""
     simulator = environment._env.unwrapped
@@ -110,8 +145,14 @@ def main() -> int:
     parser.add_argument("ids", nargs="*", default=accelerated_ids())
     parser.add_argument("--seeds", type=int, default=128, help="seeds per environment, half for each driver")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--pictures", type=int, default=0, help="pictures of a car put anywhere, per seed")
     parser.add_argument("--steps", type=int, help="at most so many steps of an episode")
     options = parser.parse_args()
+    if options.pictures:
+        for seed in range(options.first, options.first + options.seeds):
+            compare_car_pictures(seed, options.pictures)
+        print(f"same  {options.seeds * options.pictures} pictures of a car put anywhere")
+        return 0
     for env_id in options.ids:
         half = options.seeds // 2
         for name, factory, first in (

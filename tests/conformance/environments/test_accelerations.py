@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from acceleration_checks import DifferenceError, DriverFactory, accelerated_ids, compare
+from acceleration_checks import DifferenceError, DriverFactory, accelerated_ids, compare, compare_car_pictures
 from acceleration_drivers import competent_driver, random_driver
 
 from evopolicy_common.catalogue import entries
@@ -64,6 +64,10 @@ def test_pictures_of_an_accelerated_environment_are_the_plain_ones(env_id: str) 
         environment.close()
     for accelerated, plain in zip(*pictures, strict=True):
         assert accelerated.tobytes() == plain.tobytes()
+
+
+def test_a_car_put_anywhere_is_seen_as_by_the_plain_environment() -> None:
+    compare_car_pictures(seed=2, count=50)
 
 
 def test_the_comparison_notices_a_polygon_that_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,7 +93,8 @@ class NarrowFrames(CarRacing):
         canvases.narrow.blit(pygame.transform.flip(canvases.narrow_road, False, True), (0, 0))
         canvases.narrow.blit(canvases.narrow_panel, (0, ROAD_ROWS))
         scale(canvases.narrow, (STATE_W, STATE_H), canvases.small)
-        return np.array(pygame.surfarray.pixels3d(canvases.small).transpose(1, 0, 2), order="C")
+        pixels = bytearray(pygame.image.tobytes(canvases.small, "RGB"))
+        return np.frombuffer(pixels, dtype=np.uint8).reshape(STATE_H, STATE_W, 3)
 
 
 def _fits(car: Any) -> bool:
