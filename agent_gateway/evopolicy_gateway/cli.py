@@ -292,12 +292,22 @@ def _add_commands_of_other_rooms(arguments: list[str]) -> None:
     wanted = [found[named]] if named in found else list(found.values()) if named == "--help" else []
     for point in wanted:
         try:
-            app.add_typer(point.load(), name=point.name)
+            _mount(point.load(), point.name)
         except ImportError as error:
             if named == point.name:
                 fail(
                     f"evopolicy {named} is not installed here ({error}): pip install 'evopolicy[coordinator]'"
                 )
+
+
+def _mount(other: typer.Typer, name: str) -> None:
+    """Adds another room's commands under `name`; an app of one command is that command, not a group of one."""
+    if len(other.registered_commands) == 1 and not other.registered_groups and not other.registered_callback:
+        (command,) = other.registered_commands
+        command.name = name
+        app.registered_commands.append(command)
+    else:
+        app.add_typer(other, name=name)
 
 
 def main() -> None:
