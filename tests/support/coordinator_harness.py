@@ -125,6 +125,7 @@ class InstantWorker:
         """How long a batch takes."""
         self.session = ""
         self.jobs: list[Job] = []
+        self.batches = 0
         self.hold = asyncio.Event()
         """While clear, leases are taken but nothing is handed in."""
         self.hold.set()
@@ -172,6 +173,7 @@ class InstantWorker:
                 if not leases:
                     leases = await self.lease(self.slots)
                     self.jobs.extend(lease.job for lease in leases)
+                    self.batches += bool(leases)
                 await self.hold.wait()
                 await asyncio.sleep(self.pause_s)
                 if leases:

@@ -16,6 +16,10 @@ from evopolicy_common.transport import Link
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
+ANSWERED_PAUSE_S = 0.02
+"""Least time between beats: what was told to stop is named until it is handed in, and told again."""
+FAILED_PAUSE_S = 0.25
+
 
 class HeldLeases:
     """The leases this worker holds, shared between the event loop, which changes them, and the heartbeat."""
@@ -38,7 +42,10 @@ class HeldLeases:
 
 
 class HeartbeatThread:
-    """Sends what is held every `every_s` seconds and hands the answers to the event loop."""
+    """Sends what is held every `every_s` seconds and hands the answers to the event loop.
+
+    One beat is always waiting at the coordinator, so that a lease to stop is told at once.
+    """
 
     def __init__(
         self,
@@ -71,22 +78,39 @@ class HeartbeatThread:
 
     def _run(self) -> None:
         last_sent = time.monotonic()
-        while not self._stop.wait(self._every_s):
+        pause = self._every_s
+        while not self._stop.wait(pause):
             gap = time.monotonic() - last_sent
             if gap > 5 * self._every_s + 1.0:
                 log.warning(
                     "this worker was frozen; its leases may have been given to others", frozen_s=round(gap, 1)
                 )
             last_sent = time.monotonic()
-            message = Heartbeat(worker=self._worker, session=self._session, held=self._held.snapshot())
-            try:
-                answer = self._link.ask_blocking(self._key, codec.encode(message), max(1.0, self._every_s))
-                reply = codec.decode(codec.worker_replies, answer)
-            except (TransportError, ProtocolError) as error:
-                log.debug("heartbeat unanswered", why=str(error))
-                continue
-            if isinstance(reply, HeartbeatReply | Refused):
+            reply = self._beat()
+            if isinstance(reply, HeartbeatReply):
+                # The answer was held back for as long as there was nothing to stop: the next beat goes at once.
+                pause = ANSWERED_PAUSE_S if reply.cancelled else 0.0
+            else:
+                pause = FAILED_PAUSE_S
+            if time.monotonic() - last_sent < ANSWERED_PAUSE_S:
+                pause = max(pause, ANSWERED_PAUSE_S)
+            if reply is not None:
                 try:
                     self._loop.call_soon_threadsafe(self._on_reply, reply)
                 except RuntimeError:  # the loop is closed: the worker is on its way out
                     return
+
+    def _beat(self) -> HeartbeatReply | Refused | None:
+        """One beat; None when it was not answered."""
+        wait_s = self._every_s
+        held = self._held.snapshot()
+        message = Heartbeat(worker=self._worker, session=self._session, held=held, wait_s=wait_s)
+        try:
+            answer = self._link.ask_blocking(
+                self._key, codec.encode(message), wait_s + max(1.0, self._every_s)
+            )
+            reply = codec.decode(codec.worker_replies, answer)
+        except (TransportError, ProtocolError) as error:
+            log.debug("heartbeat unanswered", why=str(error))
+            return None
+        return reply if isinstance(reply, HeartbeatReply | Refused) else None

@@ -146,8 +146,10 @@ def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_p
             finished = await whole_run(coordinator)
             assert finished["status"] == "completed"
             assert len(finished["heldout_returns"]) == 4
-            # 16 train, 2 × 3 validation, 4 held-out, 4 random: nothing was played twice.
-            assert supervisor.jobs_done == 30
+            assert finished["nondeterministic_results"] == 0
+            # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
+            # played by the time it heard of it.
+            assert 30 <= supervisor.jobs_done <= 33
 
     run(scenario)
 

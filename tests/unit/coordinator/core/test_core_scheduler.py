@@ -148,6 +148,24 @@ def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
     assert [split_of(lease.job) for lease in rig.poll(session, 2)] == ["train", "train"]
 
 
+def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the_same() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    validating(rig, session)
+    rig.core.runs["r1"].flow.episode_s = 0.01
+    hidden = rig.poll(session, 2)
+    assert {split_of(lease.job) for lease in hidden} == {"validation"}
+    assert len(hidden) == 8
+    assert rig.beat(session, *hidden, wait_s=9.0) is None
+    request = rig._requests
+    rig.submit(5, key="k1")
+    stopped = rig.replies[request].cancelled
+    # The longest held goes on, in the other slot.
+    assert set(stopped) == {lease.lease_id for lease in hidden[1:]}
+    rig.hand_in(session, *(result(lease, "returned", episodes=()) for lease in hidden[1:]))
+    assert split_of(rig.poll(session, 2)[0].job) == "train"
+
+
 def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
     rig = Rig(preemptions_max=2)
     session = rig.register(slots=1)
