@@ -66,8 +66,8 @@ class Gateway:
     async def run(self) -> bool:
         """Serves until told to end; whether the run was closed. Raises what makes it impossible to go on."""
         found, run = _load(self._folder, self._connect)
-        journal = Journal(self._folder.journal)
         sock, address = await bind(self._folder)
+        journal = Journal(self._folder.journal)
         try:
             async with contextlib.AsyncExitStack() as stack:
                 link = await self._unless_told(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -490,3 +492,60 @@ def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Pa
         ("toy/line", 4),
         ("toy/maze", 4),
     ]
+
+
+def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: Path, tmp_path: Path) -> None:
+    waits = agent(tmp_path, "submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)")
+    arguments = ["run", "--env", "toy/line", "--agent", waits, "--exp-id", "t", *SMALL]
+    with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        running.process.kill()
+        wait_until(lambda: not marked(running.mark))
+    folder = run_dir(tmp_path)
+    known = re.findall(r"http://\S+/submit", (folder / "workspace" / "AGENTS.md").read_text())
+    by_hand = subprocess.Popen(
+        [sys.executable, "-m", "evopolicy_gateway.serve_cli", str(folder), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert by_hand.stdout is not None
+        urls = json.loads(by_hand.stdout.readline())
+        assert set(known) == {urls["EVOPOLICYGYM_SUBMIT_URL"]}
+        body = json.dumps({"env_instances": "0-3"}).encode()
+        with urllib.request.urlopen(urllib.request.Request(known[0], data=body)) as answer:
+            assert json.load(answer)["submit_id"] == "submit_001"
+        assert by_hand.wait(timeout=PATIENCE_S) == 0
+    finally:
+        by_hand.kill()
+        by_hand.communicate()
+    assert '"closed"' in (folder / ".gateway" / "journal.jsonl").read_text()
+
+
+def test_feedback_is_the_same_with_one_slot_and_with_two(tmp_path: Path) -> None:
+    (tmp_path / "given").mkdir()
+    (tmp_path / "given" / "policy.py").write_text(
+        "class Policy:\n"
+        "  def __init__(self, *a): pass\n"
+        "  def reset(self, i): self.i = i; print('episode', i)\n"
+        "  def act(self, obs): return [obs[2] - obs[0]] if self.i != 2 else {'not': 'an action'}\n"
+    )
+    trees = []
+    for slots in ("1", "2"):
+        arguments = ["local", "--env", "toy/line", "--agent", "replay:given", "--exp-id", f"s{slots}", *SMALL]
+        more = ["--slots", slots, "--state", str(tmp_path / "state"), "--max-episodes", "6"]
+        with command(tmp_path, *arguments, *more) as running:
+            code, _, err = running.finish()
+            assert code == 0, err
+        feedback = run_dir(tmp_path, exp_id=f"s{slots}") / "workspace" / "feedback"
+        trees.append(
+            {path.relative_to(feedback): timeless(path) for path in feedback.rglob("*") if path.is_file()}
+        )
+    assert trees[0] == trees[1]
+    assert len(trees[0]) >= 1 + 6 * 3
+
+
+def timeless(path: Path) -> bytes:
+    """A feedback file without what tells the time."""
+    return re.sub(rb'"(timestamp|submit_\w+_at|wall_time_seconds)": ?[^,}\n]+', b"", path.read_bytes())

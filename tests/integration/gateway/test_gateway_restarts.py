@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import socket
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+import pytest
 from gateway_double import Double, answering, gateway_on, opened, prepare, served
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, Submit
 from evopolicy_common.messages.worker import Refused
-from evopolicy_gateway import submits
+from evopolicy_gateway import server, submits
 from evopolicy_gateway.feedback import SubmitTree
 
 BODY = {"env_instances": [1, 2, 3]}
@@ -209,5 +213,26 @@ def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
             assert double.closed.reason == "wall_limit"
             assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
         assert isinstance(double.asked[-1], CloseRun)
+
+    asyncio.run(main())
+
+
+def test_a_port_that_somebody_else_has_taken_is_told(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(server, "_REBIND_TRIES", 2)
+    monkeypatch.setattr(server, "_REBIND_PAUSE_S", 0.01)
+
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double) as s:
+                port = urlsplit(s.urls.info).port
+            with socket.socket() as thief:
+                thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                thief.bind(("127.0.0.1", port))
+                thief.listen()
+                with pytest.raises(ConfigError, match=f"port {port}"):
+                    async with gateway_on(folder, double):
+                        pass
 
     asyncio.run(main())
