@@ -39,6 +39,17 @@ def test_an_unproved_version_switches_the_acceleration_off_and_says_so_once(
     assert logs[0]["log_level"] == "warning"
 
 
+def test_an_acceleration_that_does_not_hold_on_this_machine_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    from evopolicy_worker.environments.accelerations import car_racing_frame
+
+    assert car_racing_frame.holds()
+    monkeypatch.setattr(table, "_told", set())
+    monkeypatch.setattr(car_racing_frame, "holds", lambda: False)
+    with structlog.testing.capture_logs() as logs:
+        assert names(make("gym/racing", accelerations=True)) == ("car_racing_road",)
+    assert [entry["acceleration"] for entry in logs] == ["car_racing_frame"]
+
+
 def test_every_acceleration_is_proved_with_the_tested_versions() -> None:
     with structlog.testing.capture_logs() as logs:
         assert all(usable(acceleration) for acceleration in ACCELERATIONS)

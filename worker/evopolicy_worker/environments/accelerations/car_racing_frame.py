@@ -6,7 +6,8 @@ score, and scales the whole down. Here:
 - pygame scales in two passes, columns first, each row by itself, into whole bytes, and rows second (`scalesmooth.c`,
   when both sides shrink; each pass is left out when its length stays). So the first pass may be made before the flip,
   which then has a tenth of the pixels to move, and the rows below the panel need not be scaled at all: the panel
-  is painted on a canvas of its own, and both parts meet between the passes;
+  is painted on a canvas of its own, and both parts meet between the passes (`holds` tries this on noise, for
+  there is a routine for every kind of processor);
 - canvases are kept, and cleared unless the background is painted all over them;
 - the font is loaded once.
 Indicators that reach out of the panel (above 150 units of speed or 295 of a wheel's) are left to the library.
@@ -14,6 +15,7 @@ Indicators that reach out of the panel (above 150 units of speed or 295 of a whe
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -51,6 +53,15 @@ class _Canvases:
         self.narrow = pygame.Surface((STATE_W, WINDOW_H))
         self.small = pygame.Surface((STATE_W, STATE_H))
 
+    def shrink(self) -> None:
+        """The road, flipped, above the panel, scaled down to the small picture."""
+        scale = pygame.transform.smoothscale
+        scale(self.visible, (STATE_W, ROAD_ROWS), self.narrow_road)
+        scale(self.panel, (STATE_W, PANEL_ROWS), self.narrow_panel)
+        self.narrow.blit(pygame.transform.flip(self.narrow_road, False, True), (0, 0))
+        self.narrow.blit(self.narrow_panel, (0, ROAD_ROWS))
+        scale(self.narrow, (STATE_W, STATE_H), self.small)
+
 
 class NarrowFrames(CarRacing):
     """An observation made in two passes."""
@@ -87,12 +98,7 @@ class NarrowFrames(CarRacing):
         place.center = (60, WINDOW_H - WINDOW_H * 2.5 / 40.0)
         env.surf.blit(text, place)
 
-        scale = pygame.transform.smoothscale
-        scale(canvases.visible, (STATE_W, ROAD_ROWS), canvases.narrow_road)
-        scale(canvases.panel, (STATE_W, PANEL_ROWS), canvases.narrow_panel)
-        canvases.narrow.blit(pygame.transform.flip(canvases.narrow_road, False, True), (0, 0))
-        canvases.narrow.blit(canvases.narrow_panel, (0, ROAD_ROWS))
-        scale(canvases.narrow, (STATE_W, STATE_H), canvases.small)
+        canvases.shrink()
         pixels = bytearray(pygame.image.tobytes(canvases.small, "RGB"))
         return np.frombuffer(pixels, dtype=np.uint8).reshape(STATE_H, STATE_W, 3)
 
@@ -101,6 +107,19 @@ def _fits(car: Any) -> bool:
     """Whether the indicators stay within the panel."""
     x, y = car.hull.linearVelocity
     return x * x + y * y < SPEED_LIMIT**2 and all(wheel.omega < OMEGA_LIMIT for wheel in car.wheels)
+
+
+@cache
+def holds() -> bool:
+    """Whether this machine's scaling routine, one of several, works in two passes as described."""
+    canvases = _Canvases()
+    noise = np.random.default_rng(0).integers(0, 256, size=(WINDOW_W, WINDOW_H, 3), dtype=np.uint8)
+    flipped = pygame.surfarray.make_surface(noise)
+    canvases.road.blit(pygame.transform.flip(flipped, False, True), (0, 0))
+    canvases.whole.blit(flipped, (0, 0))
+    expected = pygame.transform.smoothscale(canvases.whole, (STATE_W, STATE_H))
+    canvases.shrink()
+    return bool(pygame.image.tobytes(canvases.small, "RGB") == pygame.image.tobytes(expected, "RGB"))
 
 
 def accelerate(env: Any) -> None:

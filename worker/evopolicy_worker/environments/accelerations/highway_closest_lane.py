@@ -26,7 +26,8 @@ CELL = 2.0
 """Side of a cell, metres."""
 DOUBT = 1e-6
 """Metres; far more than the error of an estimate."""
-_MAX_CELLS = 20_000
+_MAX_CELLS = 4_000
+"""Some 3 KiB each; more than the cells along the roads of roundabout, or in the car park."""
 _REACH = 1e5
 """Metres from the origin within which the error of estimates is known."""
 

@@ -25,6 +25,10 @@ PROVED: Mapping[str, tuple[str, ...]] = {
 """Versions with which the exhaustive comparison was run and found no difference, by distribution."""
 
 
+_told: set[str] = set()
+"""Accelerations that a warning was given about."""
+
+
 @dataclass(frozen=True)
 class Acceleration:
     """One replacement: a module of this package whose `accelerate(env)` changes that bare Gymnasium environment."""
@@ -38,9 +42,21 @@ class Acceleration:
     def serves(self, gymnasium_id: str) -> bool:
         return gymnasium_id in self.gymnasium_ids
 
+    def holds(self) -> bool:
+        """What the module itself has to check of this machine, if anything; a warning, once, when it does not hold."""
+        check = getattr(self._module(), "holds", None)
+        if check is None or check():
+            return True
+        if self.name not in _told:
+            _told.add(self.name)
+            log.warning("acceleration is off: not exact on this machine", acceleration=self.name)
+        return False
+
     def apply(self, env: Any) -> None:
-        module = importlib.import_module(f"{__package__}.{self.name}")
-        module.accelerate(env)
+        self._module().accelerate(env)
+
+    def _module(self) -> Any:
+        return importlib.import_module(f"{__package__}.{self.name}")
 
 
 _MINIGRID = (
@@ -63,14 +79,12 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
 )
 """In the order of application."""
 
-_told: set[str] = set()
-
 
 def accelerate(gymnasium_id: str, env: Any) -> list[str]:
     """Apply to a bare environment all accelerations that serve it and are usable; their names, in order."""
     applied = []
     for acceleration in ACCELERATIONS:
-        if acceleration.serves(gymnasium_id) and usable(acceleration):
+        if acceleration.serves(gymnasium_id) and usable(acceleration) and acceleration.holds():
             acceleration.apply(env)
             applied.append(acceleration.name)
     return applied
