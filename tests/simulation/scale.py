@@ -134,7 +134,8 @@ class Load:
     def _create(self) -> None:
         self._created += 1
         run = f"run-{self._created}"
-        self._submitted[run] = 0
+        # The first runs are staggered, so that at any time as many are trained as are scored.
+        self._submitted[run] = self._created % SUBMITS if self._created <= self._runs else 0
         self.tell(
             events.RunCreated(
                 request=self.request(),

@@ -176,6 +176,11 @@ class Checkers:
         elif isinstance(message, wire.HandInReply) and isinstance(event, events.ResultsHandedIn):
             for result in event.results:
                 self._taken(result)
+        elif isinstance(event, events.ResultsRequested) and getattr(message, "rows", None):
+            gate = disk.outcome(train_group(event.run, event.submit_index), 0)
+            category = None if gate is None or gate.outcome.failure is None else gate.outcome.failure.category
+            shown = gate is not None and category != "init_error"
+            want(shown, "nothing is shown before index 0 shows a Policy", event, gate)
         elif isinstance(message, wire.HeartbeatReply) and isinstance(event, events.HeartbeatReceived):
             for held in event.held:
                 group, _, first = held.job_id.rpartition("/")
@@ -336,7 +341,7 @@ class Checkers:
             name = str(lane.key)
             leases = [lease for profile in lane.profiles for lease in profile.hidden[EARLY_VALIDATION]]
             if lane.n_ready[TRAIN] and leases:
-                since = self._early_since.setdefault(name, now)
+                since = max(self._early_since.setdefault(name, now), core.stalled_at)
                 want(now - since < PREEMPT_S, "a waiting train job stops hidden ones", name, leases[0].id)
             else:
                 self._early_since.pop(name, None)

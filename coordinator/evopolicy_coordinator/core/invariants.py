@@ -43,6 +43,8 @@ def want(core: Core, key: str, holds: bool, what: str) -> None:
 
 def _jobs(core: Core) -> None:
     live = 0
+    ends = not core.adopting or ("adopt", "") in core.timers
+    want(core, "", ends, "what waits to be adopted does not wait for ever")
     for group in core.groups.values():
         left = sum(job.n for job in group.jobs.values())
         want(core, group.id, left + group.done == group.n, "each episode is open or done")
