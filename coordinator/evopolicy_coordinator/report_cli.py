@@ -95,7 +95,9 @@ def report(
         for item in study.left_out:
             typer.echo(f"left out: {item.path}: {item.reason}", err=True)
         if index is not None:
-            typer.echo(f"{len(study.runs)} runs, {len(study.left_out)} left out: {index}")
+            typer.echo(
+                f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
+            )
     if index is None:
         _fail("no complete run among what was given; nothing written", NOTHING)
 
