@@ -69,6 +69,8 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
     unprivileged process of an ordinary machine gets through."""
     stays_shut: frozenset[str] = frozenset()
     """Doors that something else shuts too when this defence is off, or that this machine may not have."""
+    opens_for_root: frozenset[str] = frozenset()
+    """Doors that file permissions shut too, unless the worker runs as root."""
 
 
 class Breaker(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,7 +106,12 @@ PROBES = (
         off=NO_SANDBOX,
         stays_shut=frozenset({"a hard link", "home folders", "the host's name"}),
     ),
-    Probe(name="write_files", off=NO_SANDBOX, stays_shut=frozenset({"shared memory"})),
+    Probe(
+        name="write_files",
+        off=NO_SANDBOX,
+        stays_shut=frozenset({"shared memory"}),
+        opens_for_root=frozenset({"numpy's folder", "the standard library", "the devices", "the root"}),
+    ),
     Probe(
         name="list_processes",
         off=NO_SANDBOX,

@@ -63,6 +63,8 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
     config: dict[str, object] = {
         "become_nobody": False,
         "namespaces": tier == "bwrap",
+        # An interpreter that is installed there must stay visible; the policy's TMPDIR is elsewhere in any case.
+        "own_tmp": not any(path.startswith("/tmp/") for path in files.read),
         "packages": _PACKAGES,
         "warm": [name for name in allowed_packages if name != "numpy"],
         "limits": sealed,

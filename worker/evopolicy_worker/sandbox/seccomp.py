@@ -23,7 +23,9 @@ PID_MARK = 0x7FFFABCD
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _X32_BIT = 0x40000000
 
-_CHECKED = frozenset({"ioctl", "fcntl", "prctl", "clone", "clone3", "fork", "vfork", "kill", "tgkill"})
+_CHECKED = frozenset(
+    {"ioctl", "fcntl", "prctl", "prlimit64", "clone", "clone3", "fork", "vfork", "kill", "tgkill"}
+)
 _FCNTL = (
     0,
     1,
@@ -89,6 +91,7 @@ def policy_filter() -> bytes:
         "prctl": _one_of(0, _PRCTL, errno.EPERM),
         "kill": _one_of(0, (PID_MARK,), errno.EPERM),
         "tgkill": _one_of(0, (PID_MARK,), errno.EPERM),
+        "prlimit64": _one_of(0, (0, PID_MARK), errno.EPERM),
         "clone": [
             (_LOAD, 0, 0, _argument(0)),
             (_AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),

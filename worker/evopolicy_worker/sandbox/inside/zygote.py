@@ -193,7 +193,7 @@ def policy_process(config: dict[str, Any], fds: list[int]) -> None:
             raise OSError("the first request is not INIT")
         init = json.loads(bytes(body[:json_length]))
         if config["namespaces"]:
-            mount_home(init)
+            mount_home(init, config["own_tmp"])
         write_bundle(init, memoryview(body)[json_length:])
         seal(config, init)
     except BaseException as error:
@@ -218,13 +218,14 @@ def output_stream(fd: int) -> io.TextIOWrapper:
     return io.TextIOWrapper(raw, encoding="utf-8", errors="backslashreplace", line_buffering=True)
 
 
-def mount_home(init: dict[str, Any]) -> None:
+def mount_home(init: dict[str, Any], own_tmp: bool) -> None:
     """A file system of the policy's own and limited size, for its copy of `system/` and for /tmp."""
     home = init["home"].encode()
     options = f"size={init['home_bytes']},nr_inodes={init['home_inodes']},mode=0700".encode()
     check(libc.mount(b"home", home, b"tmpfs", MS_NOSUID | MS_NODEV, options), "mount home")
     os.mkdir(home + b"/tmp")
-    check(libc.mount(home + b"/tmp", b"/tmp", None, MS_BIND, None), "bind /tmp")
+    if own_tmp:
+        check(libc.mount(home + b"/tmp", b"/tmp", None, MS_BIND, None), "bind /tmp")
 
 
 def write_bundle(init: dict[str, Any], data: memoryview) -> None:
