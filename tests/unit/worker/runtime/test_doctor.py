@@ -1,0 +1,48 @@
+"""The doctor's rows on this machine, and what they say where something is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from evopolicy_worker.sandbox import doctor, jail, why_not
+
+
+def test_every_part_of_the_sandbox_has_a_row_and_the_tier_follows() -> None:
+    checks = doctor.examine()
+    names = [check.name for check in checks]
+    assert len(set(names)) == len(names)
+    for name in (
+        "bubblewrap",
+        "namespace user",
+        "Landlock",
+        "cgroups",
+        "CPU pinning",
+        "/dev/shm",
+        "clock",
+        "tier bwrap",
+    ):
+        assert name in names
+    assert doctor.best_tier(checks) == "bwrap"
+    assert all(check.found for check in checks)
+    assert all(check.advice for check in checks if check.verdict == "missing")
+
+
+def test_what_is_missing_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(jail, "landlock_version", lambda: 0)
+    why_not.cache_clear()
+    checks = {check.name: check for check in doctor.examine()}
+    why_not.cache_clear()
+    assert "apt-get install bubblewrap" in checks["bubblewrap"].advice
+    assert "lsm=landlock" in checks["Landlock"].advice
+    assert checks["tier bwrap"].verdict == checks["tier landlock"].verdict == "missing"
+    assert doctor.best_tier(tuple(checks.values())) is None
+
+
+def test_a_namespace_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_tried", lambda flags: 1)
+    check = doctor._namespace("user", 0x10000000)
+    assert check.verdict == "missing"
+    assert "user.max_user_namespaces" in check.advice

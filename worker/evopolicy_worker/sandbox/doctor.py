@@ -1,0 +1,202 @@
+"""What this machine gives to a worker's sandbox, and why: rows that `evopolicy-worker doctor` prints."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.messages.episode import Tier
+from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.sandbox import jail, seccomp, why_not
+
+Verdict = Literal["ok", "missing", "note"]
+"""`missing` names what to do about it; `note` is for information."""
+
+_NAMESPACES = {
+    "user": 0x10000000,
+    "mount": 0x00020000,
+    "pid": 0x20000000,
+    "net": 0x40000000,
+    "ipc": 0x08000000,
+    "uts": 0x04000000,
+}
+_CLONE_NEWUSER = 0x10000000
+
+
+class Check(msgspec.Struct, frozen=True, kw_only=True):
+    """One thing that was looked at."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+    """What to do, when something is missing."""
+
+
+def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]:
+    """All checks, in the order in which to show them. Starts each sandbox tier once: takes about a second."""
+    return (
+        _kernel(),
+        _bubblewrap(),
+        *(_namespace(name, flag) for name, flag in _NAMESPACES.items()),
+        _seccomp(),
+        _landlock(),
+        _cgroups(),
+        _pinning(),
+        _shared_memory(),
+        _clock(),
+        *_fingerprint(),
+        *_tiers(allowed_packages),
+    )
+
+
+def best_tier(checks: tuple[Check, ...]) -> Tier | None:
+    """The strongest tier that works; None when only `none` does."""
+    working = {check.name.removeprefix("tier ") for check in checks if check.verdict == "ok"}
+    return "bwrap" if "bwrap" in working else "landlock" if "landlock" in working else None
+
+
+def _kernel() -> Check:
+    return Check(
+        name="kernel", verdict="note", found=f"{platform.system()} {platform.release()} {platform.machine()}"
+    )
+
+
+def _bubblewrap() -> Check:
+    path = shutil.which("bwrap")
+    if path is None:
+        return Check(name="bubblewrap", verdict="missing", found="not on the PATH", advice=jail.INSTALL_BWRAP)
+    said = subprocess.run(
+        [path, "--version"], capture_output=True, text=True, timeout=10, check=False
+    ).stdout.strip()
+    return Check(name="bubblewrap", verdict="ok", found=f"{said} ({path})")
+
+
+def _namespace(name: str, flag: int) -> Check:
+    # An ordinary user makes the others inside a user namespace; tried in a process of its own.
+    flags = flag | (0 if os.geteuid() == 0 else _CLONE_NEWUSER)
+    error = _tried(flags)
+    if error == 0:
+        return Check(name=f"namespace {name}", verdict="ok", found="can be made")
+    return Check(
+        name=f"namespace {name}",
+        verdict="missing",
+        found=os.strerror(error),
+        advice="allow unprivileged user namespaces: sysctl user.max_user_namespaces, kernel.unprivileged_userns_clone,"
+        " kernel.apparmor_restrict_unprivileged_userns; in a container: --security-opt seccomp=unconfined",
+    )
+
+
+def _tried(flags: int) -> int:
+    """errno of unshare(flags) in a forked process; 0 when it worked."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    child = os.fork()
+    if child == 0:
+        os._exit(ctypes.get_errno() & 0x7F if libc.unshare(flags) < 0 else 0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def _seccomp() -> Check:
+    if seccomp.supported() and "Seccomp:" in Path("/proc/self/status").read_text():
+        return Check(name="seccomp", verdict="ok", found=f"filter for {platform.machine()}")
+    return Check(
+        name="seccomp",
+        verdict="missing",
+        found=f"no filter for {platform.machine()}, or a kernel without seccomp",
+        advice="use an x86-64 or 64-bit ARM machine with CONFIG_SECCOMP_FILTER",
+    )
+
+
+def _landlock() -> Check:
+    version = jail.landlock_version()
+    if version:
+        return Check(name="Landlock", verdict="ok", found=f"ABI {version}")
+    return Check(
+        name="Landlock",
+        verdict="missing",
+        found="not in this kernel, or not enabled",
+        advice="kernel 5.13 or later with lsm=landlock,…; tier bwrap works without it, tier landlock does not",
+    )
+
+
+def _cgroups() -> Check:
+    root = Path("/sys/fs/cgroup")
+    if (root / "cgroup.controllers").is_file():
+        found = f"version 2: {(root / 'cgroup.controllers').read_text().strip() or 'no controllers'}"
+    elif root.is_dir() and any(root.iterdir()):
+        found = "version 1"
+    else:
+        found = "none"
+    return Check(name="cgroups", verdict="note", found=f"{found} (limits do not need them)")
+
+
+def _pinning() -> Check:
+    allowed = os.sched_getaffinity(0)
+    core = min(allowed)
+    try:
+        os.sched_setaffinity(0, {core})
+        os.sched_setaffinity(0, allowed)
+    except OSError as error:
+        return Check(
+            name="CPU pinning",
+            verdict="missing",
+            found=error.strerror or str(error),
+            advice="allow sched_setaffinity; without it a step costs 100 µs more",
+        )
+    return Check(
+        name="CPU pinning", verdict="ok", found=f"{len(allowed)} of {os.cpu_count()} cores may be used"
+    )
+
+
+def _shared_memory() -> Check:
+    path = Path("/dev/shm")
+    if not path.is_dir():
+        return Check(name="/dev/shm", verdict="note", found="not there (the runtime does not need it)")
+    free = shutil.disk_usage(path).free
+    return Check(name="/dev/shm", verdict="note", found=f"{free >> 20:,} MiB free (not shown to policies)")
+
+
+def _clock() -> Check:
+    resolution = time.get_clock_info("monotonic").resolution
+    source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    name = source.read_text().strip() if source.is_file() else "unknown source"
+    start = time.perf_counter()
+    for _ in range(1000):
+        time.monotonic()
+    each = (time.perf_counter() - start) * 1e6
+    return Check(
+        name="clock", verdict="note", found=f"{name}, {resolution * 1e9:g} ns, {each:.0f} ns to read"
+    )
+
+
+def _fingerprint() -> list[Check]:
+    found = fingerprint()
+    packages = ", ".join(f"{name} {version}" for name, version in found.packages.items())
+    return [
+        Check(name="worker", verdict="note", found=f"{found.code_version}, Python {found.python}"),
+        Check(name="packages", verdict="note", found=packages),
+        Check(name="CPU", verdict="note", found=found.cpu),
+    ]
+
+
+def _tiers(allowed_packages: tuple[str, ...]) -> list[Check]:
+    rows = []
+    tiers: tuple[Tier, ...] = ("bwrap", "landlock")
+    for tier in tiers:
+        why = why_not(tier, allowed_packages)
+        if why is None:
+            rows.append(Check(name=f"tier {tier}", verdict="ok", found="a sandbox started"))
+        else:
+            rows.append(Check(name=f"tier {tier}", verdict="missing", found=why, advice="see the rows above"))
+    return [
+        *rows,
+        Check(name="tier none", verdict="note", found="no sandbox; used only by runs that ask for it"),
+    ]
