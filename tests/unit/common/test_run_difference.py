@@ -1,0 +1,59 @@
+"""What makes two run directories different, and what does not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from evopolicy_common.run_difference import differences
+
+
+def make_run(root: Path, name: str, **changes: Any) -> Path:
+    folder = root / name
+    summary = {"returns": [1.0], "submit_started_at": name, "wall_time_seconds": 1.0, **changes}
+    record = {
+        "exp_id": name,
+        "timing": {"wall_s": len(name)},
+        "outcome": {"final_score": 1.0, "auxiliary": {"infrastructure_retries": len(name)}},
+    }
+    files = {
+        "run.json": json.dumps(record),
+        "logs/harness.log": name,
+        "workspace/AGENTS.md": name,
+        "workspace/system/policy.py": "class Policy: pass",
+        "workspace/feedback/submit_000/summary.json": json.dumps(summary),
+        "workspace/feedback/submit_000/episodes/ep_000/error.txt": json.dumps(
+            {"timestamp": name, "message": "x"}
+        ),
+    }
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    return folder
+
+
+def test_times_logs_and_names_make_no_difference(tmp_path: Path) -> None:
+    assert differences(make_run(tmp_path, "a"), make_run(tmp_path, "bcd")) == []
+
+
+def test_a_return_a_file_and_a_byte_each_make_one(tmp_path: Path) -> None:
+    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b", returns=[2.0])
+    (right / "workspace/system/policy.py").write_text("class Policy: 1")
+    (right / "extra").touch()
+    (left / "workspace/feedback/submit_000/episodes/ep_000/error.txt").write_text(
+        json.dumps({"timestamp": "t", "message": "y"})
+    )
+    found = differences(left, right)
+    assert [line.partition(":")[0] for line in found] == [
+        "extra",
+        "workspace/feedback/submit_000/episodes/ep_000/error.txt",
+        "workspace/feedback/submit_000/summary.json",
+        "workspace/system/policy.py",
+    ]
+    assert "returns: [1.0] and [2.0]" in found[2]
+
+
+def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
+    found = differences(make_run(tmp_path, "a", extra=1), make_run(tmp_path, "b"))
+    assert found == ["workspace/feedback/submit_000/summary.json: extra: 1 and nothing"]
