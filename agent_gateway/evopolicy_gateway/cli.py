@@ -16,10 +16,9 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import fail, fail_on_our_errors
+from evopolicy_common.cli import fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses, options, processes, trials
-from evopolicy_gateway.command_line import run_app
 from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.runs import Cluster, exit_code, play_all

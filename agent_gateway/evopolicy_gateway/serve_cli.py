@@ -17,11 +17,10 @@ import orjson
 import structlog
 import typer
 
-from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, setup_logging
+from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
-from evopolicy_gateway.command_line import run_app
 from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed
 from evopolicy_gateway.gateway import Close, Gateway, folder_of
 from evopolicy_gateway.layout import RunFolder

@@ -1,4 +1,4 @@
-"""What all commands share: logging to stderr, and errors of ours as one line with exit code 2."""
+"""What all commands share: logging to stderr, and wrong options and errors of ours as one line with exit code 2."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterator
-from typing import NoReturn, TextIO, cast
+from typing import Any, NoReturn, TextIO, cast
 
 import structlog
+import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 
 USAGE_ERROR = 2
 FAILURE = 1
+
+# typer brings click with it, under a name of its own in newer versions: only its public exceptions lead there.
+_ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 
 class _Stderr:
@@ -63,3 +67,14 @@ def fail_on_our_errors() -> Iterator[None]:
         fail(str(error), FAILURE)
     except KeyboardInterrupt:
         fail("interrupted", 130)
+
+
+def run_app(app: typer.Typer) -> None:
+    """Runs the command that `sys.argv` names, and exits."""
+    try:
+        code = typer.main.get_command(app).main(standalone_mode=False)
+    except _ClickError as error:
+        fail(" ".join(error.format_message().split()) or "wrong usage; see --help", USAGE_ERROR)
+    except (typer.Abort, KeyboardInterrupt):
+        fail("interrupted", 130)
+    raise SystemExit(code if isinstance(code, int) else 0)

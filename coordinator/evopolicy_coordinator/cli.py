@@ -11,7 +11,7 @@ import msgspec
 import typer
 
 from evopolicy_common.blobs import write_atomically
-from evopolicy_common.cli import fail_on_our_errors, setup_logging
+from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator import process
@@ -98,7 +98,7 @@ def _ready_line(ready: Ready) -> str:
 
 def main() -> None:
     """The console script."""
-    app()
+    run_app(app)
 
 
 if __name__ == "__main__":

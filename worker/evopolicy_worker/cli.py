@@ -15,11 +15,14 @@ import tempfile
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import structlog
 import typer
+from rich.console import Console
+from rich.table import Table
 
 from evopolicy_common import catalogue, credentials, keys, transport
-from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
+from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
@@ -27,6 +30,7 @@ from evopolicy_worker import environments
 from evopolicy_worker.cores import Cores
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import available_tiers
+from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
 
@@ -100,6 +104,31 @@ def work(
             )
 
 
+@app.command("doctor")
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Checks what this machine gives to the policies' sandbox, and which tier a worker gets here, and why.
+
+    Example: evopolicy-worker doctor
+
+    Exit code 0 when a sandboxed tier works, 1 when only `none` does.
+    """
+    checks = examine()
+    best = best_tier(checks)
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode({"tier": best, "checks": checks})).decode())
+    else:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("check", "verdict", "found", "what to do"):
+            table.add_column(heading, overflow="fold")
+        for check in checks:
+            table.add_row(check.name, check.verdict, check.found, check.advice)
+        Console().print(table)
+        typer.echo(f"tier: {best or 'none (policies would not be locked in; only for runs that ask for it)'}")
+    raise typer.Exit(0 if best else 1)
+
+
 def describe_all(env_ids: list[str]) -> tuple[EnvironmentDescription, ...]:
     """Descriptions of environments, made in a process of its own: this one must stay free of simulators."""
     context = multiprocessing.get_context("spawn")
@@ -166,7 +195,7 @@ def main() -> None:
     os.environ.update(environments.process_environment())
     if sys.platform != "linux":
         fail("evopolicy-worker runs on Linux (or WSL2): its sandbox is made of Linux namespaces")
-    app()
+    run_app(app)
 
 
 if __name__ == "__main__":
