@@ -26,8 +26,9 @@ QUIET_S = 600.0
 """Longest without a commit, once there are no more faults, that slow workers and long episodes can account for."""
 VALIDATE_EVERY = 7
 """Steps between looks at the core's invariants, which are costly."""
-PREEMPT_S = 15.0
-"""A train job may wait so long while hidden jobs run in its lane; messages may be late and lost."""
+PREEMPT_S = 19.0
+"""A train job may wait so long while hidden jobs run in its lane: a worker that was told to stop and is cut off counts as
+about to stop until its lease would have expired."""
 
 
 class ViolationError(AssertionError):

@@ -27,9 +27,13 @@ evaluation ids, stimulus ids. The core derives the rest: group and job ids from 
 and attempt; policy seeds by HMAC (`seeds`). Attempt numbers grow over restarts too, since they start at
 (incarnation − 1) · 1,000,000.
 
-*Tokens* are the shell's to check, before it raises an event; `core.capability(run)` gives a run's (finished runs too).
+*Tokens* are the shell's to check, before it raises an event; `core.capability(run)` gives a run's (finished runs
+too), `core.worker_of(session)` the worker whose session it is.
 Sessions are the core's: a request with an unknown one is answered `Refused("unknown_worker")`, upon which the worker
 registers again, beats with all that it holds, and goes on.
+
+*What a worker is to stop* (preempted, cancelled, played elsewhere) is told in whichever of its answers comes first: the
+waiting lease poll, a heartbeat that is held back (`wait_s`), or the next heartbeat.
 
 *Long polls* (leases, results, evaluations, waiting for a run) are kept in the core, as soft state with deadlines:
 each event with a `request` is answered by exactly one effect that names it. A second lease poll of a worker answers

@@ -80,8 +80,10 @@ def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, 
 
 def _silent(core: Core, lease: Lease, now: float) -> bool:
     """Whether the holder of a lease may have stood still during it."""
+    if lease.job.failures >= core.settings.doubts_max:
+        return False
     unheard_s = now - lease.renewed
-    return lease.doubtful or lease.granted_at < core.stalled_at or unheard_s > core.settings.lease_ttl_s
+    return lease.doubtful or lease.granted_at < core.stalled_at or unheard_s > core.settings.silence_s
 
 
 def _limit_verdict(outcome: EpisodeOutcome) -> bool:

@@ -59,7 +59,7 @@ class Lease:
     orphan_until: float | None = None
     """Its session ended; a heartbeat may claim it until then."""
     doubtful: bool = False
-    """Its holder was silent for a time to live, or this incarnation did not grant it: a verdict about a limit may be the
+    """Its holder was silent for long, or this incarnation did not grant it: a verdict about a limit may be the
     silence's fault, and does not count."""
     hidden_in: dict[Lease, None] | None = None
     """Where it is listed as one that may be preempted."""
@@ -140,7 +140,7 @@ class LeaseBook:
             if lease is None or not lease.live:
                 stop.append(item.lease_id)
                 continue
-            lease.doubtful = lease.doubtful or now - lease.renewed > self._core.settings.lease_ttl_s
+            lease.doubtful = lease.doubtful or now - lease.renewed > self._core.settings.silence_s
             lease.renewed = now
             lease.named = True
             lease.orphan_until = None

@@ -75,7 +75,7 @@ class Core:
         self.hold_until = now + settings.lease_ttl_s
         """Nothing expires before."""
         self.stalled_at = now
-        """When the loop last came to after standing still, or started."""
+        """When the loop last came to after standing still for long, or started."""
         self._flows = 0
         self._called_at = now
 
@@ -146,7 +146,8 @@ class Core:
         due = self.next_deadline()
         if due is not None and now - due > self.settings.late_s:
             self.hold_until = now + self.settings.lease_ttl_s
-            self.stalled_at = now
+            if now - due > self.settings.standstill_s:
+                self.stalled_at = now
         self._called_at = now
 
     def _fire(self, key: TimerKey, turn: Turn) -> None:

@@ -18,6 +18,13 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """After a restart, jobs that may be running somewhere wait so long for a heartbeat that names them."""
     late_s: float = 1.0
     """A deadline served later than this means the loop stood still: then nothing expires for one time to live."""
+    silence_s: float = 7.5
+    """After so long without a word from its worker, a verdict about a limit, or a slot's death, may be the silence's fault:
+    it does not count and the job is played again."""
+    standstill_s: float = 5.0
+    """The same holds for jobs that were leased before the coordinator's own loop stood still for so long."""
+    doubts_max: int = 8
+    """A job that failed so often is taken at its word all the same."""
     retry_base_s: float = 0.5
     """First back-off after an infrastructure failure; doubles with each."""
     retry_max_s: float = 60.0
