@@ -65,6 +65,17 @@ class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
     text: str
 
 
+class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
+    """The agent is at something else, has used more tokens, or waits for its provider."""
+
+    action: str = ""
+    tokens: dict[str, Any] | None = None
+    """Of the run so far, as in `run.json`."""
+    paused_s: float = 0.0
+    """It waits that long for `provider`; 0.0: it does not, or no longer."""
+    provider: str = ""
+
+
 class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """The agent and all its children are gone."""
 
@@ -98,13 +109,16 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     started_in: str
     """Where the operator's command was given: file names in the agent's command are meant from there."""
     wall_limit_s: float
+    config: dict[str, Any] | None = None
+    """A coding agent's settings: `AgentConfig`."""
+    session_file: str | None = None
 
 
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
     pass
 
 
-AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentEnded
+AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentDoing | AgentEnded
 AnyOrder = CloseRun | StartAgent | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)

@@ -80,6 +80,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "run.json"
 
     @property
+    def session(self) -> Path:
+        """A coding agent's session: `SessionState`."""
+        return self.state / "session.json"
+
+    @property
     def staged(self) -> Path:
         """What was put into the workspace: `Staged`."""
         return self.state / "staged.json"

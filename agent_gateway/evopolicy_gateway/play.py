@@ -25,7 +25,17 @@ from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord
 from evopolicy_gateway import children, control, processes, record
 from evopolicy_gateway.children import Child
-from evopolicy_gateway.control import AgentEnded, AgentTurn, CloseRun, Progress, Ready, RunClosed, StartAgent
+from evopolicy_gateway.control import (
+    AgentDoing,
+    AgentEnded,
+    AgentTurn,
+    CloseRun,
+    Progress,
+    Ready,
+    RunClosed,
+    StartAgent,
+)
+from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.layout import OpenedRun, RunFolder, run_folder, save
 from evopolicy_gateway.operations import Operations
 from evopolicy_gateway.watch import Watch
@@ -49,6 +59,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     wall_limit_s: float
     """The agent's time, seconds."""
     overwrite: bool = False
+    config: AgentConfig | None = None
+    """A coding agent's settings, from a suite's file."""
 
     @property
     def folder(self) -> RunFolder:
@@ -223,12 +235,16 @@ class RunPlay:
                 },
                 started_in=str(self._plan.started_in),
                 wall_limit_s=self._plan.wall_limit_s,
+                config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
+                session_file=str(self._folder.session),
             )
         )
         ended = AgentEnded(reason="agent_failed", detail="its keeper died")
         async for event in self._keeper.events():
             if isinstance(event, AgentTurn):
                 self._watch.turn(self._name, event.turn, event.text)
+            elif isinstance(event, AgentDoing):
+                self._watch.doing(self._name, event)
             elif isinstance(event, AgentEnded):
                 ended = event
         await self._keeper.ended()

@@ -145,7 +145,7 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
     tokens = told.get("tokens")
     return Agent(
         entry=plan.settings.entry,
-        harness=plan.agent.partition(":")[0],
+        harness=told.get("harness") or plan.agent.partition(":")[0],
         cli_version=told.get("cli_version"),
         model_string=told.get("model_string"),
         settings={"agent": plan.agent, "wall_limit_s": plan.wall_limit_s, **told.get("settings", {})},

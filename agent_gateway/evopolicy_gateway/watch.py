@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.messages.operator import RunProgress
-from evopolicy_gateway.control import Progress
+from evopolicy_gateway.control import AgentDoing, Progress
 
 PHASES = {
     "open": "train",
@@ -34,6 +34,9 @@ class Watch(Protocol):
 
     def turn(self, run: str, turn: int, text: str) -> None:
         """The agent has said something."""
+
+    def doing(self, run: str, doing: AgentDoing) -> None:
+        """The agent is at something else, or has used more tokens."""
 
     def phase(self, run: str, progress: RunProgress) -> None:
         """Finalisation has moved."""
@@ -62,6 +65,10 @@ class Lines:
 
     def turn(self, run: str, turn: int, text: str) -> None:
         self.note(run, f"turn {turn}: {_first_line(text)}")
+
+    def doing(self, run: str, doing: AgentDoing) -> None:
+        if doing.paused_s:
+            self.note(run, f"{_first_line(doing.action)} (for {doing.paused_s:.0f} s)")
 
     def phase(self, run: str, progress: RunProgress) -> None:
         if self._changed(f"{run} phase", progress.phase) and progress.phase != "finished":
@@ -102,6 +109,10 @@ class LiveTable:
 
     def turn(self, run: str, turn: int, text: str) -> None:
         self._row(run).said = _first_line(text)
+
+    def doing(self, run: str, doing: AgentDoing) -> None:
+        if doing.action:
+            self._row(run).said = _first_line(doing.action)
 
     def phase(self, run: str, progress: RunProgress) -> None:
         self._row(run).phase = progress

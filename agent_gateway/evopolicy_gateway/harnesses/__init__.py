@@ -6,13 +6,23 @@ import os
 import shlex
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.base import Harness
-from evopolicy_gateway.harnesses.command import CommandHarness
+import msgspec
 
-FORMS = "evolve, random, replay:DIR, command:PROGRAM…"
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.harnesses.agent_config import AgentConfig, read_agent
+from evopolicy_gateway.harnesses.base import Harness
+from evopolicy_gateway.harnesses.claude_code import ClaudeCode
+from evopolicy_gateway.harnesses.cli_agent import CliAgent
+from evopolicy_gateway.harnesses.codex import Codex
+from evopolicy_gateway.harnesses.command import CommandHarness
+from evopolicy_gateway.harnesses.configured import ConfiguredCli
+from evopolicy_gateway.harnesses.dialect import Dialect
+
+FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, file:AGENT.toml"
+_DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode}
 
 
 def entry_name(agent: str) -> str:
@@ -22,15 +32,25 @@ def entry_name(agent: str) -> str:
         return f"replay-{Path(rest).resolve().name}"
     if kind == "command" and rest.strip():
         return f"command-{Path(_split(rest)[0]).name}"
+    if kind in _DIALECTS and rest:
+        return f"{rest} ({kind})"
+    if kind == "file" and rest:
+        return Path(rest).stem
     return kind
 
 
-def make(agent: str, started_in: Path) -> Harness:
-    """The harness of `--agent`. ConfigError for what is none, or names what is not there.
+def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Harness:
+    """The harness of `--agent`, with a coding agent's settings where the operator has them. ConfigError for what is none.
 
     Files in a command or after `replay:` are meant from `started_in`: the agent itself runs elsewhere.
     """
     kind, colon, rest = agent.partition(":")
+    if config is None and kind == "file" and rest:
+        config = read_agent(started_in / rest)
+    if config is None and kind in _DIALECTS:
+        config = AgentConfig(harness=kind, model=rest or None)
+    if config is not None:
+        return _cli_agent(config, started_in)
     if kind in ("evolve", "random") and not colon:
         module = {"evolve": "evolve", "random": "uniform"}[kind]
         return CommandHarness(kind, _ours(module))
@@ -42,6 +62,16 @@ def make(agent: str, started_in: Path) -> Harness:
     if kind == "command" and rest.strip():
         return CommandHarness("command", _program(agent, _split(rest), started_in))
     raise ConfigError(f"--agent {agent!r} is not an agent; there are {FORMS}")
+
+
+def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
+    config.check()
+    if config.program:
+        config = msgspec.structs.replace(config, program=tuple(_absolute(config.program, started_in)))
+    dialect = _DIALECTS.get(config.harness)
+    if dialect is not None and config.cli is not None:
+        raise ConfigError(f"harness {config.harness} takes no [cli] table; give it another name")
+    return CliAgent(ConfiguredCli(config) if dialect is None else dialect(config))
 
 
 def _ours(module: str) -> list[str]:
@@ -58,10 +88,13 @@ def _split(command: str) -> list[str]:
 
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     """The command with files that lie where it was given named absolutely."""
-    # Links stay links: a virtual environment's python is one, and another program without it.
-    resolved = [
-        os.path.abspath(started_in / word) if (started_in / word).is_file() else word for word in words
-    ]
+    resolved = _absolute(words, started_in)
     if shutil.which(resolved[0]) is None:
         raise ConfigError(f"--agent {agent}: no program {words[0]!r}, neither a file here nor on the PATH")
     return resolved
+
+
+def _absolute(words: Sequence[str], started_in: Path) -> list[str]:
+    """The words with files that lie where they were given named absolutely."""
+    # Links stay links: a virtual environment's python is one, and another program without it.
+    return [os.path.abspath(started_in / word) if (started_in / word).is_file() else word for word in words]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from typing import Any
 
 import orjson
+
+from evopolicy_gateway.harnesses.redaction import Redaction
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LOG_BYTES = 1 << 30
@@ -13,16 +16,21 @@ MAX_LOG_BYTES = 1 << 30
 
 
 class AgentLog:
-    """Appends; every line reaches the file at once. What the disk refuses is lost, the agent goes on."""
+    """Appends, without keys and tokens; every line reaches the file at once. What the disk refuses is lost, the agent goes on."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, redact: Redaction | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("ab", buffering=0)
         self._left = MAX_LOG_BYTES - path.stat().st_size
+        self.redact = redact or Redaction()
+        self.last_errors: deque[str] = deque(maxlen=20)
+        """What came on stderr last, for a message about why a program ended."""
 
     def raw(self, line: bytes, stream: str) -> None:
         """A line of the agent as it came when it is JSON on stdout, else wrapped with the name of its stream."""
         line = line.rstrip(b"\r\n")
+        if stream == "stderr":
+            self.last_errors.append(line[:500].decode("utf-8", "replace").strip())
         if stream == "stdout" and line.startswith(b"{") and len(line) <= MAX_LINE_BYTES:
             try:
                 orjson.loads(line)
@@ -47,6 +55,7 @@ class AgentLog:
     def _write(self, line: bytes) -> None:
         if self._left <= 0:
             return
+        line = self.redact(line)
         self._left -= len(line) + 1
         if self._left <= 0:
             line = orjson.dumps(

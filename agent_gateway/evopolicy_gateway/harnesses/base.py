@@ -7,6 +7,7 @@ It does not end processes and does not watch the clock; the keeper does both.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import urllib.request
 from abc import ABC, abstractmethod
@@ -19,6 +20,7 @@ import msgspec
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import AgentProcess
+from evopolicy_gateway.harnesses.clock import AgentClock
 
 _INFO_TIMEOUT_S = 30.0
 
@@ -39,6 +41,21 @@ class Ending(msgspec.Struct, frozen=True, kw_only=True):
     """What else `run.json` tells: `cli_version`, `model_string`, `settings`, `tokens`."""
 
 
+class Doing(msgspec.Struct, frozen=True, kw_only=True):
+    """What an agent is at, for people who watch and for a sweep that accounts for it."""
+
+    action: str = ""
+    tokens: dict[str, Any] | None = None
+    """Of the run so far, as in `run.json`."""
+    paused_s: float = 0.0
+    """It waits that long for its provider."""
+    provider: str = ""
+
+
+def _nobody_watches(_: Doing) -> None:
+    pass
+
+
 class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """Where an agent plays."""
 
@@ -53,6 +70,21 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """Told what the agent says, for people who watch."""
     started: list[int] = []
     """Ids of the processes that `start` has started, whose exit status it takes."""
+    session_file: Path | None = None
+    """Where a session is kept, so that it goes on after its keeper was killed."""
+    on_doing: Callable[[Doing], None] = _nobody_watches
+    clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
+    over: asyncio.Event = msgspec.field(default_factory=asyncio.Event)
+    """Set when the agent's time is over: a program that ends from now on has been ended, and is not started again."""
+
+    def with_environment(self, more: Mapping[str, str]) -> Stage:
+        """The same stage with more variables."""
+        return msgspec.structs.replace(self, environment={**self.environment, **more})
+
+    async def sleep(self, seconds: float) -> None:
+        """Waits, but not beyond the agent's time."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.over.wait(), seconds)
 
     async def start(self, program: list[str], *, talks: bool) -> AgentProcess:
         """Starts a program of the agent in the workspace; `talks`: it is written to. AgentError when it cannot be."""
@@ -75,6 +107,8 @@ class Harness(ABC):
 
     name: str
     """As `run.json` names it: `command`, `replay`, `evolve`, …"""
+    resumable = False
+    """It goes on from `Stage.session_file` after everything of it was killed."""
 
     @abstractmethod
     async def play(self, stage: Stage) -> Ending:

@@ -13,6 +13,7 @@ from typing import Any
 
 import orjson
 
+from evopolicy_gateway.harnesses import prompts
 from evopolicy_gateway.harnesses.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
 
@@ -87,10 +88,7 @@ async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> None:
 
 async def _message(stage: Stage, turn: int) -> str:
     if turn == 0:
-        return (
-            "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed."
-            " Work until the episode budget is spent or you cannot improve the policy any further."
-        )
+        return prompts.FIRST
     try:
         left = (await stage.info())["state"]["remaining_budget"]
     except (OSError, ValueError, KeyError):

@@ -10,18 +10,23 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
+import msgspec
 import structlog
 
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway import control, processes
-from evopolicy_gateway.control import AgentEnded, AgentTurn, Orders, StartAgent
+from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentTurn, Orders, StartAgent
 from evopolicy_gateway.harnesses import make
+from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import environment_of
-from evopolicy_gateway.harnesses.base import Ending, Stage
+from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
+from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.harnesses.redaction import Redaction
 
 END_GRACE_S = 3.0
 """From SIGTERM to SIGKILL."""
@@ -33,20 +38,28 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     """Plays the agent to its end, or until told; everything that it started is gone afterwards."""
-    agent_log = AgentLog(Path(order.agent_log))
+    environment = environment_of(order.urls)
+    config = None if order.config is None else msgspec.convert(order.config, AgentConfig)
+    agent_log = AgentLog(Path(order.agent_log), Redaction.of(secrets_in(environment, config), order.urls))
+    clock = AgentClock(order.wall_limit_s)
     stage = Stage(
         workspace=Path(order.workspace),
         urls=order.urls,
-        environment=environment_of(order.urls),
+        environment=environment,
         log=agent_log,
         on_turn=lambda turn, text: control.emit(AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
+        session_file=None if order.session_file is None else Path(order.session_file),
+        on_doing=_tell,
+        clock=clock,
     )
-    play = asyncio.create_task(_play(order, stage))
+    play = asyncio.create_task(_play(order, stage, config))
     told = asyncio.create_task(_stopped(orders))
+    late = asyncio.create_task(clock.run_out())
     log.info("agent started", agent=order.agent)
     try:
-        await asyncio.wait([play, told], timeout=order.wall_limit_s, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([play, told, late], return_when=asyncio.FIRST_COMPLETED)
         reason = None if play.done() else "told" if told.done() else "wall_limit"
+        stage.over.set()
         left = await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=stage.started)
         # With its programs gone a harness ends by itself, and can still say how far it came.
         await asyncio.wait([play], timeout=LAST_WORDS_S)
@@ -54,6 +67,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         ending = (await asyncio.gather(play, return_exceptions=True))[0]
     finally:
         told.cancel()
+        late.cancel()
         agent_log.close()
     if left:
         log.error("processes of the agent survive", pids=left)
@@ -70,8 +84,25 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     raise ending
 
 
-async def _play(order: StartAgent, stage: Stage) -> Ending:
-    return await make(order.agent, Path(order.started_in)).play(stage)
+async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> Ending:
+    return await make(order.agent, Path(order.started_in), config).play(stage)
+
+
+def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
+    """Variables whose values may be secrets: what an agent's settings name for passing on is one whatever its name."""
+    named = {} if config is None else {f"{name}_KEY": environment.get(name, "") for name in config.pass_environment}
+    return {**environment, **named}
+
+
+def _tell(doing: Doing) -> None:
+    control.emit(
+        AgentDoing(
+            action=doing.action[:_TEXT_SHOWN],
+            tokens=doing.tokens,
+            paused_s=doing.paused_s,
+            provider=doing.provider,
+        )
+    )
 
 
 async def _stopped(orders: Orders) -> None:

@@ -1,0 +1,126 @@
+"""Claude Code: `claude --print --output-format stream-json`, its session begun under an id of ours and resumed by it.
+
+Its stream, a JSON object a line: `system` (subtype `init` with the session and the version, `api_retry` for retries of its
+own), `assistant` and `user` messages with content blocks, and one `result` at the end: `is_error`, `api_error_status`,
+`errors`, and `usage` of this invocation, with cache reads and creations apart from `input_tokens`. A message's own usage is
+repeated with every block of it and tells too little output, so it counts only where no result came.
+
+Tools are the paper's six; permissions are bypassed, since what holds an agent is the jail around it. As root the CLI
+refuses that unless `IS_SANDBOX=1`.
+
+https://code.claude.com/docs/en/headless, https://code.claude.com/docs/en/cli-reference
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line, mapping, string
+from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.usage import Usage, count
+
+TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
+_ISOLATION = ("--safe-mode", "--strict-mcp-config")
+
+
+class ClaudeCode(Dialect):
+    """`claude`."""
+
+    name = "claude-code"
+    program = ("claude",)
+    tested_version = "2.1.197"
+    install = "npm install -g @anthropic-ai/claude-code"
+    help_args = ("--help",)
+    makes_session_id = True
+
+    def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
+        words = ["--print", "--output-format", "stream-json", "--verbose"]
+        words += ["--permission-mode", "bypassPermissions"]
+        # Before `--tools` came, the profile could only be had by allowing its members.
+        words += ["--tools" if "--tools" in options else "--allowedTools", TOOLS]
+        if not self.config.user_config:
+            words += [option for option in _ISOLATION if option in options]
+        if self.config.model is not None:
+            words += ["--model", self.config.model]
+        if self.config.effort is not None:
+            words += ["--effort", self.config.effort]
+        words += self.config.extra_args
+        if session is not None:
+            words += ["--resume" if resume else "--session-id", session]
+        return words
+
+    def environment(self) -> dict[str, str]:
+        quiet = {"CLAUDE_CODE_DISABLE_NONESSENTIAL_TRAFFIC": "1", "DISABLE_AUTOUPDATER": "1"}
+        return quiet | ({"IS_SANDBOX": "1"} if os.geteuid() == 0 else {})
+
+    def required_options(self) -> list[str]:
+        needed = ["--print", "--output-format", "--permission-mode", "--session-id", "--resume"]
+        return needed + (["--effort"] if self.config.effort is not None else [])
+
+    def reader(self) -> ClaudeReader:
+        return ClaudeReader()
+
+
+class ClaudeReader(TurnReader):
+    """One `claude --print`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._messages: dict[str, Usage] = {}
+
+    def read(self, event: Mapping[str, Any]) -> None:
+        kind = event.get("type")
+        if kind == "system" and event.get("subtype") == "init":
+            self.session = string(event.get("session_id")) or None
+        elif kind == "system" and event.get("subtype") == "api_retry":
+            self.requests_failed += 1
+        elif kind == "assistant":
+            self._message(mapping(event.get("message")))
+        elif kind == "result":
+            self._result(event)
+
+    def _message(self, message: Mapping[str, Any]) -> None:
+        identity = string(message.get("id"))
+        if identity:
+            self._messages[identity] = usage_of(mapping(message.get("usage")))
+            self.usage = sum(self._messages.values(), Usage())
+        content = message.get("content")
+        for block in content if isinstance(content, list) else ():
+            self._block(mapping(block))
+
+    def _block(self, block: Mapping[str, Any]) -> None:
+        if block.get("type") == "text":
+            self.text = string(block.get("text"))
+            self.action = first_line(self.text) or self.action
+        elif block.get("type") == "tool_use":
+            given = mapping(block.get("input"))
+            command = string(given.get("command"))
+            target = string(given.get("file_path")) or string(given.get("pattern"))
+            self.action = f"$ {first_line(command)}" if command else f"{string(block.get('name'))} {target}"
+
+    def _result(self, result: Mapping[str, Any]) -> None:
+        told = usage_of(mapping(result.get("usage")))
+        if told.total >= self.usage.total:
+            self.usage = told
+        text = string(result.get("result"))
+        if not result.get("is_error"):
+            self.done, self.trouble = True, None
+            self.text = text or self.text
+            return
+        errors = result.get("errors")
+        words = [string(one) for one in (errors if isinstance(errors, list) else ())]
+        status = result.get("api_error_status")
+        message = text or "; ".join(words) or string(result.get("subtype")).replace("_", " ")
+        self.trouble = trouble_of(message, status if isinstance(status, int) else None)
+
+
+def usage_of(told: Mapping[str, Any]) -> Usage:
+    """The paper's counts from a `usage` object."""
+    return Usage(
+        input_noncached=count(told.get("input_tokens")),
+        cache_read=count(told.get("cache_read_input_tokens")),
+        cache_creation=count(told.get("cache_creation_input_tokens")),
+        output=count(told.get("output_tokens")),
+    )

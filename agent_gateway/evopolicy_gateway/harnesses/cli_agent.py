@@ -1,0 +1,251 @@
+"""A coding agent's CLI as an agent: one logical session, turn after turn, through failures, outages and restarts.
+
+Rules:
+- After a failure the same session is resumed, at most `retries` times in a row, each after a longer pause. Nothing of that
+  touches the environment or the budget.
+- A provider that stays away, or a quota that is spent, pauses the run instead; the agent's clock stands still meanwhile.
+- An agent that stops with budget left is told what remains, at most `reprompts` times.
+- A cap on tokens or money ends the agent, also within a turn where its stream tells.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import shutil
+import subprocess
+import uuid
+from typing import Any, Literal
+
+import structlog
+
+from evopolicy_gateway.harnesses import prompts, session
+from evopolicy_gateway.harnesses.base import AgentError, Doing, Ending, Harness, Stage
+from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader
+from evopolicy_gateway.harnesses.session import SessionState
+from evopolicy_gateway.harnesses.trouble import Trouble, backoff_s
+from evopolicy_gateway.harnesses.turn import play_turn
+from evopolicy_gateway.harnesses.usage import Usage
+
+_PROBE_PATIENCE_S = 60.0
+_MAX_PAUSE_S = 3600.0
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class CliAgent(Harness):
+    """Any CLI that there is a `Dialect` for."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        self.name = dialect.name
+        self.resumable = dialect.resumes
+        self._dialect = dialect
+        self._config = dialect.config
+        self._program = list(self._config.program or dialect.program)
+        self._options = ""
+        self._version: str | None = None
+        self._state = SessionState()
+        self._failures = 0
+        """Failed turns since the last one that was done."""
+        self._pause_s = self._config.pause_s
+
+    async def play(self, stage: Stage) -> Ending:
+        self._config.check(stage.environment)
+        stage = stage.with_environment(self._dialect.environment() | self._config.environment)
+        await self._probe(stage)
+        self._state = session.load(stage.session_file)
+        prompt = await self._prompt_after_failure(stage)
+        while True:
+            reader = await self._turn(stage, prompt)
+            if stage.over.is_set():
+                return self._ending()
+            ending = await (self._done(stage, reader) if reader.done else self._failed(stage, reader))
+            if isinstance(ending, Ending):
+                return ending
+            if stage.over.is_set():
+                return self._ending()
+            prompt = ending
+
+    async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
+        """One turn, booked."""
+        dialect, state = self._dialect, self._state
+        resume = state.session is not None and dialect.resumes
+        begun = state.session if resume else str(uuid.uuid4()) if dialect.makes_session_id else None
+        arguments = dialect.arguments(begun, resume=resume, prompt=prompt, options=self._options)
+        stage.log.note({"type": "prompt", "turn": state.turns, "session": begun, "message": prompt})
+        reader = dialect.reader()
+        spent = Usage() if dialect.cumulative else state.usage
+
+        def capped(now: TurnReader) -> str | None:
+            return self._capped(spent + now.usage)
+
+        program = [*self._program, *arguments]
+        await play_turn(stage, dialect, program, prompt, reader, self._config.silence_s, capped)
+        known = reader.session or begun
+        state.take(known or "", reader.usage, cumulative=dialect.cumulative)
+        if known is not None and (reader.session is not None or reader.done):
+            state.session = known
+        state.requests_failed += reader.requests_failed
+        self._keep(stage)
+        return reader
+
+    async def _done(self, stage: Stage, reader: TurnReader) -> Ending | str:
+        """The next prompt after a turn that was done, or the end."""
+        state = self._state
+        state.turns += 1
+        self._failures, self._pause_s = 0, self._config.pause_s
+        self._keep(stage)
+        stage.on_turn(state.turns, stage.log.redact.text(reader.text))
+        if (why := self._capped(state.usage)) is not None:
+            return self._ending("agent_stopped", why)
+        left = await left_of(stage)
+        if left == 0:
+            return self._ending()
+        if state.reprompts >= self._config.reprompts:
+            remaining = "budget" if left is None else f"{left} episodes"
+            return self._ending(
+                "agent_stopped", f"stopped with {remaining} left after {state.reprompts} reminders"
+            )
+        state.reprompts += 1
+        self._keep(stage)
+        if not self._dialect.resumes:
+            return prompts.FIRST
+        return prompts.interrupted(None) if left is None else prompts.go_on(left)
+
+    async def _failed(self, stage: Stage, reader: TurnReader) -> Ending | str:
+        """The prompt of the retry after a failed turn, once it is time for it, or the end."""
+        state, config = self._state, self._config
+        trouble = reader.trouble or Trouble(kind="passing", message="the program ended without a word")
+        message = stage.log.redact.text(trouble.message)
+        log.warning("turn failed", kind=trouble.kind, message=message, failures=self._failures + 1)
+        stage.log.note({"type": "turn_failed", "kind": trouble.kind, "message": trouble.message})
+        if trouble.kind == "final":
+            return self._ending("agent_failed", message)
+        if trouble.kind == "cap":
+            return self._ending("agent_stopped", message)
+        self._failures += 1
+        if trouble.kind == "lost":
+            state.session = None
+        if trouble.kind == "quota" or (trouble.provider and self._failures > config.retries):
+            if state.paused_s >= config.max_pause_s:
+                return self._ending("agent_failed", f"paused for {state.paused_s:.0f} s in all: {message}")
+            await self._pause(stage, trouble, message)
+        elif self._failures > config.retries:
+            return self._ending("agent_failed", f"failed {self._failures} times in a row: {message}")
+        elif trouble.kind != "lost":
+            wait_s = max(
+                backoff_s(self._failures, config.backoff_s, random.random()),
+                min(trouble.wait_s or 0.0, _MAX_PAUSE_S),
+            )
+            stage.on_doing(Doing(action=f"retry {self._failures} in {wait_s:.0f} s: {message}"))
+            await stage.sleep(wait_s)
+        state.retries += 1
+        self._keep(stage)
+        return await self._prompt_after_failure(stage)
+
+    async def _pause(self, stage: Stage, trouble: Trouble, message: str) -> None:
+        """Waits for the provider, with the agent's clock standing still."""
+        state, config = self._state, self._config
+        wait_s = self._pause_s if trouble.wait_s is None else trouble.wait_s
+        wait_s = min(wait_s * random.uniform(1.0, 1.1), max(0.0, config.max_pause_s - state.paused_s))
+        self._pause_s = min(2.0 * self._pause_s, max(_MAX_PAUSE_S, config.pause_s))
+        # Only a turn that is done wins the retries back: until then, one try a pause.
+        self._failures = max(self._failures, config.retries)
+        stage.log.note({"type": "paused", "seconds": round(wait_s, 1), "message": message})
+        paused = Doing(action=f"paused: {message}", paused_s=wait_s, provider=config.provider_name)
+        stage.on_doing(paused)
+        with stage.clock.paused():
+            await stage.sleep(wait_s)
+        state.paused_s += wait_s
+        stage.on_doing(Doing(action="tries again", provider=config.provider_name))
+
+    async def _prompt_after_failure(self, stage: Stage) -> str:
+        """The first prompt of a session, or what one that was interrupted is told."""
+        if self._state.session is None or not self._dialect.resumes:
+            return prompts.FIRST
+        return prompts.interrupted(await left_of(stage))
+
+    def _keep(self, stage: Stage) -> None:
+        session.save(stage.session_file, self._state)
+        stage.on_doing(Doing(tokens=self._state.usage.recorded(self._config.prices)))
+
+    def _capped(self, used: Usage) -> str | None:
+        config = self._config
+        if config.max_tokens is not None and used.total > config.max_tokens:
+            return f"cap reached: {used.total} tokens of {config.max_tokens} used"
+        if config.max_cost is not None and config.prices is not None:
+            cost = used.cost(config.prices)
+            if cost > config.max_cost:
+                return f"cap reached: {cost:.2f} of {config.max_cost:.2f} dollars spent"
+        return None
+
+    async def _probe(self, stage: Stage) -> None:
+        """Finds the program, its version and its options. AgentError says what is missing."""
+        name, dialect = self._program[0], self._dialect
+        if shutil.which(name, path=stage.environment.get("PATH")) is None:
+            how = f"; install it with: {dialect.install}" if dialect.install else ""
+            raise AgentError(f"no program {name!r} on the PATH{how}")
+        said = await self._ask(stage, dialect.version_args())
+        self._version = dialect.version_in(said)
+        if not dialect.help_args:
+            return
+        self._options = await self._ask(stage, dialect.help_args)
+        lacking = [option for option in dialect.required_options() if option not in self._options]
+        if lacking:
+            raise AgentError(
+                f"{name} {self._version or 'of an unknown version'} has no {', '.join(lacking)};"
+                f" known to work: {dialect.tested_version} ({dialect.install}@{dialect.tested_version})"
+            )
+        if self._version != dialect.tested_version:
+            log.warning(
+                "another version than the tested one", version=self._version, tested=dialect.tested_version
+            )
+
+    async def _ask(self, stage: Stage, arguments: tuple[str, ...]) -> str:
+        def run() -> str:
+            answer = subprocess.run(
+                [*self._program, *arguments],
+                cwd=stage.workspace,
+                env=dict(stage.environment),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=_PROBE_PATIENCE_S,
+                check=False,
+            )
+            return (answer.stdout or answer.stderr).decode("utf-8", "replace")
+
+        try:
+            return await asyncio.to_thread(run)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise AgentError(f"{self._program[0]} does not answer {' '.join(arguments)}: {error}") from error
+
+    def _ending(
+        self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
+    ) -> Ending:
+        state, config = self._state, self._config
+        settings: dict[str, Any] = config.settings() | {
+            "program": self._program,
+            "reprompted": state.reprompts,
+            "paused_s": round(state.paused_s, 1),
+            "requests_failed": state.requests_failed,
+        }
+        if self._dialect.tested_version not in ("", self._version):
+            settings["tested_version"] = self._dialect.tested_version
+        facts: dict[str, Any] = {
+            "harness": self.name,
+            "cli_version": self._version,
+            "model_string": config.model,
+            "settings": settings,
+        }
+        if state.usage.total:
+            facts["tokens"] = state.usage.recorded(config.prices)
+        return Ending(reason=reason, detail=detail, turns=state.turns, retries=state.retries, facts=facts)
+
+
+async def left_of(stage: Stage) -> int | None:
+    """Episodes that are left; None when the gateway does not answer."""
+    try:
+        state = (await stage.info())["state"]
+        return 0 if state["is_finalized"] else int(state["remaining_budget"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

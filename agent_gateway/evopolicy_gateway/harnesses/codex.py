@@ -1,0 +1,106 @@
+"""OpenAI's Codex CLI: `codex exec --json`, continued by `codex exec resume ID`.
+
+Its stream, a JSON object a line: `thread.started {thread_id}`, `turn.started`, `item.started|updated|completed {item}`,
+`turn.completed {usage}`, `turn.failed {error}`, `error {message}`. An `error` that starts with "Reconnecting" is only a
+notice; any error counts only if the turn does not complete. `usage` counts the thread from its beginning, across resumes;
+`input_tokens` holds the cached ones and `output_tokens` the reasoning ones.
+
+https://developers.openai.com/codex/noninteractive, https://github.com/openai/codex (codex-rs/exec)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line, mapping, string
+from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.usage import Usage, count
+
+_BYPASS = "--dangerously-bypass-approvals-and-sandbox"
+_ISOLATION = ("--ignore-user-config", "--ignore-rules")
+_NOTICE = "Reconnecting"
+
+
+class Codex(Dialect):
+    """`codex`."""
+
+    name = "codex"
+    program = ("codex",)
+    cumulative = True
+    tested_version = "0.169.0"
+    install = "npm install -g @openai/codex"
+    help_args = ("exec", "--help")
+
+    def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
+        words = ["exec", "resume"] if resume else ["exec"]
+        words += ["--json", "--skip-git-repo-check", _BYPASS]
+        if not self.config.user_config:
+            # Versions before these options read the user's settings whatever we say.
+            words += [option for option in _ISOLATION if option in options]
+        if self.config.model is not None:
+            words += ["--model", self.config.model]
+        if self.config.effort is not None:
+            words += ["--config", f'model_reasoning_effort="{self.config.effort}"']
+        words += self.config.extra_args
+        if resume and session is not None:
+            words.append(session)
+        return [*words, "-"]
+
+    def required_options(self) -> list[str]:
+        return ["--json", "--skip-git-repo-check", _BYPASS]
+
+    def reader(self) -> CodexReader:
+        return CodexReader()
+
+
+class CodexReader(TurnReader):
+    """One `codex exec`."""
+
+    def read(self, event: Mapping[str, Any]) -> None:
+        kind = event.get("type")
+        if kind == "thread.started":
+            self.session = string(event.get("thread_id")) or None
+        elif kind == "turn.completed":
+            self.done, self.trouble = True, None
+            self.usage = usage_of(mapping(event.get("usage")))
+        elif kind == "turn.failed":
+            self.done = False
+            self.trouble = trouble_of(string(mapping(event.get("error")).get("message")))
+        elif kind == "error":
+            self._error(string(event.get("message")))
+        elif kind in ("item.started", "item.updated", "item.completed"):
+            self._item(mapping(event.get("item")), completed=kind == "item.completed")
+
+    def _error(self, message: str) -> None:
+        if message.startswith(_NOTICE):
+            self.requests_failed += 1
+        elif not self.done:
+            self.trouble = trouble_of(message)
+
+    def _item(self, item: Mapping[str, Any], *, completed: bool) -> None:
+        kind = item.get("type") or item.get("item_type")
+        if kind in ("agent_message", "assistant_message"):
+            if completed:
+                self.text = string(item.get("text"))
+                self.action = first_line(self.text)
+        elif kind == "command_execution":
+            self.action = f"$ {first_line(string(item.get('command')))}"
+        elif kind == "file_change":
+            changes = item.get("changes")
+            paths = [
+                string(mapping(one).get("path")) for one in (changes if isinstance(changes, list) else ())
+            ]
+            self.action = f"edits {', '.join(path.rpartition('/')[2] for path in paths)}"
+
+
+def usage_of(told: Mapping[str, Any]) -> Usage:
+    """The paper's counts from a `usage` object."""
+    cached = count(told.get("cached_input_tokens"))
+    reasoning = told.get("reasoning_output_tokens")
+    return Usage(
+        input_noncached=max(0, count(told.get("input_tokens")) - cached),
+        cache_read=cached,
+        output=count(told.get("output_tokens")),
+        reasoning=count(reasoning) if reasoning is not None else None,
+    )

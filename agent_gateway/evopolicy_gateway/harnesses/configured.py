@@ -1,0 +1,130 @@
+"""A CLI that a TOML file describes: its arguments, and dotted paths into its JSON events.
+
+Lines that are no JSON are what the agent says. A turn is done when the program ends with status 0 and no event told an
+error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events
+from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
+from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.usage import Usage, count
+
+
+class ConfiguredCli(Dialect):
+    """`[cli]` of an agent's settings."""
+
+    tells_end = False
+
+    def __init__(self, config: AgentConfig) -> None:
+        super().__init__(config)
+        if config.cli is None or not config.program:
+            raise ConfigError(
+                f"harness {config.harness!r} is none of ours: it needs `program` and a [cli] table"
+            )
+        self._cli: Cli = config.cli
+        self.name = config.harness
+        self.program = config.program
+        self.cumulative = self._cli.events.tokens.counts == "session"
+        self.makes_session_id = self._cli.own_session_id
+        self.resumes = bool(self._cli.resume)
+        self.prompt_on_stdin = self._cli.prompt == "stdin"
+
+    def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
+        template = self._cli.resume if resume else self._cli.first
+        known = {"{model}": self.config.model, "{session}": session, "{prompt}": prompt}
+        words: list[str] = []
+        for word in template:
+            lacking = [name for name, value in known.items() if name in word and value is None]
+            if lacking:
+                # `--model {model}` goes as a pair; `--model={model}` alone.
+                if words and words[-1].startswith("-") and word == lacking[0]:
+                    words.pop()
+                continue
+            # In one pass, so that a prompt which holds `{model}` stays as it is.
+            words.append(_filled(word, {name: value or "" for name, value in known.items()}))
+        return words + list(self.config.extra_args)
+
+    def version_args(self) -> tuple[str, ...]:
+        return self._cli.version
+
+    def reader(self) -> ConfiguredReader:
+        return ConfiguredReader(self._cli.events)
+
+
+class ConfiguredReader(TurnReader):
+    """One turn of a configured CLI."""
+
+    def __init__(self, events: Events) -> None:
+        super().__init__()
+        self._events = events
+
+    def read(self, event: Mapping[str, Any]) -> None:
+        self.session = _first(event, self._events.session) or self.session
+        if text := _first(event, self._events.text):
+            self.text, self.action = text, first_line(text)
+        if action := _first(event, self._events.action):
+            self.action = first_line(action)
+        if error := _first(event, self._events.error):
+            self.trouble = trouble_of(error)
+        self._count(event)
+
+    def _count(self, event: Mapping[str, Any]) -> None:
+        paths = self._events.tokens
+        found: dict[str, int | None] = {
+            name: next(
+                (value for value in values(event, getattr(paths, name)) if isinstance(value, int)), None
+            )
+            for name in ("input", "cache_read", "cache_creation", "output", "reasoning")
+        }
+        if all(value is None for value in found.values()):
+            return
+        cached = count(found["cache_read"])
+        told = Usage(
+            input_noncached=max(0, count(found["input"]) - (cached if paths.input_includes_cached else 0)),
+            cache_read=cached,
+            cache_creation=count(found["cache_creation"]),
+            output=count(found["output"]),
+            reasoning=None if found["reasoning"] is None else count(found["reasoning"]),
+        )
+        self.usage = told if paths.counts == "session" else self.usage + told
+
+
+def values(document: Any, path: str) -> Iterator[Any]:
+    """Every value at a dotted path; nothing for an empty path."""
+    if not path:
+        return
+    head, _, rest = path.partition(".")
+    if head == "*":
+        inner: Iterable[Any] = document if isinstance(document, list) else ()
+    elif isinstance(document, dict) and head in document:
+        inner = (document[head],)
+    else:
+        return
+    for value in inner:
+        if rest:
+            yield from values(value, rest)
+        else:
+            yield value
+
+
+def _first(document: Mapping[str, Any], paths: tuple[str, ...]) -> str:
+    for path in paths:
+        for value in values(document, path):
+            if isinstance(value, str) and value:
+                return value
+    return ""
+
+
+def _filled(word: str, known: Mapping[str, str]) -> str:
+    out, at = "", 0
+    while at < len(word):
+        name = next((name for name in known if word.startswith(name, at)), None)
+        out += word[at] if name is None else known[name]
+        at += 1 if name is None else len(name)
+    return out

@@ -1,0 +1,74 @@
+"""Token accounting as the paper's appendix defines it: input that no cache served, cache traffic, output with reasoning.
+
+A stream that counts cached tokens into its input (Codex) has them taken off; one that reports them apart (Claude Code) is
+taken as it is. Reasoning is part of `output` in both, and shown beside it where it is told.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+MILLION = 1_000_000
+
+
+class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """US dollars per million tokens."""
+
+    input: float
+    """Of `input_noncached`."""
+    output: float
+    cache_read: float = 0.0
+    cache_creation: float = 0.0
+
+
+class Usage(msgspec.Struct, frozen=True, kw_only=True):
+    """Counts of tokens."""
+
+    input_noncached: int = 0
+    cache_read: int = 0
+    cache_creation: int = 0
+    output: int = 0
+    """Reasoning included."""
+    reasoning: int | None = None
+
+    def __add__(self, other: Usage) -> Usage:
+        reasoning = None
+        if self.reasoning is not None or other.reasoning is not None:
+            reasoning = (self.reasoning or 0) + (other.reasoning or 0)
+        return Usage(
+            input_noncached=self.input_noncached + other.input_noncached,
+            cache_read=self.cache_read + other.cache_read,
+            cache_creation=self.cache_creation + other.cache_creation,
+            output=self.output + other.output,
+            reasoning=reasoning,
+        )
+
+    @property
+    def total(self) -> int:
+        """All tokens, cached ones too."""
+        return self.input_noncached + self.cache_read + self.cache_creation + self.output
+
+    def cost(self, prices: Prices) -> float:
+        """US dollars."""
+        return (
+            self.input_noncached * prices.input
+            + self.cache_read * prices.cache_read
+            + self.cache_creation * prices.cache_creation
+            + self.output * prices.output
+        ) / MILLION
+
+    def recorded(self, prices: Prices | None) -> dict[str, Any]:
+        """As `run.json`'s `tokens`; reasoning and cost only where they are known."""
+        document: dict[str, Any] = msgspec.to_builtins(self)
+        if self.reasoning is None:
+            del document["reasoning"]
+        if prices is not None:
+            document["cost"] = round(self.cost(prices), 6)
+        return document
+
+
+def count(value: Any) -> int:
+    """A count of a stream; 0 for what is none."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0

@@ -1,0 +1,95 @@
+"""The real CLIs against a model API on loopback that makes them edit a file and submit. Opt-in, since they are large:
+
+    npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.197
+    EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin python -m pytest tests/integration/gateway/test_real_clis.py
+
+Nothing leaves the machine: the keys are made up, and the settings folders are the test's own.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from cli_stage import play, settings
+from model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
+
+from evopolicy_gateway.harnesses.agent_config import AgentConfig
+
+CLIS = os.environ.get("EVOPOLICY_REAL_CLIS", "")
+
+pytestmark = pytest.mark.skipif(
+    not CLIS, reason="needs the real CLIs: set EVOPOLICY_REAL_CLIS as this file's docstring says"
+)
+
+SUBMIT = (
+    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
+    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+)
+SCRIPT = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
+
+
+def config_for(harness: str, api: ModelApi) -> AgentConfig:
+    path = os.environ["PATH"]
+    if harness == "codex":
+        provider = (
+            f'model_providers.stub={{name="stub",base_url="{api.base_url}/v1",wire_api="responses",'
+            'env_key="STUB_KEY",request_max_retries=0,stream_max_retries=0}'
+        )
+        arguments = ("--config", "model_provider=stub", "--config", provider)
+        variables = {"STUB_KEY": "sk-stub-0123456789abcdef", "PATH": f"{CLIS}:{path}"}
+        return settings(harness, model="gpt-5.5", effort="high", extra_args=arguments, environment=variables)
+    variables = {
+        "ANTHROPIC_API_KEY": "sk-ant-stub-0123456789abcdef",
+        "ANTHROPIC_BASE_URL": api.base_url,
+        "CLAUDE_CODE_MAX_RETRIES": "0",
+        "PATH": f"{CLIS}:{path}",
+    }
+    return settings(harness, model="claude-opus-4-7-thinking-max", effort="max", environment=variables)
+
+
+@pytest.mark.parametrize("harness", ["codex", "claude-code"])
+def test_the_real_cli_edits_submits_and_is_resumed(tmp_path: Path, harness: str) -> None:
+    with ModelApi(SCRIPT) as api:
+        played = play(tmp_path, config_for(harness, api), "", budget=4)
+    assert played.ending is not None
+    assert played.ending.reason == "agent_stopped", played.ending.detail
+    assert (played.ending.turns, played.ending.retries) == (2, 0)
+    assert [text for _, text in played.turns] == ["first", "second"]
+    assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
+    tokens = played.ending.facts["tokens"]
+    assert tokens["input_noncached"] == 4 * (INPUT - CACHED)
+    assert tokens["cache_read"] == 4 * CACHED
+    assert tokens["output"] == 4 * OUTPUT
+    assert tokens["cache_creation"] == (0 if harness == "codex" else 4 * CREATED)
+    assert tokens.get("reasoning") == (4 * REASONING if harness == "codex" else None)
+    assert "sk-stub" not in played.text
+    # The second turn knows the first: one session.
+    assert "first" in str(api.requests[2])
+
+
+@pytest.mark.parametrize("harness", ["codex", "claude-code"])
+def test_the_real_cli_is_resumed_after_its_provider_failed(tmp_path: Path, harness: str) -> None:
+    script = [
+        SCRIPT[0],
+        Step(text="first"),
+        Step(status=503, text="overloaded"),
+        SCRIPT[2],
+        Step(text="second"),
+    ]
+    with ModelApi(script) as api:
+        played = play(tmp_path, config_for(harness, api), "", budget=4)
+    assert played.ending is not None
+    assert played.ending.reason == "agent_stopped", played.ending.detail
+    assert (played.ending.turns, played.ending.retries) == (2, 1)
+    assert "first" in str(api.requests[-1])
+
+
+@pytest.mark.parametrize("harness", ["codex", "claude-code"])
+def test_the_real_cli_with_a_wrong_key_ends_the_run(tmp_path: Path, harness: str) -> None:
+    with ModelApi([Step(status=401, text="invalid key")] * 9) as api:
+        played = play(tmp_path, config_for(harness, api), "", budget=4)
+    assert played.ending is not None
+    assert played.ending.reason == "agent_failed"
+    assert "401" in played.ending.detail

@@ -1,0 +1,156 @@
+"""A stage for a coding agent's CLI without a cluster: a gateway that only counts, a log, and the fake CLIs on the PATH."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from evopolicy_gateway.harnesses import make
+from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.agent_log import AgentLog
+from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
+from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.harnesses.keeper import secrets_in
+from evopolicy_gateway.harnesses.redaction import Redaction
+
+FAKES = Path(__file__).parent / "fake_clis"
+PATIENCE_S = 60.0
+PATH_TOKEN = "0123456789abcdef0123456789abcdef"
+
+
+@contextmanager
+def counting_gateway(budget: int) -> Iterator[dict[str, str]]:
+    """The three URLs of a gateway that answers every submit with `ok` and counts the budget down."""
+    left = [budget]
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+        def do_GET(self) -> None:
+            self._answer(
+                {"state": {"remaining_budget": left[0], "n_submits": 0, "is_finalized": left[0] <= 0}}
+            )
+
+        def do_POST(self) -> None:
+            body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+            left[0] -= len(body["env_instances"])
+            self._answer({"status": "ok", "submit_id": "submit_000", "summary": {}})
+
+        def _answer(self, document: dict[str, Any]) -> None:
+            data = json.dumps(document).encode()
+            self.send_response(200)
+            self.send_header("content-length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    base = f"http://127.0.0.1:{server.server_address[1]}/{PATH_TOKEN}"
+    try:
+        yield {f"EVOPOLICYGYM_{name.upper()}_URL": f"{base}/{name}" for name in ("info", "task", "submit")}
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class Played:
+    """What playing an agent came to."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.ending: Ending | None = None
+        self.turns: list[tuple[int, str]] = []
+        self.doings: list[Doing] = []
+
+    @property
+    def text(self) -> str:
+        return (self.folder / "agent.jsonl").read_text()
+
+    @property
+    def log(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.text.splitlines()]
+
+    @property
+    def prompts(self) -> list[dict[str, Any]]:
+        return [line for line in self.log if line.get("type") == "prompt"]
+
+    @property
+    def starts(self) -> list[list[str]]:
+        """Arguments of each start of the fake."""
+        return [json.loads(line) for line in (self.folder / "fake" / "starts").read_text().splitlines()]
+
+
+def thinks_without_end(played: Played) -> bool:
+    """The scenario `work,endless` is in its second turn."""
+    return len(played.turns) == 1 and any(doing.action == "still thinking" for doing in played.doings)
+
+
+def settings(harness: str, **more: Any) -> AgentConfig:
+    """For tests: nothing waits long."""
+    usual: dict[str, Any] = {"backoff_s": 0.001, "pause_s": 0.01, "reprompts": 3}
+    return AgentConfig(harness=harness, **(usual | more))
+
+
+def play(
+    folder: Path,
+    config: AgentConfig,
+    scenario: str,
+    budget: int = 4,
+    over_when: Callable[[Played], bool] | None = None,
+    **env: str,
+) -> Played:
+    """Plays the agent to its end, or until its time is over: when `over_when` says so."""
+    workspace = folder / "workspace"
+    (workspace / "system").mkdir(parents=True, exist_ok=True)
+    played = Played(folder)
+    with counting_gateway(budget) as urls:
+        environment = {
+            "PATH": f"{FAKES}:{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "HOME": str(folder),
+            "FAKE_SCENARIO": scenario,
+            "FAKE_STATE": str(folder / "fake"),
+            **urls,
+            **env,
+        }
+        log = AgentLog(folder / "agent.jsonl", Redaction.of(secrets_in(environment, config), urls))
+        stage = Stage(
+            workspace=workspace,
+            urls=urls,
+            environment=environment,
+            log=log,
+            on_turn=lambda turn, text: played.turns.append((turn, text)),
+            session_file=folder / "session.json",
+            on_doing=played.doings.append,
+            clock=AgentClock(3600.0),
+        )
+
+        async def main() -> Ending:
+            async with asyncio.timeout(PATIENCE_S):
+                playing = asyncio.create_task(make(config.harness, folder, config).play(stage))
+                if over_when is not None:
+                    while not playing.done() and not over_when(played):
+                        await asyncio.sleep(0.05)
+                    stage.over.set()
+                    # As the keeper does it, whose only descendants are the agent's.
+                    for pid in stage.started:
+                        if not playing.done():
+                            with suppress(ProcessLookupError):
+                                os.kill(pid, 9)
+                return await playing
+
+        try:
+            played.ending = asyncio.run(main())
+        finally:
+            log.close()
+    return played

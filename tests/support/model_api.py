@@ -1,0 +1,156 @@
+"""A model API on loopback that plays a script: enough of OpenAI's Responses and Anthropic's Messages for the real CLIs.
+
+Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the turn.
+Requests without tools (titles, token counts) get a short text and move nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+INPUT, CACHED, CREATED, OUTPUT, REASONING = 1000, 700, 50, 20, 5
+"""Tokens that every answer claims. OpenAI counts the cached ones into its input, Anthropic apart."""
+
+
+class Step:
+    """`command`: run it in the agent's shell. `text`: say it and end the turn. `status`: an HTTP error instead."""
+
+    def __init__(self, command: str | None = None, text: str = "", status: int = 200) -> None:
+        self.command = command
+        self.text = text
+        self.status = status
+
+
+class ModelApi:
+    """Serves while the `with` lasts. `base_url` is without `/v1`."""
+
+    def __init__(self, script: Sequence[Step]) -> None:
+        self.script = list(script)
+        self.played = 0
+        self.requests: list[dict[str, Any]] = []
+        """Bodies of the requests that moved the script on."""
+        self._lock = threading.Lock()
+        api = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def log_message(self, format: str, *args: Any) -> None:
+                pass
+
+            def do_HEAD(self) -> None:
+                self._send(200, b"", "text/plain")
+
+            def do_GET(self) -> None:
+                self._send(200, b'{"data": [], "object": "list", "models": []}', "application/json")
+
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers.get("content-length") or 0))
+                api.answer(self, json.loads(body or b"{}"))
+
+            def _send(self, status: int, data: bytes, kind: str) -> None:
+                self.send_response(status)
+                self.send_header("content-type", kind)
+                self.send_header("content-length", str(len(data)))
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(data)
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    @property
+    def base_url(self) -> str:
+        return f"http://127.0.0.1:{self._server.server_address[1]}"
+
+    def __enter__(self) -> ModelApi:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def answer(self, handler: Any, request: dict[str, Any]) -> None:
+        path = handler.path.partition("?")[0]
+        if path.endswith("/count_tokens"):
+            handler._send(200, b'{"input_tokens": 10}', "application/json")
+            return
+        step = self._next(request)
+        if step.status != 200:
+            error = {"type": "error", "error": {"type": "overloaded_error", "message": step.text or "busy"}}
+            handler._send(step.status, json.dumps(error).encode(), "application/json")
+            return
+        events = _responses(step, request) if path.endswith("/responses") else _messages(step, request)
+        stream = "".join(f"event: {event['type']}\ndata: {json.dumps(event)}\n\n" for event in events)
+        handler._send(200, stream.encode(), "text/event-stream")
+
+    def _next(self, request: dict[str, Any]) -> Step:
+        with self._lock:
+            if not request.get("tools"):
+                return Step(text="ok")
+            self.requests.append(request)
+            self.played += 1
+            at = self.played - 1
+        return self.script[at] if at < len(self.script) else Step(text="Nothing more to do.")
+
+
+def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    usage = {
+        "input_tokens": INPUT,
+        "input_tokens_details": {"cached_tokens": CACHED},
+        "output_tokens": OUTPUT,
+        "output_tokens_details": {"reasoning_tokens": REASONING},
+        "total_tokens": INPUT + OUTPUT,
+    }
+    identity = f"resp_{id(step)}"
+    yield {"type": "response.created", "response": {"id": identity}}
+    if step.command is None:
+        content = [{"type": "output_text", "text": step.text, "annotations": []}]
+        item: dict[str, Any] = {"type": "message", "id": "m1", "role": "assistant", "content": content}
+    else:
+        name, arguments = _shell_call(step.command, request)
+        item = {"type": "function_call", "id": "f1", "call_id": f"call_{id(step)}", "name": name}
+        item["arguments"] = json.dumps(arguments)
+    yield {"type": "response.output_item.done", "output_index": 0, "item": item}
+    yield {"type": "response.completed", "response": {"id": identity, "output": [item], "usage": usage}}
+
+
+def _shell_call(command: str, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The call of whichever shell tool this version of the CLI offers."""
+    offered = {tool.get("name"): tool for tool in request["tools"] if tool.get("type") == "function"}
+    for name, argument in (("exec_command", "cmd"), ("shell_command", "command")):
+        if name in offered:
+            return name, {argument: command}
+    if "shell" in offered:
+        return "shell", {"command": ["bash", "-c", command]}
+    raise AssertionError(f"no shell among the offered tools: {sorted(map(str, offered))}")
+
+
+def _messages(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    usage = {
+        "input_tokens": INPUT - CACHED,
+        "cache_read_input_tokens": CACHED,
+        "cache_creation_input_tokens": CREATED,
+        "output_tokens": 1,
+    }
+    message = {"id": f"msg_{id(step)}", "type": "message", "role": "assistant", "model": request["model"]}
+    message |= {"content": [], "stop_reason": None, "stop_sequence": None, "usage": usage}
+    yield {"type": "message_start", "message": message}
+    if step.command is None:
+        block: dict[str, Any] = {"type": "text", "text": ""}
+        delta = {"type": "text_delta", "text": step.text}
+    else:
+        block = {"type": "tool_use", "id": f"toolu_{id(step)}", "name": "Bash", "input": {}}
+        delta = {"type": "input_json_delta", "partial_json": json.dumps({"command": step.command})}
+    yield {"type": "content_block_start", "index": 0, "content_block": block}
+    yield {"type": "content_block_delta", "index": 0, "delta": delta}
+    yield {"type": "content_block_stop", "index": 0}
+    stop = {"stop_reason": "end_turn" if step.command is None else "tool_use", "stop_sequence": None}
+    yield {"type": "message_delta", "delta": stop, "usage": {"output_tokens": OUTPUT}}
+    yield {"type": "message_stop"}

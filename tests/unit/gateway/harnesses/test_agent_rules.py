@@ -1,0 +1,197 @@
+"""The rules of coding agents that need no process: troubles, back-off, redaction, settings, configured CLIs, the clock."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cli_stage import FAKES, play, settings
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.harnesses import entry_name, make
+from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
+from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.harnesses.codex import usage_of
+from evopolicy_gateway.harnesses.configured import ConfiguredCli, values
+from evopolicy_gateway.harnesses.redaction import Redaction
+from evopolicy_gateway.harnesses.trouble import MAX_BACKOFF_S, backoff_s, trouble_of
+
+
+@pytest.mark.parametrize(
+    ("message", "status", "kind", "provider"),
+    [
+        ("exceeded retry limit, last status: 429 Too Many Requests", None, "passing", True),
+        (
+            "unexpected status 529 <unknown status code>: overloaded, url: http://h:46209/v1",
+            None,
+            "passing",
+            True,
+        ),
+        ("stream disconnected before completion: error sending request", None, "passing", True),
+        ("API Error: Request rejected (429) · rate limited", 429, "passing", True),
+        ("API Error: 500 Internal server error", None, "passing", True),
+        ("You've hit your usage limit. Try again in 3 hours 5 minutes.", None, "quota", True),
+        ("Claude AI usage limit reached|1900000000", 429, "quota", True),
+        ("Credit balance is too low", 400, "quota", True),
+        ("unexpected status 401 Unauthorized: You exceeded your current quota", None, "final", True),
+        ("Invalid API key · Please run /login", None, "final", True),
+        ("API Error: 400 prompt is too long", None, "final", True),
+        ("No conversation found with session ID: 1-2", None, "lost", False),
+        ("thread/resume failed: no rollout found for thread id 1 (code -32600)", None, "lost", False),
+        ("Segmentation fault", None, "passing", False),
+    ],
+)
+def test_what_a_cli_says_decides_what_follows(
+    message: str, status: int | None, kind: str, provider: bool
+) -> None:
+    trouble = trouble_of(message, status, now=1.0)
+    assert (trouble.kind, trouble.provider) == (kind, provider)
+
+
+def test_a_told_waiting_time_is_understood() -> None:
+    assert trouble_of("usage limit, try again in 3 hours 5 minutes").wait_s == 3 * 3600 + 300
+    assert trouble_of("Rate limit is exceeded. Try again in 17 seconds.").wait_s == 17
+    assert trouble_of("Claude AI usage limit reached|1900000000", now=1_899_999_990.0).wait_s == 10
+    assert trouble_of('{"type":"usage_limit_reached","resets_in_seconds":9568}').wait_s == 9568
+    assert trouble_of("try again later").wait_s is None
+
+
+@given(attempt=st.integers(1, 10_000), chance=st.floats(0.0, 1.0, exclude_max=True))
+def test_back_off_doubles_within_its_jitter_and_its_bound(attempt: int, chance: float) -> None:
+    delay = backoff_s(attempt, 4.0, chance)
+    whole = 4.0 * 2.0 ** min(attempt - 1, 16)
+    assert min(MAX_BACKOFF_S, 0.75 * whole) <= delay <= min(MAX_BACKOFF_S, 1.25 * whole)
+
+
+def test_cached_input_is_taken_off_in_codex_streams() -> None:
+    told = {"input_tokens": 10, "cached_input_tokens": 7, "output_tokens": 3, "reasoning_output_tokens": 2}
+    usage = usage_of(told)
+    assert (usage.input_noncached, usage.cache_read, usage.output, usage.reasoning) == (3, 7, 3, 2)
+    assert usage_of({"input_tokens": True, "output_tokens": "x"}).total == 0
+
+
+@given(
+    secret=st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=8, max_size=40),
+    around=st.text(),
+)
+def test_a_logged_line_stays_a_document_without_the_secret(secret: str, around: str) -> None:
+    redact = Redaction([secret])
+    document = json.loads(redact(json.dumps({"text": f"{around} {secret} {around}"}).encode()))
+    assert secret not in document["text"]
+
+
+def test_redaction_knows_names_of_variables_and_looks_of_keys() -> None:
+    redact = Redaction.of(
+        {"MY_API_KEY": "0123456789", "SSH_AUTH_SOCK": "/run/agent.sock", "LANG": "en_GB.UTF-8"},
+        {"EVOPOLICYGYM_INFO_URL": "http://127.0.0.1:4/abcdefabcdefabcdef/info"},
+    )
+    line = redact.text("0123456789 /run/agent.sock en_GB.UTF-8 http://127.0.0.1:4/abcdefabcdefabcdef/info")
+    assert line == "[redacted] /run/agent.sock en_GB.UTF-8 http://127.0.0.1:4/[redacted]/info"
+    assert redact.text("Authorization: Bearer abcdefghijklmnop") == "Authorization: Bearer [redacted]"
+    assert redact.text("sk-ant-" + "a1B2" * 6) == "[redacted]"
+    assert redact.text("task-list of the mask-rcnn") == "task-list of the mask-rcnn"
+
+
+def test_the_clock_stands_still_in_a_pause() -> None:
+    now = [0.0]
+    clock = AgentClock(10.0, lambda: now[0])
+    now[0] = 4.0
+    with clock.paused():
+        now[0] = 1000.0
+        assert clock.left_s() == 6.0
+    now[0] = 1007.0
+    assert clock.left_s() == -1.0
+
+
+QWEN = """
+harness = "qwen"
+program = ["fake-qwen"]
+model = "qwen3-coder"
+[cli]
+first = ["--prompt-from-stdin", "--model", "{model}"]
+resume = ["--resume", "{session}", "--model", "{model}"]
+[cli.events]
+session = ["session_id"]
+text = ["message.content.*.text"]
+error = ["error.message"]
+[cli.events.tokens]
+input = "usage.in"
+cache_read = "usage.cached"
+output = "usage.out"
+input_includes_cached = true
+"""
+
+FAKE_QWEN = """#!/usr/bin/env python3
+import sys
+sys.path.insert(0, {fakes!r})
+from fake_stream import emit, scenario, submit
+if sys.argv[1:] == ["--version"]:
+    print("qwen 1.2.3")
+    sys.exit()
+if scenario() == "busy":
+    emit({{"error": {{"message": "503 overloaded"}}}})
+    sys.exit(1)
+submit(2)
+emit({{"session_id": "s-1"}})
+emit({{"message": {{"content": [{{"kind": "thought"}}, {{"text": "made it better"}}]}}}})
+emit({{"usage": {{"in": 10, "cached": 4, "out": 2}}}})
+"""
+
+
+def test_a_cli_without_a_harness_is_described_in_a_file(tmp_path: Path) -> None:
+    (tmp_path / "qwen.toml").write_text(QWEN)
+    program = tmp_path / "fake-qwen"
+    program.write_text(FAKE_QWEN.format(fakes=str(FAKES)))
+    program.chmod(0o755)
+    config = read_agent(tmp_path / "qwen.toml")
+    quick = settings("qwen", program=config.program, model=config.model, cli=config.cli)
+    played = play(tmp_path, quick, "work,busy,work", budget=4)
+    assert played.ending is not None
+    assert (played.ending.reason, played.ending.turns, played.ending.retries) == ("agent_stopped", 2, 1)
+    assert played.turns[0] == (1, "made it better")
+    assert played.starts[0] == ["--prompt-from-stdin", "--model", "qwen3-coder"]
+    assert played.starts[2] == ["--resume", "s-1", "--model", "qwen3-coder"]
+    facts = played.ending.facts
+    assert (facts["harness"], facts["cli_version"]) == ("qwen", "1.2.3")
+    assert facts["tokens"] == {"input_noncached": 12, "cache_read": 8, "cache_creation": 0, "output": 4}
+
+
+def test_arguments_of_a_configured_cli_are_filled_in_once() -> None:
+    cli = Cli(first=("-m", "{model}", "--id={session}", "-p", "{prompt}"), prompt="argument")
+    dialect = ConfiguredCli(AgentConfig(harness="x", program=("x",), cli=cli))
+    words = dialect.arguments(None, resume=False, prompt="say {model} and {session}", options="")
+    assert words == ["-p", "say {model} and {session}"]
+
+
+def test_paths_into_events() -> None:
+    event = {"a": [{"b": 1}, {"c": 2}, {"b": 3}], "d": {"e": "f"}}
+    assert list(values(event, "a.*.b")) == [1, 3]
+    assert list(values(event, "d.e")) == ["f"]
+    assert list(values(event, "d.e.x")) == []
+    assert list(values(event, "")) == []
+
+
+def test_agents_files_refuse_what_they_do_not_know(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text('harness = "codex"\nmodle = "x"\n')
+    with pytest.raises(ConfigError, match="modle"):
+        read_agent(path)
+    path.write_text('harness = "codex"\nbackoff_s = 0.0\n')
+    with pytest.raises(ConfigError, match="backoff_s"):
+        read_agent(path)
+    path.write_text('harness = "gemini"\n')
+    with pytest.raises(ConfigError, match=r"\[cli\]"):
+        make(f"file:{path}", tmp_path)
+    both = AgentConfig(harness="codex", cli=Cli(first=(), events=Events(tokens=TokenPaths())))
+    with pytest.raises(ConfigError, match=r"takes no \[cli\]"):
+        make("codex", tmp_path, both)
+
+
+def test_coding_agents_have_entry_names() -> None:
+    assert entry_name("codex") == "codex"
+    assert entry_name("codex:gpt-5.5") == "gpt-5.5 (codex)"
+    assert entry_name("claude-code:m") == "m (claude-code)"
+    assert entry_name("file:agents/qwen.toml") == "qwen"

@@ -1,0 +1,245 @@
+"""Codex and Claude Code as agents, against fake CLIs that speak their streams and fail in their ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cli_stage import PATH_TOKEN, Played, play, settings, thinks_without_end
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.harnesses import session
+from evopolicy_gateway.harnesses.base import AgentError, Ending
+from evopolicy_gateway.harnesses.usage import Prices
+
+both = pytest.mark.parametrize("harness", ["codex", "claude-code"])
+
+
+def ended(played: Played) -> Ending:
+    assert played.ending is not None
+    return played.ending
+
+
+def sessions_of(played: Played) -> set[str]:
+    """Session ids that the fake kept."""
+    return {path.stem for path in (played.folder / "fake").glob("*.json")}
+
+
+@both
+def test_an_agent_that_stops_is_told_what_is_left_in_the_same_session(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness), "work", budget=4)
+    assert ended(played).reason == "agent_stopped"
+    assert ended(played).turns == 2
+    assert ended(played).retries == 0
+    assert [text for _, text in played.turns] == ["submitted", "submitted"]
+    first, second = played.prompts
+    assert "AGENTS.md" in first["message"]
+    assert "2 episodes of the budget are left" in second["message"]
+    assert second["session"] in sessions_of(played)
+    assert len(sessions_of(played)) == 1
+    assert "resume" in " ".join(played.starts[1])
+
+
+@both
+def test_tokens_are_counted_as_the_paper_counts_them(tmp_path: Path, harness: str) -> None:
+    prices = Prices(input=1.0, output=10.0, cache_read=0.1, cache_creation=2.0)
+    played = play(tmp_path, settings(harness, prices=prices), "work", budget=4)
+    tokens = ended(played).facts["tokens"]
+    assert tokens["input_noncached"] == 600
+    assert tokens["cache_read"] == 1400
+    assert tokens["output"] == 40
+    if harness == "codex":
+        assert tokens["reasoning"] == 10
+        assert tokens["cache_creation"] == 0
+        assert tokens["cost"] == pytest.approx((600 + 140 + 400) / 1e6)
+    else:
+        assert "reasoning" not in tokens
+        assert tokens["cache_creation"] == 100
+        assert tokens["cost"] == pytest.approx((600 + 140 + 200 + 400) / 1e6)
+
+
+@both
+@pytest.mark.parametrize("failure", ["rate_limit", "overloaded", "crash"])
+def test_a_failed_turn_is_retried_in_the_same_session(tmp_path: Path, harness: str, failure: str) -> None:
+    played = play(tmp_path, settings(harness), f"work,{failure},{failure},work", budget=4)
+    assert (ended(played).reason, ended(played).turns, ended(played).retries) == ("agent_stopped", 2, 2)
+    assert len(sessions_of(played)) == 1
+    assert "was interrupted" in played.prompts[2]["message"]
+    assert "2 episodes of the budget are left" in played.prompts[2]["message"]
+
+
+@both
+def test_a_crash_before_the_session_began_starts_with_the_first_prompt_again(
+    tmp_path: Path, harness: str
+) -> None:
+    played = play(tmp_path, settings(harness), "crash_at_once,work", budget=2)
+    assert (ended(played).reason, ended(played).retries) == ("agent_stopped", 1)
+    assert played.prompts[0]["message"] == played.prompts[1]["message"]
+
+
+@both
+def test_a_session_that_the_cli_forgot_is_begun_anew(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness), "work,forgotten,work", budget=4)
+    assert (ended(played).reason, ended(played).turns, ended(played).retries) == ("agent_stopped", 2, 1)
+    assert len(sessions_of(played)) == 2
+    # What both sessions used counts.
+    assert ended(played).facts["tokens"]["output"] == 40
+
+
+@both
+def test_a_crashing_cli_ends_the_run_after_the_retries(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness, retries=2), "crash_at_once")
+    assert ended(played).reason == "agent_failed"
+    assert "3 times in a row" in ended(played).detail
+    assert "exit status 139" in ended(played).detail
+    assert len(played.starts) == 3
+
+
+@both
+def test_an_outage_pauses_the_run_and_it_goes_on_afterwards(tmp_path: Path, harness: str) -> None:
+    scenario = ",".join(["overloaded"] * 4 + ["work"])
+    played = play(tmp_path, settings(harness, retries=1, provider="p"), scenario, budget=2)
+    assert (ended(played).reason, ended(played).turns) == ("agent_stopped", 1)
+    assert ended(played).retries == 4
+    paused = [doing for doing in played.doings if doing.paused_s]
+    assert [doing.provider for doing in paused] == ["p", "p", "p"]
+    assert ended(played).facts["settings"]["paused_s"] > 0
+
+
+@both
+def test_a_spent_quota_pauses_until_the_time_that_was_told(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness), "quota,work", budget=2)
+    assert (ended(played).reason, ended(played).retries) == ("agent_stopped", 1)
+    (paused,) = [doing for doing in played.doings if doing.paused_s]
+    assert 0.0 < paused.paused_s <= 1.2
+    assert "limit" in paused.action
+
+
+@both
+def test_pauses_have_an_end(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness, retries=0, max_pause_s=0.02), "overloaded")
+    assert ended(played).reason == "agent_failed"
+    assert "paused for" in ended(played).detail
+
+
+@both
+def test_a_wrong_key_ends_the_run_at_once(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness), "bad_key")
+    assert ended(played).reason == "agent_failed"
+    assert "401" in ended(played).detail
+    assert len(played.starts) == 1
+
+
+@both
+@pytest.mark.parametrize("oddity", ["torn", "huge", "garbage"])
+def test_odd_streams_are_read(tmp_path: Path, harness: str, oddity: str) -> None:
+    played = play(tmp_path, settings(harness), oddity, budget=2)
+    assert (ended(played).reason, ended(played).turns, ended(played).retries) == ("agent_stopped", 1, 0)
+    assert max(map(len, played.text.splitlines())) < 2 << 20
+
+
+@both
+def test_a_silent_cli_is_ended_and_its_session_resumed(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness, silence_s=1.0), "silent,work", budget=2)
+    assert (ended(played).reason, ended(played).turns, ended(played).retries) == ("agent_stopped", 1, 1)
+    (failed,) = [line for line in played.log if line.get("type") == "turn_failed"]
+    assert "said nothing" in failed["message"]
+    assert "resume" in " ".join(played.starts[1])
+
+
+@both
+def test_a_stream_that_never_ends_is_ended_from_outside_and_still_tells_its_facts(
+    tmp_path: Path, harness: str
+) -> None:
+    played = play(
+        tmp_path, settings(harness, model="m"), "work,endless", budget=9, over_when=thinks_without_end
+    )
+    assert ended(played).facts["model_string"] == "m"
+    assert ended(played).facts["tokens"]["output"] >= 20
+    assert ended(played).turns == 1
+    assert ended(played).retries == 0
+
+
+@both
+def test_an_agent_that_does_nothing_is_reminded_up_to_the_limit(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness, reprompts=2), "idle", budget=4)
+    assert ended(played).reason == "agent_stopped"
+    assert ended(played).turns == 3
+    assert "4 episodes left after 2 reminders" in ended(played).detail
+
+
+@both
+def test_a_cap_on_tokens_ends_the_run(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path, settings(harness, max_tokens=1500), "idle", budget=4)
+    assert ended(played).reason == "agent_stopped"
+    assert "cap reached" in ended(played).detail
+    assert ended(played).turns <= 2
+
+
+@both
+def test_keys_do_not_reach_the_log(tmp_path: Path, harness: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    secret, oddly_named = "correct horse battery", "plain-looking-value"
+    scenario = "leaks" if harness == "codex" else "work"
+    config = settings(harness, pass_environment=("ODDLY_NAMED",))
+    monkeypatch.setenv("ODDLY_NAMED", oddly_named)
+    played = play(tmp_path, config, scenario, 2, FAKE_API_KEY=secret, ODDLY_NAMED=oddly_named)
+    assert secret not in played.text
+    assert "sk-proj-abc" not in played.text
+    assert PATH_TOKEN not in played.text
+    if harness == "codex":
+        assert "my key is [redacted]" in played.text
+        assert all(secret not in text for _, text in played.turns)
+        assert all(secret not in doing.action for doing in played.doings)
+
+
+@both
+def test_what_was_killed_goes_on_in_its_session(tmp_path: Path, harness: str) -> None:
+    config = settings(harness)
+    first = play(tmp_path, config, "work,endless", budget=9, over_when=thinks_without_end)
+    kept = session.load(tmp_path / "session.json")
+    assert kept.turns == 1
+    second = play(tmp_path, config, "work,endless,work", budget=2)
+    assert kept.session in " ".join(second.starts[-1])
+    assert "was interrupted" in second.prompts[-1]["message"]
+    assert ended(second).turns == 2
+    assert ended(second).facts["tokens"]["output"] >= 40
+    assert len(sessions_of(first)) == 1
+
+
+@both
+def test_versions_are_told_and_lacking_options_named(tmp_path: Path, harness: str) -> None:
+    played = play(tmp_path / "newer", settings(harness), "work", 2, FAKE_VERSION="99.1.0")
+    assert ended(played).facts["cli_version"] == "99.1.0"
+    assert ended(played).facts["settings"]["tested_version"] != "99.1.0"
+    with pytest.raises(AgentError, match=r"0\.1\.0 has no .*--"):
+        play(tmp_path / "older", settings(harness), "work", 2, FAKE_VERSION="0.1.0", FAKE_HELP="nothing")
+
+
+def test_a_cli_that_is_not_there_is_named_with_its_install_command(tmp_path: Path) -> None:
+    with pytest.raises(AgentError, match="npm install -g @openai/codex"):
+        play(tmp_path, settings("codex", environment={"PATH": "/nowhere"}), "work")
+
+
+def test_model_effort_and_further_arguments_reach_the_cli(tmp_path: Path) -> None:
+    more = {"model": "gpt-5.5", "effort": "xhigh", "extra_args": ("--config", "a=1")}
+    played = play(tmp_path / "codex", settings("codex", **more), "work", 2)
+    words = " ".join(played.starts[0])
+    assert '--model gpt-5.5 --config model_reasoning_effort="xhigh" --config a=1 -' in words
+    assert "--ignore-user-config" in words
+    more = {"model": "m", "effort": "max", "user_config": True}
+    words = " ".join(play(tmp_path / "claude", settings("claude-code", **more), "work", 2).starts[0])
+    assert "--model m --effort max" in words
+    assert "--safe-mode" not in words
+
+
+def test_codex_notices_of_reconnecting_fail_no_turn(tmp_path: Path) -> None:
+    played = play(tmp_path, settings("codex"), "reconnects", 2)
+    assert (ended(played).turns, ended(played).retries) == (1, 0)
+    assert ended(played).facts["settings"]["requests_failed"] == 1
+
+
+def test_settings_that_cannot_work_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="max_cost needs"):
+        play(tmp_path, settings("codex", max_cost=1.0), "work")
+    with pytest.raises(ConfigError, match="NO_SUCH_NAME not set"):
+        play(tmp_path, settings("codex", pass_environment=("NO_SUCH_NAME",)), "work")
