@@ -115,7 +115,9 @@ def main() -> None:
     )
     parser.add_argument("environments", nargs="*", default=["*"], help="suite ids or patterns; default: all")
     parser.add_argument("--seeds", type=int, default=32, help="episodes per environment (default 32)")
-    parser.add_argument("--first-seed", type=int, default=0, help="seeds are counted up from here (default 0)")
+    parser.add_argument(
+        "--first-seed", type=int, default=0, help="seeds are counted up from here (default 0)"
+    )
     parser.add_argument("--returns", action="store_true", help="also print each episode's return, to stderr")
     arguments = parser.parse_args()
     chosen = [
