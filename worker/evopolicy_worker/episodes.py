@@ -13,6 +13,7 @@ import contextlib
 import hashlib
 import math
 import os
+import shutil
 import time
 from collections import OrderedDict
 from pathlib import Path
@@ -77,6 +78,7 @@ class Player:
         self._bundle: tuple[str, BundleFiles] | None = None
         self._prepared: Child | None = None
         self._n_policies = 0
+        self._folders: list[Path] = []
 
     def play(self, job: Job, folder: str | None, progress: Progress) -> list[EpisodeOutcome]:
         """Play the job's episodes in order.
@@ -105,17 +107,27 @@ class Player:
         return outcomes
 
     def prepare(self) -> None:
-        """Fork the process for the next policy; to be called while there is nothing else to do."""
+        """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
+        self._bury()
         if self._prepared is None:
             self._prepared = self._zygote.spawn()
 
     def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
         child, self._prepared = self._prepared, None
         if child is None:
+            self._bury()
             child = self._zygote.spawn()
         self._n_policies += 1
-        folder = str(self._scratch / "policies" / str(self._n_policies))
-        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, folder)
+        folder = self._scratch / "policies" / str(self._n_policies)
+        if self._jail.home is None:
+            self._folders.append(folder)
+        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, str(folder))
+
+    def _bury(self) -> None:
+        """The processes of the policies so far are gone after this, and so are their folders."""
+        self._zygote.bury()
+        while self._folders:
+            shutil.rmtree(self._folders.pop(), ignore_errors=True)
 
     def close(self) -> None:
         for environment in self._environments.values():

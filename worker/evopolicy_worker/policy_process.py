@@ -20,7 +20,7 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, Re
 from evopolicy_worker import frames
 from evopolicy_worker.monitor import Monitor, Watch
 from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
+from evopolicy_worker.sandbox.zygote import DEATH_TIMEOUT_S, Child, Exit, Zygote, wait_dead
 
 MAX_DESCRIPTORS = 256
 MAX_FILES = 4096
@@ -54,7 +54,6 @@ DENIED = frozenset(
 _GRACE_S = 1.0
 _SEAL_S = 60.0
 """For what is our own work before the bundle is imported."""
-_DEATH_S = 10.0
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
 _STAGES: dict[str, FailureCategory] = {
@@ -229,14 +228,17 @@ class PolicyProcess:
             if not self.dead:
                 with contextlib.suppress(PolicyFailedError):
                     self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.END, 0)], "act", _GRACE_S)
-            if not self.dead:
-                self._bury()
-            self._monitor.watch(None)
-            self._watch.drain()
             watch = self._watch
-            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), self._cpu_of_episode())
+            cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
+            self._monitor.watch(None)
+            watch.drain()
+            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
             with self._closing:
-                self._child.close()
+                if self.dead:
+                    self._child.close()
+                else:
+                    # It has said its last; what a hostile one writes from now on is not read.
+                    self._zygote.bury_later(self._child)
         return self._finished
 
     def kill(self) -> None:
@@ -394,8 +396,8 @@ class PolicyProcess:
         self.dead = True
         self._watch.since = 0.0
         self._child.kill()
-        if not wait_dead(self._child.pidfd, _DEATH_S):
-            raise SandboxError(f"a policy's process does not end within {_DEATH_S:g} s of SIGKILL")
+        if not wait_dead(self._child.pidfd, DEATH_TIMEOUT_S):
+            raise SandboxError(f"a policy's process does not end within {DEATH_TIMEOUT_S:g} s of SIGKILL")
         self._exit = self._zygote.wait(self._child)
 
     def _cpu_of_episode(self) -> float:

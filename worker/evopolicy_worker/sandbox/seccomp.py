@@ -23,9 +23,6 @@ PID_MARK = 0x7FFFABCD
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _X32_BIT = 0x40000000
 
-_CHECKED = frozenset(
-    {"ioctl", "fcntl", "prctl", "prlimit64", "clone", "clone3", "fork", "vfork", "kill", "tgkill"}
-)
 _FCNTL = (
     0,
     1,
@@ -56,6 +53,10 @@ _NUMBER, _ARCHITECTURE = 0, 4
 _KILL_PROCESS, _ERRNO, _ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
 
 Instruction = tuple[int, int, int, int]
+Interval = tuple[int, list[Instruction]]
+"""The first number, and what to do with it: instructions that end in a verdict."""
+
+_ALLOWED: Instruction = (_RETURN, 0, 0, _ALLOW)
 
 
 def supported() -> bool:
@@ -82,9 +83,6 @@ def policy_filter() -> bytes:
     ]
     if machine == "x86_64":
         program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
-    for name, number in numbers.items():
-        if name not in _CHECKED:
-            program += [(_JUMP_EQUAL, 0, 1, number), (_RETURN, 0, 0, _ALLOW)]
     blocks = {
         "ioctl": _one_of(1, _IOCTL, errno.ENOTTY),
         "fcntl": _one_of(1, _FCNTL, errno.EPERM),
@@ -104,11 +102,28 @@ def policy_filter() -> bytes:
         # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
         "clone3": [_refuse(errno.ENOSYS)],
     }
-    for name, block in blocks.items():
-        if name in numbers:
-            program += [(_JUMP_EQUAL, 0, len(block), numbers[name]), *block]
-    program += [(_JUMP_AT_LEAST, 0, 1, _YOUNGEST), _refuse(errno.ENOSYS), _refuse(errno.EPERM)]
+    program += _search(_intervals(numbers, blocks))
     return b"".join(struct.pack("<HBBI", *instruction) for instruction in program)
+
+
+def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) -> list[Interval]:
+    """What happens to every number, as intervals in ascending order; each lasts to where the next begins."""
+    by_number = {number: blocks.get(name, [_ALLOWED]) for name, number in numbers.items()}
+    found: list[Interval] = []
+    for number in range(_YOUNGEST + 1):
+        code = by_number.get(number, [_refuse(errno.EPERM if number < _YOUNGEST else errno.ENOSYS)])
+        if not found or found[-1][1] != code:
+            found.append((number, code))
+    return found
+
+
+def _search(intervals: list[Interval]) -> list[Instruction]:
+    """A binary search for the number: the kernel runs the filter for each number when it is installed."""
+    if len(intervals) == 1:
+        return intervals[0][1]
+    half = len(intervals) // 2
+    below, above = _search(intervals[:half]), _search(intervals[half:])
+    return [(_JUMP_AT_LEAST, len(below), 0, intervals[half][0]), *below, *above]
 
 
 def _argument(index: int) -> int:

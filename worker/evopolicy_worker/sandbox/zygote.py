@@ -24,6 +24,7 @@ from evopolicy_worker.sandbox.jail import ENVIRONMENT, Jail
 
 START_TIMEOUT_S = 60.0
 ANSWER_TIMEOUT_S = 20.0
+DEATH_TIMEOUT_S = 10.0
 _MAX_MESSAGE = 1 << 16
 
 
@@ -71,6 +72,7 @@ class Zygote:
 
     def __init__(self, jail: Jail, scratch: Path) -> None:
         """Starts it and waits until it can fork. SandboxError, with what bubblewrap or Python said, when it cannot."""
+        self._dying: list[Child] = []
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(START_TIMEOUT_S)
         with tempfile.TemporaryFile(dir=scratch) as said:
@@ -133,6 +135,21 @@ class Zygote:
         """How a killed or ended child ended. Takes its entry from the process table."""
         answer, _ = self._ask({"wait": child.pid}, [])
         return Exit(status=answer["status"], cpu_s=answer["cpu_s"])
+
+    def bury_later(self, child: Child) -> None:
+        """Kill the child now, and learn of its end when there is time: a process takes milliseconds to be taken down."""
+        child.kill()
+        self._dying.append(child)
+
+    def bury(self) -> None:
+        """Waits for the ends of those that were to be buried later. SandboxError when one does not end."""
+        while self._dying:
+            child = self._dying[0]
+            if not wait_dead(child.pidfd, DEATH_TIMEOUT_S):
+                raise SandboxError(f"a policy's process does not end within {DEATH_TIMEOUT_S:g} s of SIGKILL")
+            self.wait(child)
+            del self._dying[0]
+            child.close()
 
     def close(self) -> None:
         """Ends the zygote and with it every process in its sandbox."""

@@ -139,6 +139,13 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
     assert not slot._scratch.exists()
 
 
+def test_without_a_file_system_of_its_own_a_policys_folder_is_gone_after_the_next(slots: Slots) -> None:
+    for _ in range(3):
+        slots.play(HONEST, tier="landlock")
+    folders = list((slots.slot("landlock")._scratch / "policies").iterdir())
+    assert len(folders) <= 1
+
+
 def test_a_slot_that_was_not_started_says_so(slots: Slots) -> None:
     with pytest.raises(WorkerError, match="not started"):
         slots.run(slots.new().play(make_job(), None, lambda episodes, steps: None))

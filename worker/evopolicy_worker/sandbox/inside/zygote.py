@@ -290,11 +290,9 @@ def landlock(rules: dict[str, list[str]], home: str) -> None:
 
 
 def install_filter(program: bytes) -> None:
-    mark, pid = struct.pack("<I", PID_MARK), struct.pack("<I", os.getpid())
-    instructions = [program[at : at + 8] for at in range(0, len(program), 8)]
-    program = b"".join(code[:4] + (pid if code[4:] == mark else code[4:]) for code in instructions)
+    program = program.replace(struct.pack("<I", PID_MARK), struct.pack("<I", os.getpid()))
     buffer = ctypes.create_string_buffer(program, len(program))
-    prog = struct.pack("<HxxxxxxQ", len(instructions), ctypes.addressof(buffer))
+    prog = struct.pack("<HxxxxxxQ", len(program) // 8, ctypes.addressof(buffer))
     check(libc.prctl(22, 2, prog, 0, 0), "seccomp")  # PR_SET_SECCOMP, SECCOMP_MODE_FILTER
 
 
