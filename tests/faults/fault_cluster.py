@@ -1,0 +1,194 @@
+"""A cluster of real processes that is kept up as an init system would, whole runs on it, and its processes by kind.
+
+This process is their subreaper: what any of them leaves behind becomes its child, so that nothing can hide.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from evopolicy_common import credentials
+from evopolicy_gateway import processes
+
+SUBMITS = 3
+EPISODES = 6
+HIDDEN = 4
+TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
+"""Episodes of a whole run: train, validation of each checkpoint, held-out and the random reference."""
+PATIENCE_S = 100.0
+
+AGENT = '''
+import json, os, pathlib, sys, time, urllib.error, urllib.request
+
+POLICY = """
+import random, time
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta): pass
+    def reset(self, episode_index): print("episode", episode_index)
+    def act(self, obs):
+        time.sleep(0.001)
+        return [random.uniform(-1, 1) * %%r]
+"""
+
+def submit(ids, key):
+    while True:
+        request = urllib.request.Request(
+            os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+            data=json.dumps({"env_instances": ids}).encode(),
+            headers={"Idempotency-Key": key},
+        )
+        try:
+            with urllib.request.urlopen(request) as answer:
+                return json.load(answer)
+        except (OSError, ValueError):
+            time.sleep(0.1)
+
+for number in range(%d):
+    pathlib.Path("system/policy.py").write_text(POLICY %% (0.1 + 0.4 * number))
+    submit(list(range(number, number + %d)), f"submit-{number}")
+'''
+
+
+class Kept:
+    """A program that is started again whenever it dies."""
+
+    def __init__(self, program: list[str], log: Path) -> None:
+        self._program = program
+        self._log = log
+        self._ending = False
+        self.starts = 0
+        self._start()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def _start(self) -> None:
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(self._program, stdout=log, stderr=log, start_new_session=True)
+        self.starts += 1
+
+    def _keep(self) -> None:
+        while True:
+            self.process.wait()
+            time.sleep(0.2)
+            if self._ending:
+                return
+            self._start()
+
+    def end(self) -> None:
+        self._ending = True
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.process.pid, signal.SIGCONT)
+        self.process.terminate()
+        try:
+            self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+        self._thread.join()
+
+
+class FaultCluster:
+    """Coordinator and a worker with two slots, kept up; `play` plays one whole run."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        state = root / "state"
+        self._ready = root / "ready.json"
+        launcher = Path(__file__).with_name("fixed_coordinator.py")
+        self.coordinator = Kept(
+            [sys.executable, str(launcher), str(state), str(self._ready)], root / "coordinator.log"
+        )
+        deadline = time.monotonic() + PATIENCE_S
+        while not self._ready.exists():
+            assert time.monotonic() < deadline, (root / "coordinator.log").read_text()
+            time.sleep(0.02)
+        self.files: dict[str, str] = json.loads(self._ready.read_text())["credentials"]
+        worker = [*(sys.executable, "-m", "evopolicy_worker.cli", "--env", "toy/line", "--slots", "2")]
+        worker += ["--grace", "1", "--name", "w", "--credentials", self.files["worker"]]
+        self.worker = Kept(worker, root / "worker.log")
+        self._agent = root / "agent.py"
+        self._agent.write_text(AGENT % (SUBMITS, EPISODES))
+
+    @property
+    def operator(self) -> credentials.Credentials:
+        return credentials.read(Path(self.files["operator"]))
+
+    def command(self, name: str) -> subprocess.Popen[str]:
+        """A run that has been started."""
+        arguments = ["run", "--env", "toy/line", "--agent", f"command:{sys.executable} {self._agent}"]
+        arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(SUBMITS * EPISODES)]
+        arguments += [
+            "--validation",
+            str(HIDDEN),
+            "--heldout",
+            str(HIDDEN),
+            "--credentials",
+            self.files["operator"],
+        ]
+        return subprocess.Popen(
+            [sys.executable, "-m", "evopolicy_gateway.cli", *arguments, "--runs", str(self.root / "runs")],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=self.root,
+        )
+
+    def folder(self, name: str) -> Path:
+        return self.root / "runs" / "tester" / "toy_line" / name
+
+    def find(self, kind: str) -> list[int]:
+        """Processes of that kind now, in order of their ids."""
+        if kind in ("coordinator", "worker"):
+            return [(self.coordinator if kind == "coordinator" else self.worker).process.pid]
+        wanted = {"slot": "evopolicy_worker.env_process", "zygote": "zygote.py", "gateway": "serve_cli"}[kind]
+        return [pid for pid in processes.descendants(os.getpid()) if wanted in command_line(pid)]
+
+    def strays(self) -> list[str]:
+        """What lives below this process beside the coordinator, the worker and what the worker's slots need."""
+        here = os.getpid()
+        kept = {self.coordinator.process.pid, self.worker.process.pid}
+        of_worker = set(processes.descendants(self.worker.process.pid))
+        found = [pid for pid in processes.descendants(here) if pid not in kept | of_worker]
+        slots = [pid for pid in of_worker if "evopolicy_worker.env_process" in command_line(pid)]
+        words = [f"{pid}: {command_line(pid)[:120]}" for pid in found if command_line(pid)]
+        return words + ([f"{len(slots)} slot processes"] if len(slots) > 2 else [])
+
+    def close(self) -> None:
+        self.worker.end()
+        self.coordinator.end()
+
+
+@contextlib.contextmanager
+def fault_cluster(root: Path) -> Iterator[FaultCluster]:
+    """The cluster inside the `with`; everything below this process is gone after it."""
+    processes.become_subreaper()
+    cluster: FaultCluster | None = None
+    try:
+        cluster = FaultCluster(root)
+        yield cluster
+    finally:
+        if cluster is not None:
+            cluster.close()
+        processes.end_descendants(0.0)
+
+
+def command_line(pid: int) -> str:
+    """Empty for a process that is gone or a zombie."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace")
+    except OSError:
+        return ""
+
+
+def record(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "run.json").read_text())
+    return found

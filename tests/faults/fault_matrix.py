@@ -1,0 +1,247 @@
+"""Kills, freezes and starves real processes at seeded instants of whole runs: `python tests/faults/fault_matrix.py`.
+
+A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself, its
+directory be that of the undisturbed run up to the published list (`evopolicy_common.run_difference`), its budget spent
+to the episode, and no process be left over. Exit code 1 when one is not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, fault_cluster, record
+
+from evopolicy_common import codec, keys
+from evopolicy_common.errors import TransportError
+from evopolicy_common.messages import operator
+from evopolicy_common.requests import Requester
+from evopolicy_common.run_difference import differences
+from evopolicy_common.transport import connect
+from evopolicy_gateway import processes
+
+FREEZE_S = 0.7
+LONG_FREEZE_S = 4.0
+"""Longer than a lease lives in `fixed_coordinator`."""
+DISK_FULL_S = 1.5
+TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway")
+FAULTS = (
+    *((target, "SIGKILL") for target in TARGETS),
+    *((target, "SIGSTOP") for target in TARGETS),
+    ("worker", "SIGSTOP past its leases"),
+    ("coordinator", "disk full"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault in one run."""
+
+    target: str
+    fault: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.target} {self.fault} {self.seed}"
+
+    @property
+    def after(self) -> int:
+        """Episodes of the run that are done when it strikes; of a gateway's only as long as it has work."""
+        most = SUBMITS * EPISODES if self.target == "gateway" else TOTAL - 2
+        return random.Random(self.name).randrange(most)
+
+    @property
+    def delay_s(self) -> float:
+        return random.Random(f"{self.name} delay").uniform(0.0, 0.05)
+
+
+@dataclass
+class Row:
+    """What came of it."""
+
+    target: str
+    fault: str
+    seed: int
+    after: int
+    struck: bool = False
+    """Whether the fault met a process of the run; else the run had ended before."""
+    phase: str = ""
+    took_s: float = 0.0
+    wrong: list[str] = field(default_factory=list)
+
+    @property
+    def outcome(self) -> str:
+        return "; ".join(self.wrong) or (
+            "same run" if self.struck or not self.fault else "same run, ended before"
+        )
+
+
+def cases(seeds: int) -> list[Case]:
+    return [Case(target, fault, seed) for seed in range(seeds) for target, fault in FAULTS]
+
+
+def strike(cluster: FaultCluster, case: Case) -> bool:
+    """Carries the fault out; False when there is no such process now."""
+    pids = cluster.find(case.target)
+    if not pids:
+        return False
+    pid = random.Random(f"{case.name} which").choice(pids)
+    try:
+        if case.fault == "SIGKILL":
+            os.kill(pid, signal.SIGKILL)
+        elif case.fault == "SIGSTOP":
+            with stopped([pid]):
+                time.sleep(FREEZE_S)
+        elif case.fault == "disk full":
+            with full_disk(pid):
+                time.sleep(DISK_FULL_S)
+        else:
+            # The whole machine stands still, as far as the coordinator can tell.
+            with stopped([pid, *processes.descendants(pid)]):
+                time.sleep(LONG_FREEZE_S)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def stopped(pids: list[int]) -> Iterator[None]:
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+
+
+@contextlib.contextmanager
+def full_disk(pid: int) -> Iterator[None]:
+    """No file of the process can grow."""
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+
+
+async def play_until(
+    cluster: FaultCluster, name: str, wanted: int | None
+) -> tuple[subprocess.Popen[str], str]:
+    """Starts a run, and comes back once `wanted` episodes of it are done or it has ended, with its phase."""
+    async with connect(cluster.operator) as link:
+        cluster_name = link.credentials.cluster
+        ask = Requester(link, lambda verb: keys.operator_key(cluster_name, verb), codec.operator_replies)
+        message = operator.StatusRequest(token=link.credentials.token)
+        before = (await ask.until_answered("status", message, operator.StatusReply)).episodes_done
+        command = cluster.command(name)
+        while wanted is not None and command.poll() is None:
+            with contextlib.suppress(TransportError):
+                status = await ask.once("status", message, operator.StatusReply)
+                if status.runs and status.episodes_done - before >= wanted:
+                    return command, status.runs[0].phase
+            await asyncio.sleep(0.01)
+    return command, "" if wanted is None else "ended"
+
+
+def play(cluster: FaultCluster, name: str, case: Case | None = None) -> Row:
+    """One whole run, with the fault if there is one."""
+    row = Row("nothing", "", 0, 0) if case is None else Row(case.target, case.fault, case.seed, case.after)
+    started = time.monotonic()
+    command, row.phase = asyncio.run(play_until(cluster, name, None if case is None else case.after))
+    try:
+        if case is not None:
+            time.sleep(case.delay_s)
+            row.struck = command.poll() is None and strike(cluster, case)
+        said = command.communicate(timeout=PATIENCE_S)[1]
+        if command.returncode:
+            row.wrong.append(f"exit status {command.returncode}: {' | '.join(said.splitlines()[-3:])}")
+    except subprocess.TimeoutExpired:
+        row.wrong.append(f"did not end within {PATIENCE_S:g} s")
+        command.kill()
+        command.communicate()
+    row.took_s = round(time.monotonic() - started, 1)
+    return row
+
+
+def check(cluster: FaultCluster, row: Row, folder: Path, undisturbed: Path) -> None:
+    """Adds to the row what is not as it must be."""
+    if row.wrong:
+        return
+    found = differences(undisturbed, folder)
+    row.wrong += found[:3] + ([f"and {len(found) - 3} more"] if len(found) > 3 else [])
+    used = record(folder)["outcome"]["budget_used"]
+    if used != SUBMITS * EPISODES:
+        row.wrong.append(f"budget used: {used} of {SUBMITS * EPISODES}")
+    deadline = time.monotonic() + 5.0
+    while (strays := cluster.strays()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    row.wrong += [f"left over: {stray}" for stray in strays]
+
+
+def play_all(seeds: int, on_row: Callable[[Row], None], root: Path, only: str = "") -> bool:
+    """Plays the undisturbed run, then every case; True when each came to the same run."""
+    well = True
+    with fault_cluster(root) as cluster:
+        first = play(cluster, "undisturbed")
+        check(cluster, first, cluster.folder("undisturbed"), cluster.folder("undisturbed"))
+        on_row(first)
+        for number, case in enumerate(case for case in cases(seeds) if only in case.name):
+            name = f"run-{number}"
+            row = play(cluster, name, case)
+            check(cluster, row, cluster.folder(name), cluster.folder("undisturbed"))
+            well = well and not row.wrong
+            on_row(row)
+    left = processes.descendants(os.getpid())
+    if left:
+        on_row(Row("cluster", "ended", 0, 0, wrong=[f"processes are left: {left}"]))
+    return well and not first.wrong and not left
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fault-seeds", type=int, default=1, help="instants for each kind of fault")
+    parser.add_argument("--only", default="", help="cases whose name holds this, such as 'worker SIGKILL'")
+    parser.add_argument("--json", action="store_true", help="a JSON line for each row")
+    parser.add_argument("--keep", type=Path, help="folder for the cluster and the runs; default: thrown away")
+    options = parser.parse_args()
+
+    def tell(row: Row) -> None:
+        if options.json:
+            print(json.dumps({**asdict(row), "outcome": row.outcome}), flush=True)
+        else:
+            when = f"after {row.after} episodes ({row.phase})" if row.phase else ""
+            print(f"{row.target:<12}{row.fault:<25}{when:<34}{row.took_s:>6} s  {row.outcome}", flush=True)
+
+    # Ended from outside, it still takes everything down that it has started.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    with contextlib.ExitStack() as stack:
+        root = options.keep
+        if root is None:
+            root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="evof-")))
+        root.mkdir(parents=True, exist_ok=True)
+        well = play_all(options.fault_seeds, tell, root, options.only)
+    sys.exit(0 if well else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""A coordinator for the fault tests: the real process, with short timings and the same keys for every run, so that runs
+on it can be compared byte for byte (random actions and policies' generators are seeded from a run's key)."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import secrets
+import signal
+import sys
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.blobs import write_atomically
+from evopolicy_common.cli import setup_logging
+from evopolicy_coordinator import intake, process
+from evopolicy_coordinator.core.settings import CoreSettings
+
+SETTINGS = CoreSettings(
+    lease_ttl_s=3.0,
+    heartbeat_s=0.5,
+    liveness_grace_s=1.0,
+    adoption_s=1.5,
+    retry_base_s=0.1,
+    avoid_s=0.5,
+)
+
+
+class FixedKeys:
+    """In place of the module `secrets`, where the coordinator makes up what names and guards a run."""
+
+    token_hex = staticmethod(secrets.token_hex)
+    token_urlsafe = staticmethod(secrets.token_urlsafe)
+
+    @staticmethod
+    def token_bytes(n: int) -> bytes:
+        return bytes(itertools.islice(itertools.cycle(b"fault"), n))
+
+
+async def serve(state: Path, ready_file: Path) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+    def on_ready(ready: process.Ready) -> None:
+        write_atomically(ready_file, msgspec.json.encode(ready), mode=0o600)
+
+    await process.run(process.Options(state=state, core=SETTINGS), stop, on_ready)
+
+
+if __name__ == "__main__":
+    setup_logging("info")
+    intake.secrets = FixedKeys  # type: ignore[attr-defined]
+    asyncio.run(serve(Path(sys.argv[1]), Path(sys.argv[2])))

@@ -1,0 +1,75 @@
+"""Real processes are killed, frozen and starved at seeded instants of whole runs, and every run comes to the same.
+
+All runs are played by `fault_matrix.py`, in a process of its own because it adopts whatever is left over; each test waits
+for its row. More instants: `pytest tests/faults --fault-seeds 10`; the table: `python tests/faults/fault_matrix.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fault_matrix import Case, cases
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+class Matrix:
+    """The rows that the program has printed so far."""
+
+    def __init__(self, seeds: int) -> None:
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, str(Path(__file__).with_name("fault_matrix.py"))),
+                *("--json", "--fault-seeds", str(seeds)),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._rows: dict[tuple[str, str, int], dict[str, Any]] = {}
+
+    def row(self, target: str, fault: str, seed: int) -> dict[str, Any]:
+        """Waits for it."""
+        assert self.process.stdout is not None
+        while (target, fault, seed) not in self._rows:
+            line = self.process.stdout.readline()
+            assert line, f"the program ended with status {self.process.wait()}"
+            row = json.loads(line)
+            self._rows[row["target"], row["fault"], row["seed"]] = row
+        return self._rows[target, fault, seed]
+
+
+@pytest.fixture(scope="module")
+def matrix(request: pytest.FixtureRequest) -> Iterator[Matrix]:
+    matrix = Matrix(request.config.getoption("--fault-seeds"))
+    yield matrix
+    # Also when only some rows were asked for: it takes everything down that it has started.
+    matrix.process.terminate()
+    matrix.process.communicate(timeout=60)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "case" in metafunc.fixturenames:
+        found = cases(metafunc.config.getoption("--fault-seeds"))
+        metafunc.parametrize("case", found, ids=[case.name.replace(" ", "-") for case in found])
+
+
+def test_an_undisturbed_run_spends_its_budget_and_leaves_no_process(matrix: Matrix) -> None:
+    assert matrix.row("nothing", "", 0)["wrong"] == []
+
+
+def test_a_run_comes_to_the_same_through(case: Case, matrix: Matrix) -> None:
+    row = matrix.row(case.target, case.fault, case.seed)
+    assert row["wrong"] == []
+    assert row["phase"]
+
+
+def test_nothing_is_left_of_the_cluster(matrix: Matrix) -> None:
+    matrix.process.wait()
+    assert matrix.process.stdout is not None
+    assert [line for line in matrix.process.stdout if json.loads(line)["wrong"]] == []
