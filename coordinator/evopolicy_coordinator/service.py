@@ -29,6 +29,7 @@ from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message, Refused
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answer, Answers
+from evopolicy_coordinator.claims import Claims
 from evopolicy_coordinator.core.effects import Effect, Log, ReadEvaluation, ReadFinished, ReadResults, Reply
 from evopolicy_coordinator.core.events import AnyEvent, LivenessLost
 from evopolicy_coordinator.core.machine import Core
@@ -78,6 +79,7 @@ class Service:
         self._settings = settings
         self._loop = asyncio.get_running_loop()
         self._writer = Writer(store)
+        self._claims = Claims(self._writer)
         self._outbox: Outbox | None = None
         self._core: Core | None = None
         self._pending: dict[int, _Pending] = {}
@@ -167,6 +169,8 @@ class Service:
             self._serve_put(core, query, parsed, message)
         elif isinstance(message, BlobGet):
             self._serve_get(core, query, parsed, message)
+        elif isinstance(message, operator.Claim):
+            self._spawn(self._serve_claim(query, message))
         elif isinstance(message, operator.StatusRequest):
             query.reply(codec.encode(self._status(core)), _lane(parsed.asker))
         elif isinstance(message, _READS_FILES):
@@ -203,6 +207,21 @@ class Service:
         if request in self._pending:  # else the core was dropped meanwhile, and the query with it
             self._handle(event)
             self._flush()
+
+    async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
+        """Claims are beside the core: what they decide changes no run."""
+        try:
+            answer: Message = await self._claims.ask(message, self.now())
+        except RefusedError as error:
+            self._refuse(query, error)
+            return
+        except StorageError as error:
+            answer = Refused(status="unavailable", message=str(error))
+        except Exception:
+            log.exception("request failed", key=query.key)
+            query.drop()
+            return
+        query.reply(codec.encode(answer))
 
     def _admit(self, query: IncomingQuery, parsed: Parsed) -> int:
         self._n_requests += 1

@@ -63,6 +63,9 @@ _MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE finished (run TEXT PRIMARY KEY, data BLOB NOT NULL);
     CREATE TABLE workers (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
     """,
+    """
+    CREATE TABLE claims (suite TEXT NOT NULL, name TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (suite, name));
+    """,
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
 
@@ -116,6 +119,14 @@ class Store:
             if db.in_transaction:
                 db.execute("ROLLBACK")
             raise
+
+    def write_claim(self, suite: str, name: str, data: bytes) -> None:
+        """Keeps a sweep's claim, durably; StorageError when it could not."""
+        _guard(self._path, lambda: self._db.execute(_CLAIM, (suite, name, data)))
+
+    def claims(self) -> list[tuple[str, str, bytes]]:
+        """All claims of sweeps, as they were written."""
+        return _guard(self._path, lambda: self._db.execute("SELECT suite, name, data FROM claims").fetchall())
 
     def load(self) -> Snapshot:
         """Counts one more incarnation, durably, and reads what a core starts from."""
@@ -298,6 +309,7 @@ _STRIKE = _upsert("strikes", "grp, lease_id, data", "grp, lease_id")
 _EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
 _FINISHED = _upsert("finished", "run, data", "run")
 _WORKER = _upsert("workers", "worker, data", "worker")
+_CLAIM = _upsert("claims", "suite, name, data", "suite, name")
 
 
 def _write_run(db: sqlite3.Connection, row: RunRow) -> None:

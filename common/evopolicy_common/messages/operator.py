@@ -188,6 +188,39 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
     """The request was carried out."""
 
 
+class Claim(Message, frozen=True, kw_only=True, tag="claim"):
+    """One run of a sweep, for this host to play: taken, renewed, given back or settled, so that none is played twice."""
+
+    token: str
+    suite: str
+    """The sweep's name."""
+    name: str
+    """The run's name in the sweep."""
+    holder: str
+    """The host that asks; the same after its restart."""
+    ttl_s: float
+    """Asked for again before this many seconds are over; 0.0 gives it back."""
+    run: str = ""
+    """The cluster's id of what is played for it, once there is one."""
+    result: dict[str, Any] | None = None
+    """What it came to: settles the claim for good."""
+
+
+class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
+    """How things stand after a `Claim`."""
+
+    granted: bool
+    """The asker holds it, or may not and need not because it is settled."""
+    holder: str
+    """Who holds or held it last; empty: nobody."""
+    run: str
+    """What the last holder played for it; empty: nothing yet."""
+    previous: str = ""
+    """The holder from whom it has just been taken over, because its time was up."""
+    result: dict[str, Any] | None = None
+    """What it came to, once it is settled."""
+
+
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
     token: str
 
@@ -245,6 +278,7 @@ OperatorRequest = (
     | CancelRun
     | RepinRun
     | SetWorker
+    | Claim
     | StatusRequest
     | BlobPut
     | BlobGet
@@ -255,6 +289,7 @@ OperatorReply = (
     | EvaluationStarted
     | EvaluationPage
     | Done
+    | ClaimState
     | StatusReply
     | BlobAck
     | BlobChunk
