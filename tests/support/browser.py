@@ -130,7 +130,9 @@ class Page:
         params = message.get("params", {})
         match message.get("method"):
             case "Runtime.exceptionThrown":
-                self.problems.append(str(params["exceptionDetails"].get("exception", params["exceptionDetails"])))
+                self.problems.append(
+                    str(params["exceptionDetails"].get("exception", params["exceptionDetails"]))
+                )
             case "Runtime.consoleAPICalled" if params["type"] in ("error", "warning", "assert"):
                 self.problems.append(str([arg.get("value") for arg in params["args"]]))
             case "Log.entryAdded" if params["entry"]["level"] in ("error", "warning"):
@@ -158,7 +160,11 @@ class Page:
     def look(self, *, width: int = 1280, height: int = 800, dark: bool = False, phone: bool = False) -> None:
         """Sets the window's size in CSS pixels and the preferred colour scheme."""
         self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=phone,
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
@@ -169,5 +175,7 @@ class Page:
         if whole:
             size = self.call("Page.getLayoutMetrics")["cssContentSize"]
             clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-            data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)["data"]
+            data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)[
+                "data"
+            ]
         path.write_bytes(base64.b64decode(data))
