@@ -1,9 +1,10 @@
 """Acrobot: pump energy through the elbow, with a gain that was rehearsed for this very start.
 
-The motor does work on the pendulum when its torque has the sign of the elbow's angular velocity ω2: that bang-bang rule
-alone swings the tip up. Looking at ω2 − k ω1 instead switches a little earlier, in time with the shoulder's swing, and
-which k is soonest at the top depends on the start. The equations of motion are known and exact, so the first `act` plays
-the whole swing-up in its head once for each k and keeps the quickest.
+The motor does work on the pendulum when its torque has the sign of the elbow's angular velocity ω2: that
+bang-bang rule alone swings the tip up. Looking at ω2 − k ω1 instead switches a little earlier, in time with
+the shoulder's swing, and which k is soonest at the top depends on the start. The equations of motion are
+known and exact, so the first `act` plays the whole swing-up in its head once for each k and keeps the
+quickest.
 """
 
 import math

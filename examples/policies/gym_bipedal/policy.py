@@ -1,10 +1,11 @@
 """Bipedal walker: a step is three phases, and then the legs change roles.
 
-Swing: the body tips forward over the standing leg while the other leg, its knee bent, is brought forward. Land: the
-swung leg is lowered until it touches the ground. Push: the leg that is now behind straightens its knee and shoves the
-body on; then it becomes the one that swings. Each phase wants certain angles of hips and knees; springs and dampers draw
-the joints to them, the hips also hold the hull upright, and the knees damp its bobbing. The numbers were tuned together
-by evolution (CMA-ES) on the return, from a guess that fell in half of its episodes.
+Swing: the body tips forward over the standing leg while the other leg, its knee bent, is brought forward.
+Land: the swung leg is lowered until it touches the ground. Push: the leg that is now behind straightens its
+knee and shoves the body on; then it becomes the one that swings. Each phase wants certain angles of hips and
+knees; springs and dampers draw the joints to them, the hips also hold the hull upright, and the knees damp
+its bobbing. The numbers were tuned together by evolution (CMA-ES) on the return, from a guess that fell in
+half of its episodes.
 """
 
 import numpy as np
@@ -67,7 +68,8 @@ class Policy:
         return np.clip(POWER * torques.ravel(), -1.0, 1.0)
 
     def wanted_angles(self, swing, stand):
-        """Wanted angles of the swinging hip (None: only hold the hull), the swinging knee and the standing knee.
+        """Wanted angles of the swinging hip (None: only hold the hull), the swinging knee and the standing
+        knee.
 
         Passes on to the next phase where that is due.
         """

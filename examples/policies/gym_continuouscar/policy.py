@@ -1,9 +1,10 @@
 """Mountain car, continuous: push the way the car already moves, and no harder than needed.
 
-A push along the velocity always adds energy, so the swings grow until one of them passes the flag. The cost is 0.1 a² a
-step: a gentler push needs more swings, but the sum of squares shrinks with it. The model of the valley is known, so at
-the start the policy rehearses the whole drive for a number of strengths and takes the cheapest that arrives; while it
-drives, it coasts as soon as the energy that the car has carries it over the hill.
+A push along the velocity always adds energy, so the swings grow until one of them passes the flag. The cost
+is 0.1 a² a step: a gentler push needs more swings, but the sum of squares shrinks with it. The model of the
+valley is known, so at the start the policy rehearses the whole drive for a number of strengths and takes the
+cheapest that arrives; while it drives, it coasts as soon as the energy that the car has carries it over the
+hill.
 """
 
 import math

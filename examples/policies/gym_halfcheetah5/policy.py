@@ -1,8 +1,9 @@
 """Half cheetah: a gait of six sine waves, one a joint, with a spring and a damper to follow them.
 
-Every joint swings around a centre of its own with the same rhythm; what makes it run is the amplitudes and phases, which
-were tuned together by evolution (CMA-ES) on the return. A little of the body's pitch is fed back to the thighs. Now and
-then the start tips it over on its back, where it stays: a faster gait is a riskier one.
+Every joint swings around a centre of its own with the same rhythm; what makes it run is the amplitudes and
+phases, which were tuned together by evolution (CMA-ES) on the return. A little of the body's pitch is fed
+back to the thighs. Now and then the start tips it over on its back, where it stays: a faster gait is a
+riskier one.
 """
 
 import numpy as np

@@ -1,10 +1,10 @@
 """Pusher: bring the arm's open fork down behind the cylinder, then carry it before the fork to the goal.
 
-The wrist carries two fingers and a bar between them: a fork that opens away from the forearm. The bar pushes the cylinder
-forward, a finger pushes it sideways, and a cylinder between the fingers does not get away. Where the wrist shall be
-follows from where the cylinder is, a little ahead of where it would just touch. Which joint angles bring it there is
-looked up in a table of postures, of which the one nearest to the present posture is taken. Springs and dampers draw the
-joints to it; they are soft, for torque is costly.
+The wrist carries two fingers and a bar between them: a fork that opens away from the forearm. The bar pushes
+the cylinder forward, a finger pushes it sideways, and a cylinder between the fingers does not get away. Where
+the wrist shall be follows from where the cylinder is, a little ahead of where it would just touch. Which
+joint angles bring it there is looked up in a table of postures, of which the one nearest to the present
+posture is taken. Springs and dampers draw the joints to it; they are soft, for torque is costly.
 """
 
 import itertools
@@ -43,7 +43,9 @@ def wrist_of(lift, roll, elbow):
 
 
 def posture_table():
-    """Postures whose wrist is low: rows of (lift, roll, elbow), and their wrists as (distance, direction, height)."""
+    """Postures whose wrist is low: rows of (lift, roll, elbow), and their wrists as (distance, direction,
+    height).
+    """
     grid = itertools.product(np.linspace(0, 1.39, 48), np.linspace(-1.4, 1.4, 9), np.linspace(-2.3, 0, 48))
     postures = np.array(list(grid))
     x, y, z = wrist_of(*postures.T)
@@ -55,7 +57,9 @@ POSTURES, WRISTS = posture_table()
 
 
 def posture_for(place, height, angles):
-    """Pan, lift, roll and elbow that bring the wrist over a place on the table, near to the present angles."""
+    """Pan, lift, roll and elbow that bring the wrist over a place on the table, near to the present
+    angles.
+    """
     distance, direction = math.hypot(*(place - BASE)), math.atan2(*(place - BASE)[::-1])
     miss = ((WRISTS[:, 0] - distance) ** 2 + (WRISTS[:, 2] - height) ** 2) / 0.01**2
     pan = direction - WRISTS[:, 1]

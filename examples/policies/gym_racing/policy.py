@@ -1,9 +1,10 @@
 """Car racing: trace the road's middle ahead of the car, steer for a point on it, slow down in time for bends.
 
-Road is grey and grass green, so a pixel is road where green does not stand out. From the car on, the road is scanned
-across, every few units of length; the middle found there says where the next scan is and how it is turned, so the trace
-follows a bend even where the road comes back down the picture. Two numbers are taken from the trace: the point to steer
-for (pure pursuit), and the highest speed from which the car can still brake to what each bend ahead allows.
+Road is grey and grass green, so a pixel is road where green does not stand out. From the car on, the road is
+scanned across, every few units of length; the middle found there says where the next scan is and how it is
+turned, so the trace follows a bend even where the road comes back down the picture. Two numbers are taken
+from the trace: the point to steer for (pure pursuit), and the highest speed from which the car can still
+brake to what each bend ahead allows.
 """
 
 import math
@@ -63,7 +64,9 @@ def read_speed(obs):
 
 
 def trace_road(obs):
-    """Points (x to the right, y ahead, in units from the car) on the road's middle, the car's own place first."""
+    """Points (x to the right, y ahead, in units from the car) on the road's middle, the car's own place
+    first.
+    """
     road = obs[:84, :, 1] <= obs[:84, :, 0].astype(np.int16) + GREEN
     x, y, angle = 0.0, 0.0, 0.0
     points = [(x, y)]
@@ -85,7 +88,9 @@ def trace_road(obs):
 
 
 def middle_of(seen):
-    """Middle, in units from the centre, of the stretch of road nearest to a scan's centre; None without road."""
+    """Middle, in units from the centre, of the stretch of road nearest to a scan's centre; None without
+    road.
+    """
     here = min((i for i, road in enumerate(seen) if road), key=lambda i: abs(i - CENTRE), default=None)
     if here is None:
         return None

@@ -1,9 +1,9 @@
 """Reacher: inverse kinematics for where to go, and a rehearsed spring and damper for how fast.
 
-Two elbow bends put the fingertip on the target. Each joint is then drawn to its angle like a mass on a damped spring.
-Torque is costly and so is time: which stiffness and damping are cheapest depends on the way to go, so the first `act`
-plays the motion in its head for a grid of both, for both bends, with joints that do not disturb each other (nearly
-true: their own inertia of 1 kg m² outweighs the links), and keeps the cheapest.
+Two elbow bends put the fingertip on the target. Each joint is then drawn to its angle like a mass on a damped
+spring. Torque is costly and so is time: which stiffness and damping are cheapest depends on the way to go, so
+the first `act` plays the motion in its head for a grid of both, for both bends, with joints that do not
+disturb each other (nearly true: their own inertia of 1 kg m² outweighs the links), and keeps the cheapest.
 """
 
 import math

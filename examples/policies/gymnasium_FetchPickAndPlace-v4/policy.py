@@ -1,7 +1,7 @@
 """Fetch pick and place: over the block, down, close the fingers, carry it to the target.
 
-The phase is read off the observation every step, not counted: a block that slips is simply picked up again. Approaching
-from above starts early: the lower the gripper is, the nearer to the block's axis it has to be.
+The phase is read off the observation every step, not counted: a block that slips is simply picked up again.
+Approaching from above starts early: the lower the gripper is, the nearer to the block's axis it has to be.
 """
 
 import numpy as np

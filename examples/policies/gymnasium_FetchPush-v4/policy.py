@@ -1,8 +1,9 @@
 """Fetch push: get behind the block, seen from the target, and push it along the line to the target.
 
-Phases: while the gripper is not behind the block, go to the place behind it, low where the way is free, else over the
-block; then push, steering so that gripper, block and target stay in line. A pushed block slides on when the gripper
-stops, so what counts is where it will come to rest: once that is the target, the gripper stands back.
+Phases: while the gripper is not behind the block, go to the place behind it, low where the way is free, else
+over the block; then push, steering so that gripper, block and target stay in line. A pushed block slides on
+when the gripper stops, so what counts is where it will come to rest: once that is the target, the gripper
+stands back.
 """
 
 import numpy as np
@@ -15,7 +16,9 @@ PUSH_HEIGHT = 0.425
 CLEAR_HEIGHT = 0.515
 """z from which on the gripper passes over the block without touching it."""
 BEHIND = 0.075
-"""How far behind the block's centre the push starts (m): half of block and fingers together, with some air."""
+"""How far behind the block's centre the push starts (m): half of block and fingers together, with some
+air.
+"""
 IN_LINE = 0.02
 """How far beside the line of the push the gripper may be when it starts (m)."""
 TOUCH = 0.07

@@ -1,7 +1,9 @@
-"""Door and key: a memory of the map and a list of wishes, of which the first that can be fulfilled is pursued.
+"""Door and key: a memory of the map and a list of wishes, of which the first that can be fulfilled is
+pursued.
 
-Goal in reach: walk onto it. Key in hand and the door known: open it. Key known: fetch it. Otherwise look where most is
-unseen. `gridmap.py` holds the map, the shortest routes over poses (cell and direction), and the choice of where to look.
+Goal in reach: walk onto it. Key in hand and the door known: open it. Key known: fetch it. Otherwise look
+where most is unseen. `gridmap.py` holds the map, the shortest routes over poses (cell and direction), and the
+choice of where to look.
 """
 
 from gridmap import DOOR, GOAL, KEY, LEFT, LOCKED, PICK_UP, GridMap

@@ -1,8 +1,9 @@
 """Four rooms: remember every cell seen, look where most is unseen, walk straight to the goal once it shows.
 
-`gridmap.py` holds the map, the shortest routes over poses (cell and direction, since turning costs a step too), and the
-choice of where to look. What is special to this world: its walls are straight lines from end to end, so two wall cells
-side by side give away the whole line, and nothing need be hoped for behind it but the gaps.
+`gridmap.py` holds the map, the shortest routes over poses (cell and direction, since turning costs a step
+too), and the choice of where to look. What is special to this world: its walls are straight lines from end to
+end, so two wall cells side by side give away the whole line, and nothing need be hoped for behind it but the
+gaps.
 """
 
 from gridmap import GOAL, LEFT, STEP, WALL, GridMap
@@ -29,7 +30,9 @@ class Policy:
         return self.map.acted(action)
 
     def plan(self):
-        """Poses to pass: to the goal when it is known and can be reached, else to where most is to be seen."""
+        """Poses to pass: to the goal when it is known and can be reached, else to where most is to be
+        seen.
+        """
         goals = self.map.find(GOAL)
         return (goals and self.map.route_onto(goals[0])) or self.map.route_to_news()
 

@@ -1,7 +1,7 @@
 """Errands in a MiniGrid world where one thing at a time can be carried: fetch, open, put down out of the way.
 
-Each function returns a plan, (poses to pass, what to do at the last of them), or None when the errand cannot be done from
-what is known. The same file serves the policies that fetch a ball from behind a locked door.
+Each function returns a plan, (poses to pass, what to do at the last of them), or None when the errand cannot
+be done from what is known. The same file serves the policies that fetch a ball from behind a locked door.
 """
 
 from gridmap import DOOR, DROP, EMPTY, LEFT, LOCKED, PICK_UP, STEP, trace
@@ -48,7 +48,9 @@ def put_down(world, then=None):
 
 
 def cost_to_face(world, thing, start, blocked):
-    """Steps from a pose until `thing` is right ahead, with one more cell blocked; None when it can't be reached."""
+    """Steps from a pose until `thing` is right ahead, with one more cell blocked; None when it can't be
+    reached.
+    """
     for cost, cell, direction, _ in world.poses({blocked}, start):
         if cell + STEP[direction] == thing:
             return cost

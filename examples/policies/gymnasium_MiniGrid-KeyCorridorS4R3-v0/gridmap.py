@@ -1,8 +1,8 @@
 """A memory of a MiniGrid world, with routes through it and a sense of where to look next.
 
-The agent sees a 7 x 7 window that turns with it and never its position, so the map counts positions from the start:
-a `forward` has moved exactly when the cell ahead could be entered. Cells are numbered row by row in one flat list; a pose
-is a (cell, direction). The same file serves all MiniGrid policies.
+The agent sees a 7 x 7 window that turns with it and never its position, so the map counts positions from the
+start: a `forward` has moved exactly when the cell ahead could be entered. Cells are numbered row by row in
+one flat list; a pose is a (cell, direction). The same file serves all MiniGrid policies.
 """
 
 import heapq
@@ -25,8 +25,9 @@ YES, NO = ord("1"), ord("0")
 def spread(lit, clear):
     """How sight spreads along a row of the window, and from it to the next row ahead.
 
-    `lit` and `clear` are rows of seven bits: where light enters, and which cells let it pass. Returns the row's visible
-    cells and the cells of the next row that are lit. The rule is MiniGrid's own: first left to right, then back.
+    `lit` and `clear` are rows of seven bits: where light enters, and which cells let it pass. Returns the
+    row's visible cells and the cells of the next row that are lit. The rule is MiniGrid's own: first left to
+    right, then back.
     """
     ahead = 0
     for order, step in ((range(VIEW - 1), 1), (range(VIEW - 1, 0, -1), -1)):
@@ -48,7 +49,9 @@ class GridMap:
         self.state = [0] * cells
         self.unseen = bytearray([YES]) * cells
         self.clear = bytearray([YES]) * cells
-        """Cells that can be seen through, the unseen ones hopefully; digits, so that a slice reads as a binary number."""
+        """Cells that can be seen through, the unseen ones hopefully; digits, so that a slice reads as a
+        binary number.
+        """
         self.cell = START
         self.direction = 0
         self.carried = None
@@ -148,7 +151,9 @@ class GridMap:
                     heapq.heappush(queue, (cost + entry, target, direction, here))
 
     def route(self, arrived, blocked=()):
-        """Poses on the quickest way to the first pose for which `arrived(cell, direction)`; None if there is none."""
+        """Poses on the quickest way to the first pose for which `arrived(cell, direction)`; None if there is
+        none.
+        """
         before = {}
         for _, cell, direction, previous in self.poses(blocked):
             before[cell, direction] = previous
@@ -180,7 +185,9 @@ class GridMap:
     # -- looking
 
     def expect_wall(self, cell):
-        """Take an unseen cell for a wall until it is seen: it hides what is behind it, and is still worth a look."""
+        """Take an unseen cell for a wall until it is seen: it hides what is behind it, and is still worth a
+        look.
+        """
         if self.kind[cell] == UNSEEN:
             self.clear[cell] = NO
 
@@ -202,7 +209,9 @@ class GridMap:
         return total
 
     def route_to_news(self, patience=3):
-        """The way to the pose that shows most for its cost, (novelty / (cost + patience)); None when all is seen."""
+        """The way to the pose that shows most for its cost, (novelty / (cost + patience)); None when all is
+        seen.
+        """
         before, best, goal = {}, 0.0, None
         for cost, cell, direction, previous in self.poses():
             before[cell, direction] = previous

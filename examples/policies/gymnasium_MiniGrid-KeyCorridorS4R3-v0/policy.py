@@ -1,8 +1,10 @@
-"""Key corridor: a memory of the map and a list of wishes, of which the first that can be fulfilled is pursued.
+"""Key corridor: a memory of the map and a list of wishes, of which the first that can be fulfilled is
+pursued.
 
-The ball in reach: put the key down, pick up the ball. The key in hand: open the locked door. The key and the door known:
-fetch the key. Otherwise look where most is unseen. `gridmap.py` holds the map, the shortest routes over poses (cell and
-direction) and the choice of where to look; `errands.py` turns a wish into a route and an action.
+The ball in reach: put the key down, pick up the ball. The key in hand: open the locked door. The key and the
+door known: fetch the key. Otherwise look where most is unseen. `gridmap.py` holds the map, the shortest
+routes over poses (cell and direction) and the choice of where to look; `errands.py` turns a wish into a route
+and an action.
 """
 
 from errands import fetch, go_through, locked_doors, look_around, put_down

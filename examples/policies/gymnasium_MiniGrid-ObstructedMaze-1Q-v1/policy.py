@@ -1,9 +1,10 @@
-"""Obstructed maze: a memory of the map and a list of wishes, of which the first that can be fulfilled is pursued.
+"""Obstructed maze: a memory of the map and a list of wishes, of which the first that can be fulfilled is
+pursued.
 
-The blue ball in reach: empty the hands and take it. The right key in hand: open the upper door. The green ball before
-that door: move it out of the way. The key known: fetch it. A box: open it, keys are hidden in there. Otherwise look where
-most is unseen. `gridmap.py` holds the map, the shortest routes over poses (cell and direction) and the choice of where to
-look; `errands.py` turns a wish into a route and an action.
+The blue ball in reach: empty the hands and take it. The right key in hand: open the upper door. The green
+ball before that door: move it out of the way. The key known: fetch it. A box: open it, keys are hidden in
+there. Otherwise look where most is unseen. `gridmap.py` holds the map, the shortest routes over poses (cell
+and direction) and the choice of where to look; `errands.py` turns a wish into a route and an action.
 """
 
 from errands import fetch, go_through, locked_doors, look_around, put_down
@@ -29,13 +30,24 @@ class Policy:
     def act(self, obs):
         self.map.update(obs)
         if self.map.news or self.map.arrived(self.route):
-            wishes = (self.blue_ball, self.open, self.unload, self.unblock, self.key, self.box, self.search, self.clear)
+            wishes = (
+                self.blue_ball,
+                self.open,
+                self.unload,
+                self.unblock,
+                self.key,
+                self.box,
+                self.search,
+                self.clear,
+            )
             plans = (plan for wish in wishes if (plan := wish()))
             self.route, self.finally_do = next(plans, ([], LEFT))
         return self.map.acted(self.map.follow(self.route) if self.route else self.finally_do)
 
     def upper_door(self):
-        """The locked door in the upper wall of the room with the boxes, if it is known: the room is below it."""
+        """The locked door in the upper wall of the room with the boxes, if it is known: the room is below
+        it.
+        """
         for door in locked_doors(self.map):
             if self.map.kind[door + BELOW] not in (UNSEEN, WALL):
                 return door

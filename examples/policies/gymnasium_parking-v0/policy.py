@@ -1,9 +1,9 @@
 """Parking: rehearse a few hundred simple manoeuvres in the known model of the car, and drive the best.
 
-A manoeuvre first goes a little forward or backward with a fixed steering angle, to turn the car round, and then steers
-onto the middle line of the space and along it: the further beside the line the car is, the more its wanted heading turns
-towards it. Being parked does not ask for standing still, so the quickest way in wins. The model is exact; the choice is
-made once, in the first `act`.
+A manoeuvre first goes a little forward or backward with a fixed steering angle, to turn the car round, and
+then steers onto the middle line of the space and along it: the further beside the line the car is, the more
+its wanted heading turns towards it. Being parked does not ask for standing still, so the quickest way in
+wins. The model is exact; the choice is made once, in the first `act`.
 
 All is computed as if the space lay at positive y; for the other row, y and the steering are mirrored.
 """
@@ -33,12 +33,16 @@ STEER_GAIN = 2.5
 MANOEUVRES = np.array(
     [
         (first, gear, steering, reach, turn, speed)
-        for first, gear, steering in [(0, 1, 0), *itertools.product((2, 4, 6, 8, 10, 12), (-1, 1), (-1, 0, 1))]
+        for first, gear, steering in [
+            (0, 1, 0),
+            *itertools.product((2, 4, 6, 8, 10, 12), (-1, 1), (-1, 0, 1)),
+        ]
         for reach, turn, speed in itertools.product((3.0, 5.0, 8.0, 12.0), (1.1, 1.57), (6.0, 11.0))
     ]
 ).T
-"""One a column: steps of the first part, its gear and steering; then the distance from the line (m) at which the wanted
-heading is turned fully, by how much (rad), and the speed (m/s)."""
+"""One a column: steps of the first part, its gear and steering; then the distance from the line (m) at which
+the wanted heading is turned fully, by how much (rad), and the speed (m/s).
+"""
 
 
 def control(manoeuvre, t, x, heading, speed):

@@ -1,8 +1,10 @@
-"""Roundabout: try out speed plans against a forecast of the traffic, every second, and take the first step of the best.
+"""Roundabout: try out speed plans against a forecast of the traffic, every second, and take the first step of
+the best.
 
-The built-in driver steers, so the way is known beforehand and only the speed along it is to be chosen. Each plan is a
-sequence of choices for the next seconds; the forecast lets the other cars go round at their present speed. A plan earns
-what the environment pays for speed and loses for every moment too near to another car. Lanes are never changed.
+The built-in driver steers, so the way is known beforehand and only the speed along it is to be chosen. Each
+plan is a sequence of choices for the next seconds; the forecast lets the other cars go round at their present
+speed. A plan earns what the environment pays for speed and loses for every moment too near to another car.
+Lanes are never changed.
 """
 
 import itertools
@@ -29,10 +31,10 @@ FORGET_S = 3
 """A car that is no longer shown is still expected where it would be, for this long."""
 WAY = np.array(
     [
-        (2.0, 60.0), (2.0, 44.5), (2.1, 41.0), (2.5, 36.8), (3.5, 32.1), (4.9, 27.3), (8.9, 24.1), (13.1, 21.0),
-        (17.0, 17.4), (20.2, 13.2), (22.5, 8.4), (23.7, 3.2), (23.8, -2.1), (22.7, -7.3), (20.5, -12.2),
-        (17.3, -16.4), (13.2, -19.8), (9.1, -23.2), (6.2, -27.6), (4.1, -32.5), (2.7, -37.7), (2.2, -43.0),
-        (2.0, -60.0), (2.0, -200.0),
+        (2.0, 60.0), (2.0, 44.5), (2.1, 41.0), (2.5, 36.8), (3.5, 32.1), (4.9, 27.3),
+        (8.9, 24.1), (13.1, 21.0), (17.0, 17.4), (20.2, 13.2), (22.5, 8.4), (23.7, 3.2),
+        (23.8, -2.1), (22.7, -7.3), (20.5, -12.2), (17.3, -16.4), (13.2, -19.8), (9.1, -23.2),
+        (6.2, -27.6), (4.1, -32.5), (2.7, -37.7), (2.2, -43.0), (2.0, -60.0), (2.0, -200.0),
     ]
 )  # fmt: skip
 """Points on the car's way: in from the south, round on the outer lane, out to the north (m)."""
@@ -65,7 +67,9 @@ class Policy:
         """Take in the cars that are shown; of those that are not, keep a forecast for a while."""
         forecast = [(advance(state, 1.0), age + 1) for state, age in self.cars if age < FORGET_S]
         hidden = [
-            (state, age) for state, age in forecast if all(np.hypot(*(state[:2] - car[:2])) > 6.0 for car in seen)
+            (state, age)
+            for state, age in forecast
+            if all(np.hypot(*(state[:2] - car[:2])) > 6.0 for car in seen)
         ]
         self.cars = [(car, 0) for car in seen] + hidden
 
@@ -108,7 +112,9 @@ def way_done(position):
 
 
 def advance(cars, seconds):
-    """Forecast of cars, rows of (x, y, vx, vy): round the centre at constant speed, or straight on outside."""
+    """Forecast of cars, rows of (x, y, vx, vy): round the centre at constant speed, or straight on
+    outside.
+    """
     x, y, vx, vy = cars[..., 0], cars[..., 1], cars[..., 2], cars[..., 3]
     radius = np.maximum(np.hypot(x, y), 1.0)
     going_round = (radius < RING_M) & (np.abs(x * vy - y * vx) > 0.5 * radius * np.hypot(vx, vy))
