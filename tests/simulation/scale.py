@@ -2,7 +2,7 @@
 
 A job's cost is the CPU time of the core and nothing else: the workers here answer at once and the store drops its rows. It
 must stay flat, and memory must not grow with finished jobs: it is measured in a second
-pass over half of the jobs, after two fifths of them (when the core's story, of fixed size, is full) and at the end.
+pass, after two fifths of them (when the core's story, of fixed size, is full) and at the end.
 
     python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000]
 """
@@ -282,12 +282,12 @@ class Load:
 
 
 def measure(workers: int, jobs: int) -> Row:
-    """One line: CPU in one pass, memory in another, shorter one, for watching memory is slow."""
+    """One line: CPU in one pass, memory in another, for watching memory is slow."""
     load = Load(workers, jobs, memory=False)
     load.start()
     gc.collect()
     load.run()
-    watched = Load(workers, jobs // 2, memory=True)
+    watched = Load(workers, jobs, memory=True)
     watched.start()
     watched.run()
     early, late = watched.memory
