@@ -15,13 +15,18 @@ from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator import process
+from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.process import Options, Ready
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: evopolicy-coordinator --listen tcp/0.0.0.0:7447 --state /var/lib/evopolicy")
+@app.callback(
+    invoke_without_command=True,
+    epilog="Example: evopolicy-coordinator --listen tcp/0.0.0.0:7447 --state /var/lib/evopolicy",
+)
 def serve(
+    context: typer.Context,
     listen: Annotated[
         list[str] | None,
         typer.Option(
@@ -56,6 +61,8 @@ def serve(
 
     SIGTERM or Ctrl-C: makes everything durable and exits; started again on the same folder, it goes on where it was.
     """
+    if context.invoked_subcommand is not None:
+        return
     with fail_on_our_errors():
         if log_level not in ("debug", "info", "warning", "error"):
             raise ConfigError(f"--log-level {log_level!r}: say debug, info, warning or error")
@@ -72,6 +79,28 @@ def serve(
         finally:
             if ready_file is not None:
                 ready_file.unlink(missing_ok=True)
+
+
+@app.command(epilog="Example: evopolicy-coordinator backup /backup/monday --state /var/lib/evopolicy")
+def backup(
+    target: Annotated[Path, typer.Argument(help="New folder for the copy.", show_default=False)],
+    state: Annotated[
+        Path | None, typer.Option(help="The state folder [$EVOPOLICY_STATE or the user's state home].")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was copied as JSON.")] = False,
+) -> None:
+    """Copies the state folder, also while its coordinator runs: database as of one instant, blobs, keys.
+
+    To restore: stop the coordinator, copy the backup to where its state was, start it again. Workers and gateways
+    reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the state:
+    they hold the hidden cases.
+    """
+    with fail_on_our_errors():
+        copied = back_up(state or default_state_dir(), target)
+    if as_json:
+        print(msgspec.json.encode(copied).decode())
+    else:
+        print(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
 
 
 async def _run(options: Options, ready_file: Path | None) -> None:

@@ -112,7 +112,8 @@ class FaultCluster:
             assert time.monotonic() < deadline, (root / "coordinator.log").read_text()
             time.sleep(0.02)
         self.files: dict[str, str] = json.loads(self._ready.read_text())["credentials"]
-        worker = [*(sys.executable, "-m", "evopolicy_worker.cli", "--env", "toy/line", "--slots", "2")]
+        worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
+        worker += ["--env", "toy/line", "--slots", "2"]
         worker += ["--grace", "1", "--name", "w", "--credentials", self.files["worker"]]
         self.worker = Kept(worker, root / "worker.log")
         self._agent = root / "agent.py"
