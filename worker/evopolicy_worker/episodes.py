@@ -383,7 +383,7 @@ def _read_files(folder: str) -> BundleFiles:
                 raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
             names.append((os.path.relpath(path, folder), executable, len(content)))
             data.append(content)
-    return BundleFiles(names, data)
+    return BundleFiles(names, b"".join(data))
 
 
 def fault_of(error: BaseException) -> str:

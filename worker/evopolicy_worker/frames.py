@@ -143,11 +143,11 @@ def _text_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
     return step
 
 
-def init_frame(init: dict[str, Any], files: list[bytes]) -> list[bytes]:
+def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
     """The first request: what the policy's process is to be, and its bundle."""
     head = json.dumps(init).encode()
-    length = len(head) + sum(map(len, files))
-    return [REQUEST_HEADER.pack(length, INIT, len(head)), head, *files]
+    length = len(head) + len(files)
+    return [REQUEST_HEADER.pack(length, INIT, len(head)), head, files]
 
 
 def action(tag: int, payload: bytes) -> Any:

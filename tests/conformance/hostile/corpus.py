@@ -2,7 +2,9 @@
 
 Two kinds. *Probes* (files in `policies/`) try one door after another and print `held: …` or `THROUGH: …`: their verdict
 is an ordinary episode in which every door held. *Breakers* misbehave at step 3 of an episode, or before its first; their
-verdict is the failure's category. `python tests/conformance/hostile/corpus.py` prints the table for the documentation.
+verdict is the failure's category. The table in docs/hostile-policies.md is made by
+
+    PYTHONPATH=tests/support python tests/conformance/hostile/corpus.py > docs/hostile-policies.md
 """
 
 from __future__ import annotations
@@ -305,7 +307,9 @@ BREAKERS = (
     Breaker(name="os._exit", act="os._exit(0)", verdict="killed"),
     Breaker(name="a segmentation fault", act="ctypes.string_at(1)", verdict="killed"),
     Breaker(name="an abort", act="os.abort()", verdict="killed"),
-    Breaker(name="an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None),
+    Breaker(
+        name="a signal of an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None
+    ),
     Breaker(
         name="stopping itself",
         act="os.kill(os.getpid(), signal.SIGSTOP); time.sleep(60)",
@@ -340,18 +344,35 @@ BREAKERS = (
 )
 
 
-def table() -> str:
-    """The corpus as markdown."""
-    lines = ["| attack | verdict |", "|---|---|"]
+def document() -> str:
+    """The corpus as markdown: what docs/hostile-policies.md holds."""
+    rows = []
     for probe in PROBES:
-        first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1]
-        lines.append(f"| {first.rstrip('.')} | nothing gets through; the episode goes on |")
-    lines += [
-        f"| {b.name} | {f'`{b.verdict}`' if b.verdict else 'none: harmless, the episode goes on'} |"
-        for b in BREAKERS
-    ]
-    return "\n".join(lines)
+        first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
+        undefended = {"tier": "with tier `none`", "sealed": "unsealed"}
+        off = "-" if probe.off is None else undefended["sealed" if "sealed" in probe.off else "tier"]
+        rows.append((first, "no door opens; the episode goes on", off))
+    for breaker in BREAKERS:
+        verdict = f"`{breaker.verdict}`" if breaker.verdict else "harmless; the episode goes on"
+        ways = ["unsealed"] * breaker.unsealed + ["with a higher limit"] * (breaker.off is not None)
+        rows.append((breaker.name, verdict, ", ".join(ways) or "-"))
+    rows += [(what, "nothing is found", "with tier `none`") for what in PAIRS]
+    lines = [f"| {what} | {verdict} | {off} |" for what, verdict, off in rows]
+    return "\n".join([HEAD, *lines, ""])
 
+
+PAIRS = (
+    "Leaves files, shared memory and state for the next episode, which looks for them",
+    "Two policies in parallel slots talk by files, shared memory, sockets or locks",
+    "Searches all objects, frames and generators for the case's seed",
+)
+HEAD = """# Hostile policies
+
+What the tests in `tests/conformance/hostile/` do to a slot of tier `bwrap`, and what comes of it. After each of them the
+slot plays an honest episode. The last column says how the attack was seen to succeed with its defence off.
+
+| attack | verdict | succeeds |
+|---|---|---|"""
 
 if __name__ == "__main__":
-    print(table())
+    print(document(), end="")

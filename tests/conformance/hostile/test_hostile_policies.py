@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from corpus import BREAKERS, NO_SANDBOX, POLICIES, PROBE, PROBES, Breaker, Probe
+from corpus import BREAKERS, NO_SANDBOX, POLICIES, PROBE, PROBES, Breaker, Probe, document
 from slots import HONEST, Slots, make_job, rows
 
 import evopolicy_worker
+from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 
 SEED = 1_987_654_321
@@ -209,3 +210,23 @@ async def both(one: Any, two: Any) -> Any:
     import asyncio
 
     return await asyncio.gather(one, two)
+
+
+def test_the_documented_table_is_the_corpus() -> None:
+    path = Path(__file__).parents[3] / "docs" / "hostile-policies.md"
+    assert path.read_text(encoding="utf-8") == document(), "make it anew: see corpus.py"
+
+
+def test_a_bundle_of_thousands_of_files_is_played(slots: Slots) -> None:
+    files: dict[str, str | bytes] = {f"data/{k % 40}/{k}.bin": bytes([k % 256]) for k in range(1999)}
+    files["policy.py"] = HONEST + "\nimport os\nprint(sum(len(files) for _, _, files in os.walk('.')))"
+    outcome = slots.play(files)
+    assert (outcome.failure, outcome.stdout) == (None, b"2000\n")
+
+
+def test_a_link_in_an_unpacked_bundle_is_never_followed(slots: Slots, target: dict[str, Any]) -> None:
+    folder = slots.bundle(HONEST)
+    (folder / "data.txt").symlink_to(target["secret_file"])
+    with pytest.raises(WorkerError, match="cannot be read"):
+        slots.run(slots.slot().play(make_job(), folder, lambda episodes, steps: None))
+    assert serves_honestly(slots)
