@@ -74,11 +74,12 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
 
     def rows(self) -> Iterator[Row]:
         """The steps in order."""
+        arrays = isinstance(self.actions, np.ndarray)  # of which indexing makes scalars where they have no axes
         for t in range(self.n):
             yield Row(
                 t,
                 self.obs_at(t),
-                self.actions[t],
+                np.asarray(self.actions[t]) if arrays else self.actions[t],
                 float(self.rewards[t]),
                 bool(self.terminated[t]),
                 bool(self.truncated[t]),
