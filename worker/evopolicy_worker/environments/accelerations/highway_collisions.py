@@ -3,7 +3,8 @@
 Replaces the second half of `Road.step`, which checks every vehicle against every other and every object with
 `RoadObject.handle_collisions`. That does nothing when the two are further apart than their diagonals allow, nor when
 some side of one of the rectangles separates both of them, with the way they move in one step. Either is estimated in
-scalars, with an error below 1e-9 m; a pair that is not apart by DOUBT goes to the library.
+scalars, with an error below 1e-9 m; a pair that is not apart by DOUBT goes to the library, except for a goal that was
+driven over before: it is not solid, and nothing is left to be noted of it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class SiftedRoad(Road):  # type: ignore[misc]
                 if not _apart(body, bodies[j]):
                     vehicle.handle_collisions(vehicles[j], dt)
             for thing, other in zip(self.objects, others, strict=True):
-                if not _apart(body, other):
+                if not _apart(body, other) and not _settled(vehicle, thing):
                     vehicle.handle_collisions(thing, dt)
 
 
@@ -55,6 +56,11 @@ def _body(thing: Any, dt: float) -> Body:
         float(thing.diagonal),
         float(thing.speed) * dt,
     )
+
+
+def _settled(vehicle: Any, thing: Any) -> bool:
+    """Whether all that a collision of the two could do is to mark as hit what is marked already: a goal driven over."""
+    return bool(vehicle.solid and not thing.solid and thing.hit)
 
 
 def _apart(a: Body, b: Body) -> bool:
