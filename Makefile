@@ -19,7 +19,7 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11 or newer found; install one, or name it: make PYTHON=/path/to/python3"; exit 2; }
-	@bash deploy/setup-host.sh --tests
+	@bash deploy/setup-host.sh
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (a minute or two the first time)"
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[coordinator,gateway,worker,dev]'
@@ -29,6 +29,7 @@ demo: install
 	@$(BIN)/evopolicy local --env gym/continuouscar --agent evolve --budget 32 --exp-id demo --overwrite --runs runs
 
 test: install
+	@bash deploy/setup-host.sh --tests
 	@$(BIN)/python -m pytest
 
 check: install
@@ -40,9 +41,10 @@ check: install
 bench: install
 	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/runtime_bench.py $(ARGS)
 
-# The coordinator's core under seeded faults; a size or one seed: make sim ARGS="--help"
+# The coordinator's core under seeded faults, then 2,000 workers; one seed again: make sim ARGS="--seed 17 --trace"
 sim: install
 	@$(BIN)/python tests/simulation/simulate.py $(ARGS)
+	@test -n "$(ARGS)" || $(BIN)/python tests/simulation/scale.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

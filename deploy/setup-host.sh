@@ -1,12 +1,15 @@
 #!/usr/bin/env bash
-# Installs the system packages that evopolicy needs: bubblewrap, the policies' sandbox.
+# Installs the system packages that evopolicy needs: bubblewrap, the policies' sandbox; with --tests, what its tests use too.
 # As root on Debian or Ubuntu it installs them; otherwise it says exactly what to install and goes on.
 set -euo pipefail
 
 missing=()
 command -v bwrap >/dev/null 2>&1 || missing+=(bubblewrap)
 if [ "${1:-}" = "--tests" ]; then
+  # What only the tests use: network namespaces, a browser for reports, drawing without a display.
   command -v ip >/dev/null 2>&1 || missing+=(iproute2)
+  command -v chromium >/dev/null 2>&1 || missing+=(chromium)
+  ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' || missing+=(libegl1 libegl-mesa0 libgl1-mesa-dri)
 fi
 [ ${#missing[@]} -eq 0 ] && exit 0
 
