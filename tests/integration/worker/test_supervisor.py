@@ -228,3 +228,44 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
             assert (await run_task)["status"] == "completed"
 
     run(scenario)
+
+
+def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
+    coordinator: Coordinator, tmp_path: Path
+) -> None:
+    hanging = asyncio.Event()
+    stopped: list[str] = []
+    go_on = asyncio.Event()
+
+    async def hang_while_hidden(slot: ScriptedSlot, job: Job) -> None:
+        if job.record == "actions" and not go_on.is_set():
+            hanging.set()
+            waits = [asyncio.create_task(event.wait()) for event in (slot.stopped, go_on)]
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            for wait in waits:
+                wait.cancel()
+            if not go_on.is_set():
+                stopped.append(job.job_id)
+                raise SandboxError("cancelled")
+
+    async def scenario() -> None:
+        async with (
+            supervising(coordinator, tmp_path, hang_while_hidden),
+            operator_of(coordinator) as operator,
+        ):
+            created = await operator.create(n_validation=3, n_heldout=2)
+            async with gateway_of(coordinator, created) as gateway:
+                for number in range(3):
+                    await gateway.submit(bundle_of(f"policy {number}"), (0, 1, 2), f"k{number}")
+                    await gateway.results(number)
+                    await hanging.wait()
+                    hanging.clear()
+                go_on.set()
+                await gateway.close()
+            finished = await operator.finished(created.run)
+        assert finished.status == "completed"
+        assert stopped
+        # Being stopped is nobody's failure.
+        assert finished.infrastructure_retries == 0
+
+    run(scenario)
