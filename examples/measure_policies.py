@@ -5,7 +5,7 @@ Policy plays each episode, as under the policy scope `episode`; actions are repa
 that needed it are counted. The last columns put the mean beside the paper's Table 1: 0 is its random policy, 1 the best
 of its agents (not clipped, so a value above 1 beats them all).
 
-    python examples/measure_policies.py                          # everything, 32 seeds each: about 40 minutes
+    python examples/measure_policies.py                          # everything, 32 seeds each: some ten minutes
     python examples/measure_policies.py gym/acrobot --seeds 8    # one environment
     python examples/measure_policies.py 'gymnasium/MiniGrid-*' --returns
 """
