@@ -19,6 +19,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses, options, processes, trials
+from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.runs import Cluster, exit_code, play_all
@@ -82,6 +83,11 @@ def run(
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
     runs: Runs = Path("runs"),
+    jail: options.JailMode = "bwrap",
+    jail_bind: options.JailBind = None,
+    jail_bind_rw: options.JailBindWritable = None,
+    jail_env: options.JailVariable = None,
+    allow_host: options.AllowHost = None,
     overwrite: Overwrite = False,
     slots: options.Slots = 2,
     as_json: options.Json = False,
@@ -109,7 +115,8 @@ def run(
             video=video,
             limits=limit or (),
         )
-        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, overwrite)
+        held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
+        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, overwrite, held)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
             where = Cluster(local_slots=slots)
@@ -142,6 +149,11 @@ def local(
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
     runs: Runs = Path("runs"),
+    jail: options.JailMode = "bwrap",
+    jail_bind: options.JailBind = None,
+    jail_bind_rw: options.JailBindWritable = None,
+    jail_env: options.JailVariable = None,
+    allow_host: options.AllowHost = None,
     overwrite: Overwrite = False,
     parallel: Parallel = 1,
     slots: options.Slots = 2,
@@ -168,7 +180,8 @@ def local(
             video=video,
             limits=limit or (),
         )
-        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, overwrite)
+        held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
+        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, overwrite, held)
         _play(plans, Cluster(local_slots=slots, state=state, data=data), parallel, as_json)
 
 
@@ -231,7 +244,12 @@ def play_random(
 
 
 def _plans(
-    given: RunOptions, env_ids: list[str], runs: Path, wall_limit_s: float, overwrite: bool
+    given: RunOptions,
+    env_ids: list[str],
+    runs: Path,
+    wall_limit_s: float,
+    overwrite: bool,
+    jail: JailSettings,
 ) -> list[Plan]:
     """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
     started_in = Path.cwd()
@@ -249,6 +267,7 @@ def _plans(
         for env_id in env_ids
     ]
     for plan in plans:
+            jail=jail,
         plan.check()
     return plans
 

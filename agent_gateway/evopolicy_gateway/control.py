@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_gateway.jail.jail import JailOrder
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
@@ -112,6 +113,8 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     config: dict[str, Any] | None = None
     """A coding agent's settings: `AgentConfig`."""
     session_file: str | None = None
+    jail: JailOrder | None = None
+    """None: not jailed."""
 
 
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):

@@ -85,6 +85,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "session.json"
 
     @property
+    def agent(self) -> Path:
+        """What a jailed agent has outside its workspace: home and /tmp."""
+        return self.state / "agent"
+
+    @property
     def staged(self) -> Path:
         """What was put into the workspace: `Staged`."""
         return self.state / "staged.json"

@@ -17,6 +17,7 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.operator import RunSettings
+from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
 Connect = Annotated[
@@ -46,6 +47,27 @@ DataFolder = Annotated[
     typer.Option(
         help="Folder of split files (`evopolicy data make`); default: derived from the state's secret."
     ),
+]
+JailMode = Annotated[
+    str,
+    typer.Option(
+        "--jail",
+        help="Around the agent: bwrap, open-network (jailed, with this machine's network), none. Recorded in run.json.",
+    ),
+]
+JailBind = Annotated[
+    list[str] | None,
+    typer.Option("--jail-bind", help="File or folder that the agent sees, read-only; may be repeated."),
+]
+JailBindWritable = Annotated[
+    list[str] | None, typer.Option("--jail-bind-rw", help="File or folder that it may also change.")
+]
+JailVariable = Annotated[
+    list[str] | None, typer.Option("--jail-env", help="Variable that is passed on to it, such as an API key's.")
+]
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(help="HOST or HOST:PORT that it reaches besides its harness's own; may be repeated."),
 ]
 StateFolder = Annotated[
     Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
@@ -90,6 +112,26 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             video=_one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
             limits=limits_of(self.limits),
         )
+
+
+def jail_of(
+    mode: str,
+    read: Sequence[str] | None,
+    write: Sequence[str] | None,
+    variables: Sequence[str] | None,
+    hosts: Sequence[str] | None,
+) -> JailSettings:
+    """The jail that the options ask for. ConfigError naming the one that is wrong, or what this machine lacks."""
+    started_in = Path.cwd()
+    settings = JailSettings(
+        mode=_one_of("--jail", mode, Mode),  # type: ignore[arg-type]
+        read=tuple(absolute(path, started_in) for path in read or ()),
+        write=tuple(absolute(path, started_in) for path in write or ()),
+        environment=tuple(variables or ()),
+        hosts=tuple(hosts or ()),
+    )
+    settings.check()
+    return settings
 
 
 def console(*, stderr: bool) -> Console:

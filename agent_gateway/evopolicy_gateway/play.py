@@ -36,6 +36,8 @@ from evopolicy_gateway.control import (
     StartAgent,
 )
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.jail.jail import JailOrder
+from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import OpenedRun, RunFolder, run_folder, save
 from evopolicy_gateway.operations import Operations
 from evopolicy_gateway.watch import Watch
@@ -61,13 +63,15 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     overwrite: bool = False
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
+    jail: JailSettings = JailSettings()
 
     @property
     def folder(self) -> RunFolder:
         return run_folder(self.runs, self.settings.entry, self.settings.env, self.settings.exp_id)
 
     def check(self) -> None:
-        """ConfigError when the run's folder cannot be had: there is one already that may not be overwritten."""
+        """ConfigError when the agent's jail or the run's folder cannot be had: there is one that may not be overwritten."""
+        self.jail.check()
         folder = self.folder
         if not folder.root.exists():
             return
@@ -255,6 +259,14 @@ class RunPlay:
     async def _finish(self, run: str) -> RunFinished:
         async for progress in self._operations.wait(run):
             self._watch.phase(self._name, progress)
+    def _jail(self) -> JailOrder | None:
+        if self._plan.jail.mode == "none":
+            return None
+        sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
+        states = [str(Path(path).parent) for kind, _, path in sockets if kind == "unixsock-stream"]
+        hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]
+        return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
+
             if progress.finished is not None:
                 return progress.finished
         raise AssertionError("waiting ends with the finished run")
@@ -266,3 +278,4 @@ class RunPlay:
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
                 await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)
+                jail=self._jail(),

@@ -46,8 +46,6 @@ from evopolicy_gateway.operations import Operations
 if TYPE_CHECKING:
     from evopolicy_gateway.play import Plan
 
-NO_JAIL = "none"
-
 
 async def write(
     folder: RunFolder,
@@ -96,7 +94,7 @@ def run_record(
         attempt=settings.attempt,
         agent=_agent(plan, finished.agent),
         sandbox_tier=settings.sandbox_tier,
-        jail=NO_JAIL,
+        jail=plan.jail.recorded,
         experiment_dimensions=ExperimentDimensions(
             episode_budget=finished.episode_budget,
             min_episodes_per_submit=staged.min_episodes_per_submit if staged else 0,
@@ -148,7 +146,12 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
         harness=told.get("harness") or plan.agent.partition(":")[0],
         cli_version=told.get("cli_version"),
         model_string=told.get("model_string"),
-        settings={"agent": plan.agent, "wall_limit_s": plan.wall_limit_s, **told.get("settings", {})},
+        settings={
+            "agent": plan.agent,
+            "wall_limit_s": plan.wall_limit_s,
+            **({"jail": plan.jail.chosen()} if plan.jail.chosen() else {}),
+            **told.get("settings", {}),
+        },
         retries=int(told.get("retries", 0)),
         turns=int(told.get("turns", 0)),
         tokens=None if tokens is None else msgspec.convert(tokens, Tokens),

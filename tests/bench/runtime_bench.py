@@ -127,6 +127,8 @@ def submit_time(env: str, n: int, *, accelerations: bool) -> tuple[float, list[f
                 env,
                 "--agent",
                 f"command:{sys.executable} {AGENT} {n} {result}",
+                "--jail",
+                "none",
                 "--budget",
                 str(n + 14),
                 "--data",

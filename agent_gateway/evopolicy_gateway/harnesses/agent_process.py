@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
 from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
@@ -25,7 +25,14 @@ class AgentProcess:
 
     @classmethod
     async def start(
-        cls, program: list[str], cwd: Path, environment: Mapping[str, str], log: AgentLog, *, talks: bool
+        cls,
+        program: list[str],
+        cwd: Path,
+        environment: Mapping[str, str],
+        log: AgentLog,
+        *,
+        talks: bool,
+        pass_fds: Sequence[int] = (),
     ) -> AgentProcess:
         """Starts it; OSError when that fails. `talks`: it has a stdin to be written to."""
         process = await asyncio.create_subprocess_exec(
@@ -36,6 +43,7 @@ class AgentProcess:
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
+            pass_fds=tuple(pass_fds),
         )
         return cls(process, log)
 

@@ -11,7 +11,7 @@ import contextlib
 import json
 import urllib.request
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.jail.jail import Jail
 
 _INFO_TIMEOUT_S = 30.0
 
@@ -76,6 +77,8 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
     over: asyncio.Event = msgspec.field(default_factory=asyncio.Event)
     """Set when the agent's time is over: a program that ends from now on has been ended, and is not started again."""
+    jail: Jail | None = None
+    """Around every program that `start` starts."""
 
     def with_environment(self, more: Mapping[str, str]) -> Stage:
         """The same stage with more variables."""
@@ -88,12 +91,22 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
 
     async def start(self, program: list[str], *, talks: bool) -> AgentProcess:
         """Starts a program of the agent in the workspace; `talks`: it is written to. AgentError when it cannot be."""
+        way = None if self.jail is None else self.jail.way(program)
         try:
             process = await AgentProcess.start(
-                program, self.workspace, self.environment, self.log, talks=talks
+                program if way is None else way.words,
+                self.workspace,
+                self.environment,
+                self.log,
+                talks=talks,
+                pass_fds=() if way is None else way.pass_fds,
             )
         except OSError as error:
+            if way is not None:
+                way.failed()
             raise AgentError(f"cannot start {program[0]}: {error.strerror or error}") from error
+        if way is not None:
+            way.started(process.ended)
         self.started.append(process.pid)
         return process
 
@@ -107,6 +120,10 @@ class Harness(ABC):
 
     name: str
     """As `run.json` names it: `command`, `replay`, `evolve`, …"""
+    command: Sequence[str] = ()
+    """Words of the operator's command, whose files a jail shows; nothing that an agent has said."""
+    variables: Sequence[str] = ()
+    """Variables of the operator that the agent's settings pass on, into a jail too."""
     resumable = False
     """It goes on from `Stage.session_file` after everything of it was killed."""
 

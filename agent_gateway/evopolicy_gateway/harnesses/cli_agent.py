@@ -42,6 +42,8 @@ class CliAgent(Harness):
         self._dialect = dialect
         self._config = dialect.config
         self._program = list(self._config.program or dialect.program)
+        self.command = self._program
+        self.variables = self._config.pass_environment
         self._options = ""
         self._version: str | None = None
         self._state = SessionState()
@@ -202,9 +204,11 @@ class CliAgent(Harness):
             )
 
     async def _ask(self, stage: Stage, arguments: tuple[str, ...]) -> str:
+        words = [*self._program, *arguments]
+
         def run() -> str:
             answer = subprocess.run(
-                [*self._program, *arguments],
+                words if stage.jail is None else stage.jail.sealed(words),
                 cwd=stage.workspace,
                 env=dict(stage.environment),
                 stdin=subprocess.DEVNULL,

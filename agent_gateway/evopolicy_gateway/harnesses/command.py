@@ -27,6 +27,7 @@ class CommandHarness(Harness):
     def __init__(self, name: str, program: list[str], settings: dict[str, Any] | None = None) -> None:
         self.name = name
         self._program = program
+        self.command = program
         self._settings = settings or {}
 
     async def play(self, stage: Stage) -> Ending:

@@ -27,6 +27,7 @@ from evopolicy_gateway.harnesses.agent_process import environment_of
 from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
 from evopolicy_gateway.harnesses.clock import AgentClock
 from evopolicy_gateway.harnesses.redaction import Redaction
+from evopolicy_gateway.jail.jail import Jail
 
 END_GRACE_S = 3.0
 """From SIGTERM to SIGKILL."""
@@ -85,7 +86,20 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
 
 
 async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> Ending:
-    return await make(order.agent, Path(order.started_in), config).play(stage)
+    harness = make(order.agent, Path(order.started_in), config)
+    if order.jail is not None:
+        jail = Jail(
+            order.jail,
+            harness=harness.name,
+            command=harness.command,
+            variables=harness.variables,
+            workspace=stage.workspace,
+            urls=order.urls,
+            started_in=Path(order.started_in),
+        )
+        inside = jail.environment(stage.environment, order.urls)
+        stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
+    return await harness.play(stage)
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:

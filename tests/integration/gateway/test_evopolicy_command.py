@@ -81,6 +81,8 @@ class Command:
 
     def __init__(self, arguments: list[str], cwd: Path, environment: dict[str, str]) -> None:
         self.mark = uuid.uuid4().hex
+        if arguments[0] in ("run", "local"):
+            arguments = [*arguments, "--jail-env", MARK]
         self.process = subprocess.Popen(
             [*EVOPOLICY, *arguments],
             cwd=cwd,
@@ -234,7 +236,7 @@ while not os.path.exists("child.pid"):
     time.sleep(0.01)
 submit([0])
 """
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
     assert exit_code == 0, err
     child = int((run_dir(tmp_path) / "workspace" / "child.pid").read_text())
     assert not Path(f"/proc/{child}").exists()
@@ -281,6 +283,7 @@ subprocess.Popen([sys.executable, "-c", hide])
 time.sleep(1000)
 """
     arguments = ["run", "--env", "toy/line", "--agent", agent(tmp_path, code), "--exp-id", "t", *SMALL]
+    arguments += ["--jail", "none"]
     with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
         found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
         (keeper,) = [

@@ -1,0 +1,178 @@
+"""Which files of this machine an agent's program needs: its installation, the interpreter of its first line, our Python.
+
+A folder is shown as a whole only where it looks like an installation of its own; otherwise the file alone is.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import sys
+import sysconfig
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
+"""Shown in every jail."""
+
+SIMULATORS = frozenset(
+    (
+        *("gymnasium", "gym", "gymnasium_robotics", "mujoco", "mujoco_py", "highway_env", "minigrid"),
+        *("Box2D", "box2d", "pettingzoo", "dm_control", "shimmy", "ale_py", "pybullet", "pybullet_envs"),
+        *("evopolicy_worker", "evopolicy_coordinator"),
+    )
+)
+"""Packages that no agent gets to see: with them it could train outside its budget."""
+
+_INSTALLATION_MARKS = ("pyvenv.cfg", "lib", "libexec", "node_modules")
+_SITE_FOLDERS = ("site-packages", "dist-packages")
+_MAX_LINKS = 16
+_SHEBANG_BYTES = 512
+
+
+class Needs:
+    """What is to be shown, read-only: paths as they are, and links as links."""
+
+    def __init__(self) -> None:
+        self.paths: dict[str, None] = {}
+        self.links: dict[str, str] = {}
+        """Path, and what the link there says."""
+
+    def path(self, path: str) -> None:
+        """Shows a file or folder."""
+        if not _in_system(path) and os.path.exists(path):
+            self.paths[path] = None
+
+    def link(self, path: str) -> None:
+        if not _in_system(path):
+            self.links[path] = os.readlink(path)
+
+
+def needs_of(command: Sequence[str], search: str | None) -> Needs:
+    """What the command that the operator gave needs: its program, the files it names, and our own Python.
+
+    `search`: the PATH.
+    """
+    needs = Needs()
+    _our_python(needs)
+    if command:
+        found = shutil.which(command[0], path=search)
+        if found is not None:
+            _program(needs, os.path.abspath(found), search)
+    for word in command[1:]:
+        if os.path.isabs(word) and word != "/" and os.path.exists(word) and not _is_ours(word):
+            needs.path(word)
+    return needs
+
+
+def simulators_below(folder: str) -> Iterator[str]:
+    """Files and folders of simulator packages in the Python installations at and right below `folder`."""
+    root = Path(folder)
+    sites: list[Path] = []
+    for base in ("", "lib/", "lib64/", "local/lib/", "versions/*/lib/", "envs/*/lib/", "*/lib/"):
+        for name in _SITE_FOLDERS:
+            sites += root.glob(f"{base}python3*/{name}")
+    if root.name in _SITE_FOLDERS:
+        sites.append(root)
+    for site in sites:
+        try:
+            names = os.listdir(site)
+        except OSError:
+            continue
+        for name in names:
+            if name.partition(".")[0] in SIMULATORS and not name.endswith((".dist-info", ".egg-info")):
+                yield str(site / name)
+
+
+def _our_python(needs: Needs) -> None:
+    """The interpreter with its standard library, numpy, and the agents that come with this package; nothing else."""
+    prefix, base = os.path.abspath(sys.prefix), os.path.abspath(sys.base_prefix)
+    needs.path(base)
+    if os.path.realpath(base) != base:
+        needs.path(os.path.realpath(base))
+    if prefix == base:
+        return
+    needs.path(f"{prefix}/pyvenv.cfg")
+    for launcher in Path(prefix, "bin").glob("python*"):
+        if launcher.is_symlink():
+            needs.link(str(launcher))
+        elif launcher.name.rstrip("0123456789.") == "python":
+            needs.path(str(launcher))
+
+
+def our_packages() -> Iterator[tuple[str, str]]:
+    """Where the packages of the agents that come with us are, and where a virtual environment shows them."""
+    if os.path.abspath(sys.prefix) == os.path.abspath(sys.base_prefix):
+        return
+    site = sysconfig.get_path("platlib")
+    spec = importlib.util.find_spec("numpy")
+    if spec is not None and spec.submodule_search_locations:
+        folder = Path(next(iter(spec.submodule_search_locations)))
+        for source in (folder, folder.with_name("numpy.libs")):
+            if source.is_dir():
+                yield str(source), f"{site}/{source.name}"
+    ours = Path(__file__).parents[1]
+    yield str(ours / "__init__.py"), f"{site}/{ours.name}/__init__.py"
+    yield str(ours / "agents"), f"{site}/{ours.name}/agents"
+
+
+def _program(needs: Needs, path: str, search: str | None, depth: int = 0) -> None:
+    """A program: the links that lead to it, its installation, and what its first line names."""
+    for _ in range(_MAX_LINKS):
+        if not os.path.islink(path):
+            break
+        _installation(needs, path)
+        if not _is_ours(path):
+            needs.link(path)
+        path = os.path.normpath(os.path.join(os.path.dirname(path), os.readlink(path)))
+    _installation(needs, os.path.realpath(path))
+    if not _is_ours(path):
+        needs.path(path)
+    interpreter = _interpreter(path, search)
+    if interpreter is not None and depth < 3:
+        _program(needs, interpreter, search, depth + 1)
+
+
+def _installation(needs: Needs, path: str) -> None:
+    """The folder of the installation that `path` belongs to, where it is one of its own."""
+    parts = Path(path).parts
+    if "node_modules" in parts:
+        needs.path(str(Path(*parts[: parts.index("node_modules") + 1])))
+    elif Path(path).parent.name in ("bin", "shims"):
+        root = Path(path).parents[1]
+        home = Path(os.path.expanduser("~"))
+        # `~/.local` holds far more than programs, state folders of others too.
+        too_wide = root == Path("/") or root == home or root in home.parents or root.name == ".local"
+        marked = any((root / mark).exists() for mark in _INSTALLATION_MARKS)
+        if not too_wide and marked and not _is_ours(path):
+            needs.path(str(root))
+
+
+def _interpreter(path: str, search: str | None) -> str | None:
+    try:
+        with open(path, "rb") as file:
+            first = file.read(_SHEBANG_BYTES).partition(b"\n")[0]
+    except OSError:
+        return None
+    if not first.startswith(b"#!"):
+        return None
+    try:
+        words = shlex.split(first[2:].decode("utf-8", "replace"))
+    except ValueError:
+        return None
+    if words and os.path.basename(words[0]) == "env":
+        words = [word for word in words[1:] if not word.startswith("-") and "=" not in word]
+    found = shutil.which(words[0], path=search) if words else None
+    return None if found is None else os.path.abspath(found)
+
+
+def _in_system(path: str) -> bool:
+    return any(path == root or path.startswith(root + "/") for root in SYSTEM)
+
+
+def _is_ours(path: str) -> bool:
+    """In the virtual environment that this package runs from, of which only `our_packages` are shown."""
+    prefix = os.path.abspath(sys.prefix)
+    return prefix != os.path.abspath(sys.base_prefix) and (path + "/").startswith(prefix + "/")

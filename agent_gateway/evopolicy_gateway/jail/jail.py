@@ -1,0 +1,188 @@
+"""One run's jail, as the agent's keeper uses it: for each program a command, an environment, and doors while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import msgspec
+
+from evopolicy_gateway.jail.doors import Doors
+from evopolicy_gateway.jail.installs import needs_of
+from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host
+from evopolicy_gateway.jail.view import DOORWAY, View
+
+_PASSED = frozenset(
+    (
+        *("PATH", "USER", "LOGNAME", "SHELL", "LANG", "LANGUAGE", "TERM", "COLORTERM", "NO_COLOR", "TZ"),
+        *("PYENV_ROOT", "PYENV_VERSION", "NVM_DIR"),
+        *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
+    )
+)
+_LOOPBACK_NAMES = ("localhost", "127.0.0.1")
+
+HARNESS_HOSTS: Mapping[str, tuple[str, ...]] = {
+    "codex": ("api.openai.com", "auth.openai.com", "chatgpt.com"),
+    "claude-code": ("api.anthropic.com", "console.anthropic.com", "platform.claude.com"),
+}
+"""Where the model of a harness that we know is, and where its CLI logs in."""
+HARNESS_VARIABLES: Mapping[str, tuple[str, ...]] = {
+    "codex": ("OPENAI_API_KEY", "CODEX_API_KEY", "OPENAI_BASE_URL"),
+    "claude-code": (
+        "ANTHROPIC_API_KEY",
+        "ANTHROPIC_AUTH_TOKEN",
+        "ANTHROPIC_BASE_URL",
+        "CLAUDE_CODE_OAUTH_TOKEN",
+    ),
+}
+"""Which variables hold its key."""
+
+
+class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """What a keeper is told of the jail that its agent plays in."""
+
+    settings: JailSettings
+    private: str
+    """Folder for the agent's home and /tmp, kept until the run is over."""
+    hidden: tuple[str, ...] = ()
+    """Folders that are never shown."""
+
+
+class Way:
+    """How one program is started: the whole command, and the socket that it hands its listening sockets out by."""
+
+    def __init__(self, jail: Sequence[str], program: Sequence[str], doors: Doors | None) -> None:
+        """`doors` None: the network is open."""
+        self._doors = doors
+        self._keeper: socket.socket | None = None
+        self._child: socket.socket | None = None
+        self._serving: asyncio.Task[None] | None = None
+        self.words = [*_PATIENT, *jail, "--", _base_python(), "-I", "-S", DOORWAY]
+        if doors is None:
+            self.words += ["-", "-"]
+        else:
+            self._keeper, self._child = socket.socketpair()
+            self.words += [str(self._child.fileno()), ",".join(map(str, doors.ports))]
+        self.words += program
+
+    @property
+    def pass_fds(self) -> tuple[int, ...]:
+        return () if self._child is None else (self._child.fileno(),)
+
+    def started(self, ended: Callable[[], Awaitable[object]]) -> None:
+        """Serves the doors until `ended` comes back: the program is gone."""
+        if self._child is not None:
+            self._child.close()
+            self._serving = asyncio.create_task(self._serve(ended))
+
+    def failed(self) -> None:
+        """It could not be started."""
+        for sock in (self._keeper, self._child):
+            if sock is not None:
+                sock.close()
+
+    async def _serve(self, ended: Callable[[], Awaitable[object]]) -> None:
+        assert self._doors is not None
+        assert self._keeper is not None
+        serving = asyncio.ensure_future(self._doors.serve(self._keeper))
+        try:
+            await ended()
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            await self._doors.close()
+            self._keeper.close()
+
+
+# Asked to end, bubblewrap would end at once and take the program with it; so only the program is asked.
+_PATIENT = ("/bin/sh", "-c", 'trap "" TERM INT; exec "$@"', "jail")
+
+
+class Jail:
+    """Around all programs of one agent; each has namespaces of its own."""
+
+    def __init__(
+        self,
+        order: JailOrder,
+        *,
+        harness: str,
+        command: Sequence[str],
+        workspace: Path,
+        urls: Mapping[str, str],
+        started_in: Path,
+        variables: Sequence[str] = (),
+    ) -> None:
+        """`command`: words that the operator gave, never the agent's. `variables`: what its settings pass on.
+
+        `started_in`: where the operator's relative paths are meant from.
+        """
+        settings = order.settings
+        self._open_network = settings.mode == "open-network"
+        self._variables = frozenset(
+            (*_PASSED, *settings.environment, *variables, *HARNESS_VARIABLES.get(harness, ()))
+        )
+        home = os.path.expanduser("~")
+        self._home = home if os.path.isabs(home) and home != "/" else "/home/agent"
+        self._hosts = frozenset(map(host, (*HARNESS_HOSTS.get(harness, ()), *settings.hosts)))
+        self._forwards = {found.port: ("127.0.0.1", found.port) for found in map(_address, urls.values())}
+        self._forwards |= {port: ("127.0.0.1", port) for name, port in self._hosts if name in _LOOPBACK_NAMES}
+        self._view = View(
+            workspace=workspace,
+            private=Path(order.private),
+            home=self._home,
+            needs=needs_of(command, os.environ.get("PATH")),
+            read=tuple(absolute(path, started_in) for path in settings.read),
+            write=tuple(absolute(path, started_in) for path in settings.write),
+            hidden=tuple(Path(path).resolve() for path in order.hidden),
+            open_network=self._open_network,
+        )
+        self._view.prepare()
+        self._proxy_port = self._doors().proxy_port
+
+    def environment(self, surroundings: Mapping[str, str], urls: Mapping[str, str]) -> dict[str, str]:
+        """Of the keeper's variables those that the agent gets, with the URLs and the way to the allowed hosts."""
+        kept = {
+            name: value
+            for name, value in surroundings.items()
+            if name in self._variables or name.startswith("LC_")
+        }
+        kept |= {"HOME": self._home, "TMPDIR": "/tmp", **urls}
+        if self._open_network:
+            return kept
+        proxy = f"http://127.0.0.1:{self._proxy_port}"
+        here = ",".join(_LOOPBACK_NAMES)
+        return kept | {
+            **dict.fromkeys(("HTTPS_PROXY", "https_proxy"), proxy),
+            **dict.fromkeys(("NO_PROXY", "no_proxy"), here),
+            "NODE_USE_ENV_PROXY": "1",
+        }
+
+    def way(self, program: Sequence[str]) -> Way:
+        """For one start of a program."""
+        return Way(self._view.arguments(), program, None if self._open_network else self._doors())
+
+    def sealed(self, program: Sequence[str]) -> list[str]:
+        """The command of a program that needs nobody: a CLI that is asked for its version."""
+        return [*self._view.arguments(), "--", *program]
+
+    def _doors(self) -> Doors:
+        return Doors(self._forwards, self._hosts)
+
+
+class _Address(msgspec.Struct, frozen=True):
+    name: str
+    port: int
+
+
+def _address(url: str) -> _Address:
+    parts = urlsplit(url)
+    return _Address(parts.hostname or "", parts.port or (HTTPS if parts.scheme == "https" else 80))
+
+
+def _base_python() -> str:
+    return os.path.realpath(getattr(sys, "_base_executable", sys.executable))

@@ -1,0 +1,112 @@
+"""What the operator chose of an agent's jail, checked before anything is started."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+
+Mode = Literal["bwrap", "open-network", "none"]
+Host = tuple[str, int]
+"""Name and port."""
+
+HTTPS = 443
+_HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<port>[0-9]{1,5}))?")
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PATIENCE_S = 30.0
+_STATE_FOLDERS = (".gateway", "*/.gateway", "*/*/.gateway", "*/*/*/.gateway")
+_REMEDY = (
+    "install bubblewrap (apt-get install bubblewrap, dnf install bubblewrap) and permit user namespaces, or give the"
+    " jail up by name with --jail none, which run.json then says"
+)
+
+
+class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """The jail of one run's agent."""
+
+    mode: Mode = "bwrap"
+    """`open-network`: jailed, with this machine's network. `none`: not jailed."""
+    read: tuple[str, ...] = ()
+    """Files and folders that it sees besides, at their own paths."""
+    write: tuple[str, ...] = ()
+    """Such that it may also change."""
+    environment: tuple[str, ...] = ()
+    """Variables that are passed on."""
+    hosts: tuple[str, ...] = ()
+    """`HOST` (port 443) or `HOST:PORT` that it reaches besides its harness's own."""
+
+    @property
+    def recorded(self) -> str:
+        """As `run.json` tells it."""
+        return {"bwrap": "bwrap", "open-network": "bwrap, open network", "none": "none"}[self.mode]
+
+    def chosen(self) -> dict[str, Any]:
+        """What was widened by the operator, for `run.json`."""
+        kept = {"read": self.read, "write": self.write, "environment": self.environment, "hosts": self.hosts}
+        return {name: list(value) for name, value in kept.items() if value}
+
+    def check(self) -> None:
+        """ConfigError naming the option that is wrong, or what this machine lacks."""
+        if self.mode not in get_args(Mode):
+            raise ConfigError(f"--jail {self.mode!r}: there are {', '.join(get_args(Mode))}")
+        for option, paths in (("--jail-bind", self.read), ("--jail-bind-rw", self.write)):
+            for path in paths:
+                _check_path(option, Path(path))
+        for name in self.environment:
+            if not _VARIABLE.fullmatch(name):
+                raise ConfigError(f"--jail-env {name!r} is not a variable's name; values are not given here")
+            if name not in os.environ:
+                raise ConfigError(f"--jail-env {name}: it is not set")
+        for text in self.hosts:
+            host(text)
+        if self.mode != "none":
+            check_bubblewrap()
+
+
+def host(text: str) -> Host:
+    """Name in lower case and port of `HOST` or `HOST:PORT`. ConfigError for anything else, patterns too."""
+    found = _HOST.fullmatch(text)
+    port = HTTPS if found is None or found["port"] is None else int(found["port"])
+    if found is None or not 0 < port < 1 << 16:
+        raise ConfigError(f"--allow-host {text!r}: say it as HOST or HOST:PORT, without patterns")
+    return found["name"].lower(), port
+
+
+def check_bubblewrap() -> None:
+    """ConfigError, with what to do, when this machine cannot build a jail."""
+    program = shutil.which("bwrap")
+    if program is None:
+        raise ConfigError(f"the agent's jail needs bubblewrap, which is not installed: {_REMEDY}")
+    flags = ("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts")
+    command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
+    try:
+        tried = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(f"the agent's jail cannot be built here ({error}): {_REMEDY}") from error
+    if tried.returncode:
+        said = tried.stderr.decode("utf-8", "replace").strip() or f"exit status {tried.returncode}"
+        raise ConfigError(f"the agent's jail cannot be built here ({said}): {_REMEDY}")
+
+
+def absolute(path: str, started_in: Path) -> str:
+    """A path of an option, meant from where the command was given."""
+    return os.path.abspath(started_in / os.path.expanduser(path))
+
+
+def _check_path(option: str, path: Path) -> None:
+    if not path.exists():
+        raise ConfigError(f"{option} {path}: there is no such file or folder")
+    real = path.resolve()
+    if real == Path("/"):
+        raise ConfigError(f"{option} /: the whole machine is no jail; say --jail none")
+    if ".gateway" in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
+        raise ConfigError(f"{option} {path}: it holds the credentials of a run that is open")
