@@ -82,12 +82,12 @@ def run(
     video: Video = "off",
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
-    runs: Runs = Path("runs"),
     jail: options.JailMode = "bwrap",
     jail_bind: options.JailBind = None,
     jail_bind_rw: options.JailBindWritable = None,
     jail_env: options.JailVariable = None,
     allow_host: options.AllowHost = None,
+    runs: Runs = Path("runs"),
     overwrite: Overwrite = False,
     slots: options.Slots = 2,
     as_json: options.Json = False,
@@ -148,12 +148,12 @@ def local(
     video: Video = "off",
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
-    runs: Runs = Path("runs"),
     jail: options.JailMode = "bwrap",
     jail_bind: options.JailBind = None,
     jail_bind_rw: options.JailBindWritable = None,
     jail_env: options.JailVariable = None,
     allow_host: options.AllowHost = None,
+    runs: Runs = Path("runs"),
     overwrite: Overwrite = False,
     parallel: Parallel = 1,
     slots: options.Slots = 2,
@@ -263,11 +263,11 @@ def _plans(
             started_in=started_in,
             wall_limit_s=wall_limit_s,
             overwrite=overwrite,
+            jail=jail,
         )
         for env_id in env_ids
     ]
     for plan in plans:
-            jail=jail,
         plan.check()
     return plans
 

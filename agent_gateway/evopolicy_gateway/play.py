@@ -224,6 +224,14 @@ class RunPlay:
         elif isinstance(event, RunClosed):
             self._closed.set()
 
+    def _jail(self) -> JailOrder | None:
+        if self._plan.jail.mode == "none":
+            return None
+        sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
+        states = [str(Path(path).parent) for kind, _, path in sockets if kind == "unixsock-stream"]
+        hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]
+        return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
+
     async def _keep_agent(self, ready: Ready) -> AgentEnded:
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.harnesses.keeper"]
         self._keeper = await Child.start(program, self._folder.harness_log, talks=True)
@@ -241,6 +249,7 @@ class RunPlay:
                 wall_limit_s=self._plan.wall_limit_s,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
+                jail=self._jail(),
             )
         )
         ended = AgentEnded(reason="agent_failed", detail="its keeper died")
@@ -259,14 +268,6 @@ class RunPlay:
     async def _finish(self, run: str) -> RunFinished:
         async for progress in self._operations.wait(run):
             self._watch.phase(self._name, progress)
-    def _jail(self) -> JailOrder | None:
-        if self._plan.jail.mode == "none":
-            return None
-        sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
-        states = [str(Path(path).parent) for kind, _, path in sockets if kind == "unixsock-stream"]
-        hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]
-        return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
-
             if progress.finished is not None:
                 return progress.finished
         raise AssertionError("waiting ends with the finished run")
@@ -278,4 +279,3 @@ class RunPlay:
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
                 await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)
-                jail=self._jail(),
