@@ -24,6 +24,7 @@ from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.runs import Cluster, exit_code, play_all
 from evopolicy_gateway.runs import report as report_runs
+from evopolicy_gateway.suite.suite_cli import suite as play_suite
 
 T = TypeVar("T")
 
@@ -241,6 +242,9 @@ def play_random(
             raise ConfigError(f"--split {split!r}: there are train, validation, heldout")
         where = _trial_cluster(connect, credentials_file, slots, state, data)
         _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+
+
+app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_suite)
 
 
 def _plans(

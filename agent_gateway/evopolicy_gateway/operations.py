@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from evopolicy_common import codec, credentials, keys
 from evopolicy_common.blobs import digest_of
@@ -15,6 +16,8 @@ from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
     CancelRun,
+    Claim,
+    ClaimState,
     CreateRun,
     Done,
     Evaluate,
@@ -67,6 +70,35 @@ class Operations:
             yield progress
             if progress.finished is not None:
                 return
+
+    async def phase(self, run: str) -> str | None:
+        """Where the run is now, as `RunProgress.phase`; None when the cluster does not know it."""
+        message = WaitRun(token=self._token, run=run, wait_s=0.0)
+        try:
+            return (await self._requests.until_answered("wait", message, RunProgress, wait_s=0.0)).phase
+        except RefusedError:
+            return None
+
+    async def claim(
+        self,
+        suite: str,
+        name: str,
+        holder: str,
+        ttl_s: float,
+        run: str = "",
+        result: dict[str, Any] | None = None,
+    ) -> ClaimState:
+        """Takes, renews, gives back (`ttl_s` 0) or settles (`result`) a run of a sweep."""
+        message = Claim(
+            token=self._token, suite=suite, name=name, holder=holder, ttl_s=ttl_s, run=run, result=result
+        )
+        while True:
+            try:
+                return await self._requests.until_answered("claim", message, ClaimState)
+            except RefusedError as error:
+                if error.status != "unavailable":
+                    raise
+            await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
     async def cancel(self, run: str) -> None:
         """Ends a run as it is. TransportError when nobody answers soon."""

@@ -98,14 +98,32 @@ class RunError(EvopolicyError):
 class RunPlay:
     """Plays one plan once."""
 
-    def __init__(self, plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> None:
-        """`gateway`: credentials of the gateway role, without a run's capability."""
+    def __init__(
+        self,
+        plan: Plan,
+        operations: Operations,
+        gateway: Credentials,
+        watch: Watch,
+        *,
+        name: str | None = None,
+        key: str | None = None,
+        stays_open: bool = False,
+    ) -> None:
+        """`gateway`: credentials of the gateway role, without a run's capability.
+
+        `name`: how the watch knows the run, its environment otherwise. `key`: the same key opens the same run again.
+        `stays_open`: when this is cancelled the run is left as it is, to be resumed.
+        """
         self._plan = plan
         self._folder = plan.folder
         self._operations = operations
         self._credentials = gateway
         self._watch = watch
-        self._name = plan.settings.env
+        self._name = name or plan.settings.env
+        self._key = key or uuid.uuid4().hex
+        self._stays_open = stays_open
+        self.run = ""
+        """The cluster's id of the run, once it is open."""
         self._ready: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
         self._spent = asyncio.Event()
         self._closed = asyncio.Event()
@@ -119,7 +137,7 @@ class RunPlay:
         plan = self._plan
         plan.claim()
         try:
-            created = await self._operations.create(plan.settings, uuid.uuid4().hex)
+            created = await self._operations.create(plan.settings, self._key)
         except BaseException:
             self._folder.root.rmdir()
             raise
@@ -128,11 +146,28 @@ class RunPlay:
         credentials.write(found, self._folder.credentials)
         save(self._folder.opened, OpenedRun(run=created.run))
         self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
+        return await self._to_the_end(created.run, agents_side=True)
+
+    async def resume(self) -> RunRecord:
+        """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
+        run = msgspec.json.decode(self._folder.opened.read_bytes(), type=OpenedRun).run
+        capability = credentials.read(self._folder.credentials).token
+        found = msgspec.structs.replace(self._credentials, token=capability)
+        credentials.write(found, self._folder.credentials)
+        phase = await self._operations.phase(run)
+        self._watch.note(self._name, f"goes on with run {run} in {self._folder.root}")
+        return await self._to_the_end(run, agents_side=phase == "open")
+
+    async def _to_the_end(self, run: str, *, agents_side: bool) -> RunRecord:
+        self.run = run
+        plan, agent_s = self._plan, 0.0
         try:
-            agent_s = await self._agents_side()
-            finished = await self._finish(created.run)
+            if agents_side:
+                agent_s = await self._agents_side()
+            finished = await self._finish(run)
         except BaseException as error:
-            await self._give_up(created.run, str(error) if isinstance(error, EvopolicyError) else None)
+            if not (self._stays_open and isinstance(error, asyncio.CancelledError)):
+                await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
         return await record.write(self._folder, plan, finished, self._operations, self.last, agent_s)
 

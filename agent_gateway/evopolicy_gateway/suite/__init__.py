@@ -1,0 +1,1 @@
+"""Sweeps: agents × environments × repeats, unattended, on one host or several, stopped and resumed."""

@@ -1,0 +1,187 @@
+"""`evopolicy suite`: plays a sweep, says beforehand what it will do, and goes on where it was when started again.
+
+Exit codes: 0 every run completed, 1 something failed or was not begun, 2 a wrong option or file, 3 a run ended without an ok
+submit, 130 interrupted (started again it goes on).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.run_record import decode_run_record
+from evopolicy_gateway import options
+from evopolicy_gateway.runs import Cluster, connected, unless_failed
+from evopolicy_gateway.suite import decisions, suite_file, suite_index
+from evopolicy_gateway.suite.decisions import Changed, Decision
+from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
+from evopolicy_gateway.suite.suite_index import FINISHED, Index
+from evopolicy_gateway.suite.suite_view import JsonView, results_table, viewing
+from evopolicy_gateway.suite.sweep import Sweep, look
+
+NO_OK_SUBMIT = 3
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """What the command was asked for."""
+
+    suite: SuiteFile
+    runs: tuple[SuiteRun, ...]
+    root: Path
+    where: Cluster
+    changed: Changed
+    dry_run: bool
+    as_json: bool
+
+
+def suite(
+    file: Annotated[
+        str, typer.Argument(help="TOML file, or a shipped one: smoke.toml, core16.toml, core16-paper.toml.")
+    ],
+    connect: options.Connect = None,
+    credentials_file: options.CredentialsFile = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Bring up a coordinator and a worker here for the sweep.")
+    ] = False,
+    runs: Annotated[Path | None, typer.Option(help="The sweep's folder; default: runs/NAME.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Glob of run names, such as 'evolve/*'; may be repeated.")
+    ] = None,
+    parallel: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Runs at once, over the file's.")
+    ] = None,
+    changed: Annotated[
+        str, typer.Option(help="Runs whose settings the file has changed: refuse, keep, rerun.")
+    ] = "refuse",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and stop.")] = False,
+    slots: options.Slots = 2,
+    state: Annotated[
+        Path | None,
+        typer.Option(help="State of the --local coordinator; default: .cluster in the sweep's folder."),
+    ] = None,
+    data: options.DataFolder = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
+) -> None:
+    """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was.
+
+    Example: evopolicy suite core16.toml --connect tcp/10.0.0.5:7447
+    """
+    with fail_on_our_errors():
+        if local and (connect or credentials_file):
+            raise ConfigError("--local brings up a cluster of its own; it does not go with --connect")
+        if changed not in ("refuse", "keep", "rerun"):
+            raise ConfigError(f"--changed {changed!r}: there are refuse, keep, rerun")
+        wanted = suite_file.read(file)
+        if parallel is not None:
+            limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
+            wanted = msgspec.structs.replace(wanted, parallel=limits)
+        expanded = suite_file.expand(wanted, Path.cwd(), tuple(only or ()))
+        root = (runs or Path("runs") / wanted.name).absolute()
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        if local:
+            where = Cluster(local_slots=slots, state=state or root / ".cluster", data=data)
+        order = Order(
+            suite=wanted,
+            runs=tuple(expanded),
+            root=root,
+            where=where,
+            changed=changed,  # type: ignore[arg-type]
+            dry_run=dry_run,
+            as_json=as_json,
+        )
+        try:
+            code = asyncio.run(_suite(order))
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
+    if code:
+        raise typer.Exit(code)
+
+
+async def _suite(order: Order) -> int:
+    console = Console(stderr=order.as_json)
+    with _alone(order.root):
+        index = suite_index.load(order.root, order.suite.name)
+        env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
+        async with connected(order.where, env_ids) as (operations, gateway, failed):
+            started_in = Path.cwd()
+            decided = [
+                decisions.decide(
+                    run, await look(run, order.root, started_in, index, operations), order.changed
+                )
+                for run in order.runs
+            ]
+            _tell(order, index, decided, console)
+            decisions.check_changes(decided, order.changed)
+            if order.dry_run:
+                return 0
+            for one in decided:
+                if one.kind == "keep":
+                    _keep(order, index, one)
+            suite_index.save(order.root, index)
+            names = [run.name for run in order.runs]
+            with viewing(names, order.suite.parallel.machine, console, as_json=order.as_json) as view:
+                for one in decided:
+                    if one.kind == "keep":
+                        view.kept(one.run.name, index.runs.get(one.run.name))
+                sweep = Sweep(order.suite, order.root, started_in, index, operations, gateway, view)
+                await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
+    entries = [index.runs[name] for name in names if name in index.runs]
+    if not order.as_json:
+        console.print(results_table(entries))
+        console.print(f"index: {order.root / suite_index.FILE_NAME}", markup=False, soft_wrap=True)
+    states = {entry.state for entry in entries}
+    if len(entries) < len(names) or not states <= FINISHED:
+        return 1
+    return NO_OK_SUBMIT if "no_ok_submit" in states else 0
+
+
+def _tell(order: Order, index: Index, decided: list[Decision], console: Console) -> None:
+    known = {run.name for run in order.runs}
+    # Runs that --only leaves out are still the file's.
+    in_file = {run.name for run in suite_file.expand(order.suite, Path.cwd())}
+    left_alone = [name for name in index.runs if name not in known and name not in in_file]
+    for line in decisions.told(decided, left_alone):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if order.as_json:
+        view = JsonView([], 1)
+        for one in decided:
+            view.event("planned", one.run.name, what=one.kind, attempt=one.attempt, why=one.why)
+
+
+def _keep(order: Order, index: Index, decision: Decision) -> None:
+    """Brings the index in line with a finished run's own record."""
+    run = decision.run
+    folder = run.folder(order.root)
+    entry = index.runs.get(run.name)
+    if folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
+        record = decode_run_record(folder.run_json.read_bytes())
+        digest = entry.digest if entry is not None else run.digest
+        index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, digest=digest)
+
+
+@contextlib.contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Holds the sweep's folder; ConfigError when another command has it."""
+    root.mkdir(parents=True, exist_ok=True)
+    file = os.open(root / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"another `evopolicy suite` plays in {root}; choose another --runs to take part from here"
+            ) from None
+        yield
+    finally:
+        os.close(file)

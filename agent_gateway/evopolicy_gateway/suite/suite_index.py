@@ -1,0 +1,106 @@
+"""`suite.json`: what a sweep has come to, run by run. Rewritten whole and atomically after every change.
+
+It is an index: whether a run is finished its own `run.json` says, and the index is brought in line with it at a start.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.blobs import write_atomically
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.run_record import RunRecord
+from evopolicy_common.summary import utc_text
+from evopolicy_gateway.suite.suite_file import SuiteRun
+
+SCHEMA_VERSION = 1
+FILE_NAME = "suite.json"
+
+State = Literal["pending", "running", "completed", "no_ok_submit", "error"]
+FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """One run."""
+
+    name: str
+    agent: str
+    env: str
+    repeat: int
+    digest: str
+    """Of the settings that it is or was played with."""
+    state: State = "pending"
+    attempt: int = 1
+    directory: str = ""
+    """Relative to the sweep's folder; empty for a run that another host has."""
+    run: str = ""
+    """The cluster's id."""
+    host: str = ""
+    score: float | None = None
+    random: float | None = None
+    n_submits: int = 0
+    budget_used: int = 0
+    tokens: dict[str, Any] | None = None
+    error: str | None = None
+    wall_s: float = 0.0
+    finished_at: str = ""
+
+
+class Index(msgspec.Struct, kw_only=True):
+    """The whole file."""
+
+    schema_version: int = SCHEMA_VERSION
+    suite: str
+    updated_at: str = ""
+    runs: dict[str, Entry] = {}
+
+
+def load(root: Path, suite: str) -> Index:
+    """The index in a sweep's folder; a new one where there is none. ConfigError for one that is another sweep's."""
+    path = root / FILE_NAME
+    try:
+        index = msgspec.json.decode(path.read_bytes(), type=Index)
+    except FileNotFoundError:
+        return Index(suite=suite)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}; move it away to have it made anew") from error
+    if index.schema_version > SCHEMA_VERSION:
+        raise ConfigError(f"{path} is of a newer version of evopolicy: update this one")
+    if index.suite != suite:
+        raise ConfigError(f"{path} is of suite {index.suite!r}, not {suite!r}; choose another --runs")
+    return index
+
+
+def save(root: Path, index: Index) -> None:
+    """Replaces `suite.json`; StorageError when the disk refuses."""
+    index.updated_at = utc_text(time.time())
+    root.mkdir(parents=True, exist_ok=True)
+    write_atomically(root / FILE_NAME, msgspec.json.format(msgspec.json.encode(index), indent=2) + b"\n")
+
+
+def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path, **more: Any) -> Entry:
+    """What the index tells of a finished run."""
+    outcome = record.outcome
+    reference = outcome.random_reference
+    return Entry(
+        name=suite_run.name,
+        agent=suite_run.agent,
+        env=suite_run.settings.env,
+        repeat=suite_run.settings.repeat,
+        state=outcome.status,
+        attempt=record.attempt,
+        directory=str(directory.relative_to(root.absolute())),
+        score=outcome.final_score,
+        random=None if reference is None else reference.mean_return,
+        n_submits=len(outcome.val_scores),
+        budget_used=outcome.budget_used,
+        tokens=None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens),
+        error=outcome.error,
+        wall_s=record.timing.wall_s,
+        finished_at=record.timing.finished_at,
+        **more,
+    )

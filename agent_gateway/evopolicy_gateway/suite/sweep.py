@@ -1,0 +1,306 @@
+"""A sweep on this host: begins runs as the limits allow, keeps its claims on them, and the index up to date.
+
+Rules:
+- A run is played only while this host holds its claim at the coordinator. A claim that another host has meanwhile ends
+  the run here, and its folder stays as it is.
+- Cancelled, it leaves runs open and gives no claim back: the same host goes on with them, and another takes them over
+  once their time is up.
+- A provider that is away holds back further runs with it; those that go on wait by themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import shutil
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.credentials import Credentials
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.control import AgentDoing
+from evopolicy_gateway.harnesses import session
+from evopolicy_gateway.layout import OpenedRun, RunFolder
+from evopolicy_gateway.operations import Operations
+from evopolicy_gateway.play import Plan, RunPlay
+from evopolicy_gateway.suite import suite_index
+from evopolicy_gateway.suite.decisions import Decision, Found
+from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
+from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
+from evopolicy_gateway.suite.suite_view import SuiteView
+
+CLAIM_TTL_S = 60.0
+_RENEW_S = CLAIM_TTL_S / 4
+_ASK_AGAIN_S = 10.0
+ATTEMPTS = ".attempts"
+
+
+class Sweep:
+    """Plays the decisions."""
+
+    def __init__(
+        self,
+        suite: SuiteFile,
+        root: Path,
+        started_in: Path,
+        index: Index,
+        operations: Operations,
+        gateway: Credentials,
+        view: SuiteView,
+    ) -> None:
+        self._suite = suite
+        self._root = root.absolute()
+        self._started_in = started_in
+        self._index = index
+        self._operations = operations
+        self._gateway = gateway
+        self._view = view
+        self._host = socket.gethostname()
+        # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts.
+        self._holder = f"{self._host}:{hashlib.sha256(str(self._root).encode()).hexdigest()[:12]}"
+        self._active: dict[str, asyncio.Task[None]] = {}
+        self._plays: dict[str, RunPlay] = {}
+        self._not_before: dict[str, float] = {}
+        self._paused_until: dict[str, float] = {}
+        view.on_doing = self._on_doing
+
+    async def play(self, decisions: Sequence[Decision]) -> None:
+        """All of them to their end, or as far as caps and other hosts' runs allow."""
+        todo = [one for one in decisions if one.kind != "keep"]
+        by_name = {one.run.name: one for one in decisions}
+        renewing = asyncio.create_task(self._renew(by_name))
+        try:
+            while todo or self._active:
+                for decision in self._startable(todo, by_name):
+                    if await self._begin(decision):
+                        todo.remove(decision)
+                waiting = list(self._active.values())
+                if not waiting and todo and self._used_up() is not None:
+                    self._view.say(f"{len(todo)} runs are not begun: {self._used_up()}")
+                    return
+                if waiting:
+                    await asyncio.wait(waiting, timeout=1.0, return_when=asyncio.FIRST_COMPLETED)
+                elif todo:
+                    await asyncio.sleep(1.0)
+                for name, task in list(self._active.items()):
+                    if task.done():
+                        del self._active[name]
+                        if task.cancelled():
+                            # Another host has it: its result is asked for in time.
+                            self._not_before[name] = time.monotonic() + _ASK_AGAIN_S
+                            todo.append(by_name[name])
+                        else:
+                            task.result()
+        finally:
+            renewing.cancel()
+            for task in self._active.values():
+                task.cancel()
+            await asyncio.gather(renewing, *self._active.values(), return_exceptions=True)
+
+    def _startable(self, todo: list[Decision], by_name: dict[str, Decision]) -> list[Decision]:
+        """Runs that the limits let begin now."""
+        now = time.monotonic()
+        limits = self._suite.parallel
+        active = [by_name[name].run for name in self._active]
+        found: list[Decision] = []
+        if self._used_up() is not None:
+            return found
+        for decision in todo:
+            run = decision.run
+            if len(active) >= limits.machine:
+                break
+            same_agent = sum(other.agent == run.agent for other in active)
+            same_provider = sum(other.provider == run.provider for other in active)
+            most = run.parallel or limits.agent
+            if (
+                (most is not None and same_agent >= most)
+                or same_provider >= limits.providers.get(run.provider, limits.machine)
+                or self._not_before.get(run.name, 0.0) > now
+                or self._paused_until.get(run.provider, 0.0) > now
+            ):
+                continue
+            found.append(decision)
+            active.append(run)
+        return found
+
+    async def _begin(self, decision: Decision) -> bool:
+        """Claims the run and starts it; False when another host has it at the moment."""
+        run = decision.run
+        claim = await self._ask(run)
+        if claim.result is not None:
+            entry = msgspec.structs.replace(msgspec.convert(claim.result, Entry), directory="")
+            self._put(entry)
+            self._view.finished(run.name, entry)
+            return True
+        if not claim.granted:
+            self._not_before[run.name] = time.monotonic() + _ASK_AGAIN_S
+            self._view.elsewhere(run.name, claim.holder.partition(":")[0])
+            return False
+        if claim.previous and claim.run:
+            self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
+            await self._forget(claim.run)
+        self._active[run.name] = asyncio.create_task(self._play(decision))
+        return True
+
+    async def _play(self, decision: Decision) -> None:
+        run = decision.run
+        folder = run.folder(self._root)
+        entry = Entry(
+            name=run.name,
+            agent=run.agent,
+            env=run.settings.env,
+            repeat=run.settings.repeat,
+            digest=run.digest,
+            state="running",
+            attempt=decision.attempt,
+            directory=str(folder.root.relative_to(self._root)),
+            host=self._host,
+        )
+        self._put(entry)
+        self._view.started(run.name, decision.attempt)
+        try:
+            if decision.kind in ("restart", "new"):
+                await self._put_aside(folder, decision.attempt - 1)
+            record = await self._played(decision, folder)
+            done = suite_index.entry_of(
+                run,
+                record,
+                self._root,
+                folder.root,
+                digest=run.digest,
+                host=self._host,
+                run=self._run_of(run),
+            )
+        except EvopolicyError as error:
+            done = msgspec.structs.replace(entry, state="error", error=str(error))
+        finally:
+            self._plays.pop(run.name, None)
+        self._put(done)
+        self._view.finished(run.name, done)
+        if done.state in FINISHED:
+            await self._ask(run, result=msgspec.to_builtins(done))
+        else:
+            await self._ask(run, ttl_s=0.0)
+
+    async def _played(self, decision: Decision, folder: RunFolder) -> RunRecord:
+        run = decision.run
+        plan = Plan(
+            settings=msgspec.structs.replace(run.settings, attempt=decision.attempt),
+            agent=run.harness,
+            runs=self._root,
+            started_in=self._started_in,
+            wall_limit_s=run.wall_s,
+            config=run.config,
+        )
+        play = RunPlay(
+            plan,
+            self._operations,
+            self._gateway,
+            self._view,
+            name=run.name,
+            key=f"{self._suite.name}/{run.digest}/{self._holder}/{run.name}/{decision.attempt}"[:200],
+            stays_open=True,
+        )
+        self._plays[run.name] = play
+        return await (play.resume() if decision.kind in ("resume", "finish") else play.play())
+
+    async def _renew(self, by_name: dict[str, Decision]) -> None:
+        """Keeps the claims of what goes on here."""
+        while True:
+            await asyncio.sleep(_RENEW_S)
+            for name, task in list(self._active.items()):
+                with contextlib.suppress(EvopolicyError):
+                    claim = await self._ask(by_name[name].run)
+                    if not claim.granted and claim.result is None and not task.done():
+                        self._view.note(name, f"another host has it now ({claim.holder}): ended here")
+                        task.cancel()
+
+    async def _ask(
+        self, run: SuiteRun, ttl_s: float = CLAIM_TTL_S, result: dict[str, Any] | None = None
+    ) -> ClaimState:
+        # With other settings it is another run, whatever has become of the one before.
+        name = f"{run.name}@{run.digest}"
+        return await self._operations.claim(
+            self._suite.name, name, self._holder, ttl_s, self._run_of(run), result
+        )
+
+    async def _put_aside(self, folder: RunFolder, attempt: int) -> None:
+        """Keeps what there is of an earlier attempt, and ends its run at the cluster."""
+        if not folder.root.exists():
+            return
+        if folder.opened.exists():
+            opened = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun)
+            await self._forget(opened.run)
+        kept = self._root / ATTEMPTS / folder.root.relative_to(self._root)
+        target = kept.with_name(f"{kept.name}.{max(attempt, 1)}")
+        while target.exists():
+            target = target.with_name(f"{target.name}+")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(folder.state, ignore_errors=True)
+        folder.root.rename(target)
+
+    async def _forget(self, run: str) -> None:
+        with contextlib.suppress(EvopolicyError):
+            await self._operations.cancel(run)
+
+    def _run_of(self, run: SuiteRun) -> str:
+        play = self._plays.get(run.name)
+        return "" if play is None else play.run
+
+    def _on_doing(self, name: str, doing: AgentDoing) -> None:
+        entry = self._index.runs.get(name)
+        if entry is not None and doing.tokens is not None:
+            # Written with the next change: a sweep's cap reads it from memory.
+            self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
+        if doing.provider:
+            self._paused_until[doing.provider] = time.monotonic() + doing.paused_s
+
+    def _used_up(self) -> str | None:
+        caps = self._suite.caps
+        tokens, cost = used(self._index)
+        if caps.max_tokens is not None and tokens >= caps.max_tokens:
+            return f"{tokens} of {caps.max_tokens} tokens are used"
+        if caps.max_cost is not None and cost >= caps.max_cost:
+            return f"{cost:.2f} of {caps.max_cost:.2f} dollars are spent"
+        return None
+
+    def _put(self, entry: Entry) -> None:
+        self._index.runs[entry.name] = entry
+        suite_index.save(self._root, self._index)
+
+
+def used(index: Index) -> tuple[int, float]:
+    """Tokens and dollars of all runs."""
+    kinds = ("input_noncached", "cache_read", "cache_creation", "output")
+    told = [entry.tokens for entry in index.runs.values() if entry.tokens is not None]
+    return sum(int(one.get(kind, 0)) for one in told for kind in kinds), sum(
+        float(one.get("cost") or 0.0) for one in told
+    )
+
+
+async def look(run: SuiteRun, root: Path, started_in: Path, index: Index, operations: Operations) -> Found:
+    """What there is of a run."""
+    folder = run.folder(root)
+    status: str | None = None
+    with contextlib.suppress(OSError, EvopolicyError):
+        status = decode_run_record(folder.run_json.read_bytes()).outcome.status
+    opened = status is None and folder.opened.exists() and folder.credentials.exists()
+    phase: str | None = None
+    has_session = False
+    if opened:
+        identity = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+        phase = await operations.phase(identity)
+        resumable = harnesses.make(run.harness, started_in, run.config).resumable
+        has_session = resumable and session.load(folder.session).session is not None
+    return Found(
+        entry=index.runs.get(run.name), status=status, opened=opened, phase=phase, has_session=has_session
+    )
