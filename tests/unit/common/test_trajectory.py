@@ -170,11 +170,23 @@ def test_an_episode_without_a_step_is_an_episode() -> None:
     assert (episode.n, episode.obs, list(episode.rows())) == (0, None, [])
 
 
-def test_pictures_are_packed_as_they_come() -> None:
+def pictures(n: int, side: int = 40) -> Steps:
+    return [(np.full((side, side, 3), t % 256, np.uint8), t, float(t), False, False, {}) for t in range(n)]
+
+
+def test_pictures_are_packed_as_they_come(monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder()
-    frame = np.zeros((96, 96, 3), np.uint8)
-    for _ in range(1000):
-        recorder.append(frame, 0, 0.0, False, False, {})
-    # 27 MB of pictures; uncompressed there is never more than a block of them.
-    assert len(recorder._obs) * frame.nbytes <= trajectory.BLOCK_BYTES
+    for step in pictures(1000, side=96):
+        recorder.append(*step)
+        assert recorder._obs == []
     assert decode(recorder.finish()).obs.shape == (1000, 96, 96, 3)
+    monkeypatch.setattr(trajectory, "PICTURES_BLOCK_BYTES", 50_000)
+    episode = round_trip(pictures(45))
+    assert all(same(step[0], row.obs) for step, row in zip(pictures(45), episode.rows(), strict=True))
+    assert packed(pictures(45)) == packed(pictures(45))
+
+
+def test_observations_that_change_their_form_are_kept_all_the_same() -> None:
+    steps = pictures(3) + pictures(2, side=50) + dict_steps(2) + pictures(2)
+    rows = list(round_trip(steps).rows())
+    assert all(same(step[0], row.obs) for step, row in zip(steps, rows, strict=True))

@@ -1,0 +1,270 @@
+"""The columns of a trajectory's block: the values of one leaf over its rows, as msgpack and back.
+
+Numbers come back bit for bit. What msgpack has no form for (arrays, integers beyond 64 bits, half surrogates) is an
+extension or readable text.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+MAX_COLUMN_BYTES = 1 << 30
+"""A column of pictures that claims to be larger is not decoded."""
+
+_EXT_ARRAY, _EXT_INT = 1, 2
+
+
+def pack(values: list[Any]) -> list[Any]:
+    n = len(values)
+    first = values[0]
+    kind = type(first)
+    if kind is np.ndarray:
+        if all(
+            type(value) is np.ndarray and value.dtype == first.dtype and value.shape == first.shape
+            for value in values
+        ):
+            joined = b"".join([value.tobytes() for value in values])
+            return ["array", n, first.dtype.str, list(first.shape), joined]
+        return ["values", values]
+    if any(type(value) is not kind for value in values):
+        return ["values", values]
+    if kind is int:
+        if all(-(2**63) <= value < 2**63 for value in values):
+            return ["scalar", "<i8", np.array(values, dtype="<i8").tobytes()]
+    elif kind is float:
+        return ["scalar", "<f8", np.array(values, dtype="<f8").tobytes()]
+    elif kind is str:
+        found: dict[str, int] = {}
+        where = [found.setdefault(value, len(found)) for value in values]
+        return ["text", list(found), np.array(where, dtype="<u4").tobytes()]
+    elif kind is dict:
+        keys = list(first)
+        if all(type(key) is str for key in keys) and all(list(value) == keys for value in values):
+            return ["dict", n, keys, [pack([value[key] for value in values]) for key in keys]]
+    elif kind is tuple and all(len(value) == len(first) for value in values):
+        return ["tuple", n, [pack([value[k] for value in values]) for k in range(len(first))]]
+    return ["values", values]
+
+
+class Pictures:
+    """A column of large arrays, all of one shape and dtype, compressed one by one."""
+
+    def __init__(self, first: NDArray[Any]) -> None:
+        self._dtype = first.dtype
+        self._shape = first.shape
+        self._n = 0
+        self._stream = zstandard.ZstdCompressor(level=1).compressobj()
+        self._pieces: list[bytes] = []
+
+    def add(self, picture: Any) -> bool:
+        """Take one more; False, and nothing is changed, when it is not like the first."""
+        if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
+            return False
+        piece = self._stream.compress(np.ascontiguousarray(picture).data)
+        if piece:
+            self._pieces.append(piece)
+        self._n += 1
+        return True
+
+    def packed(self) -> list[Any]:
+        """The column. Nothing is added afterwards."""
+        data = b"".join([*self._pieces, self._stream.flush()])
+        return ["pictures", self._n, self._dtype.str, list(self._shape), data]
+
+
+class Column:
+    """Rows of one leaf, or of a dict or tuple of leaves."""
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def row(self, t: int) -> Any:
+        raise NotImplementedError
+
+    def values(self) -> Any:
+        """The column in the form that `Trajectory.obs` promises."""
+        raise NotImplementedError
+
+    def rows(self) -> list[Any]:
+        return [self.row(t) for t in range(len(self))]
+
+
+class Arrays(Column):
+    """Arrays of one shape, or Python numbers of one type."""
+
+    def __init__(self, array: NDArray[Any], *, scalar: bool) -> None:
+        self.array = array
+        self.scalar = scalar
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def row(self, t: int) -> Any:
+        return self.array[t].item() if self.scalar else np.asarray(self.array[t])
+
+    def values(self) -> Any:
+        return self.array
+
+
+class Values(Column):
+    """Anything, a value a row."""
+
+    def __init__(self, items: list[Any]) -> None:
+        self._items = items
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def row(self, t: int) -> Any:
+        return self._items[t]
+
+    def values(self) -> Any:
+        return self._items
+
+
+class Dicts(Column):
+    def __init__(self, parts: dict[str, Column], n: int) -> None:
+        self.parts = parts
+        self._n = n
+        _require_equal(n, list(parts.values()))
+
+    def __len__(self) -> int:
+        return self._n
+
+    def row(self, t: int) -> Any:
+        return {key: part.row(t) for key, part in self.parts.items()}
+
+    def values(self) -> Any:
+        return {key: part.values() for key, part in self.parts.items()}
+
+
+class Tuples(Column):
+    def __init__(self, parts: list[Column], n: int) -> None:
+        self.parts = parts
+        self._n = n
+        _require_equal(n, parts)
+
+    def __len__(self) -> int:
+        return self._n
+
+    def row(self, t: int) -> Any:
+        return tuple(part.row(t) for part in self.parts)
+
+    def values(self) -> Any:
+        return tuple(part.values() for part in self.parts)
+
+
+def _require_equal(n: int, parts: list[Column]) -> None:
+    if any(len(part) != n for part in parts):
+        raise ValueError(f"columns of {n} rows have {[len(part) for part in parts]}")
+
+
+def unpack(packed: list[Any]) -> Column:
+    kind = packed[0]
+    if kind == "array":
+        _, n, dtype, shape, data = packed
+        return Arrays(_array(dtype, data).reshape(n, *shape), scalar=False)
+    if kind == "pictures":
+        _, n, dtype, shape, data = packed
+        size = n * np.dtype(dtype).itemsize * math.prod(shape)
+        if not 0 < size <= MAX_COLUMN_BYTES:
+            raise ValueError(f"pictures of {size} bytes")
+        raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        return Arrays(_array(dtype, raw).reshape(n, *shape), scalar=False)
+    if kind == "scalar":
+        return Arrays(_array(packed[1], packed[2]), scalar=True)
+    if kind == "text":
+        return Values([packed[1][index] for index in _array("<u4", packed[2])])
+    if kind == "dict":
+        _, n, keys, parts = packed
+        return Dicts(dict(zip(keys, map(unpack, parts), strict=True)), n)
+    if kind == "tuple":
+        return Tuples([unpack(part) for part in packed[2]], packed[1])
+    if kind == "values":
+        return Values(packed[1])
+    raise ValueError(f"unknown kind of column {kind!r}")
+
+
+def join(columns: list[Column]) -> Column:
+    """The columns of successive blocks as one."""
+    first = columns[0]
+    if len(columns) == 1:
+        return first
+    if isinstance(first, Arrays) and all(
+        isinstance(column, Arrays)
+        and (column.scalar, column.array.dtype, column.array.shape[1:])
+        == (first.scalar, first.array.dtype, first.array.shape[1:])
+        for column in columns
+    ):
+        return Arrays(np.concatenate([column.values() for column in columns]), scalar=first.scalar)
+    n = sum(map(len, columns))
+    dicts = [column for column in columns if isinstance(column, Dicts)]
+    if len(dicts) == len(columns) and all(list(column.parts) == list(dicts[0].parts) for column in dicts):
+        return Dicts({key: join([column.parts[key] for column in dicts]) for key in dicts[0].parts}, n)
+    tuples = [column for column in columns if isinstance(column, Tuples)]
+    if len(tuples) == len(columns) and all(len(column.parts) == len(tuples[0].parts) for column in tuples):
+        width = len(tuples[0].parts)
+        return Tuples([join([column.parts[k] for column in tuples]) for k in range(width)], n)
+    return Values([item for column in columns for item in column.rows()])
+
+
+# Values that msgpack has no form for.
+
+
+def _array(dtype: str, data: bytes) -> NDArray[Any]:
+    kind = np.dtype(dtype)
+    if kind.kind not in "biuf":
+        raise ValueError(f"no columns of dtype {dtype!r}")
+    return np.frombuffer(data, dtype=kind)
+
+
+def _enc_hook(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        head = [value.dtype.str, list(value.shape), value.tobytes()]
+        return msgspec.msgpack.Ext(_EXT_ARRAY, encoder.encode(head))
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return str(value)
+
+
+def _ext_hook(code: int, data: memoryview) -> Any:
+    if code == _EXT_ARRAY:
+        dtype, shape, raw = decoder.decode(data)
+        return _array(dtype, raw).reshape(shape)
+    if code == _EXT_INT:
+        return int(bytes(data))
+    raise ValueError(f"unknown extension {code}")
+
+
+encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
+decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
+
+
+def encode(block: dict[str, Any]) -> bytes:
+    try:
+        return encoder.encode(block)
+    except (OverflowError, UnicodeEncodeError, TypeError):
+        # Only hostile policies return what msgpack cannot say: integers beyond 64 bits, half surrogates.
+        return encoder.encode(_portable(block))
+
+
+def _portable(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return msgspec.msgpack.Ext(_EXT_INT, str(value).encode())
+    if isinstance(value, dict):
+        return {_portable_key(key): _portable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_portable(item) for item in value]
+    return value
+
+
+def _portable_key(key: Any) -> Any:
+    return _portable(key) if isinstance(key, str) else str(key)
