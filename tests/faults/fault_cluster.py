@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from weak_link import WeakLink
+
 from evopolicy_common import credentials
 from evopolicy_gateway import processes
 
@@ -97,7 +99,7 @@ class Kept:
 
 
 class FaultCluster:
-    """Coordinator and a worker with two slots, kept up; `play` plays one whole run."""
+    """Coordinator and a worker with two slots, kept up, with a link between them that can be made weak."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -115,6 +117,8 @@ class FaultCluster:
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
         worker += ["--env", "toy/line", "--slots", "2"]
         worker += ["--grace", "1", "--name", "w", "--credentials", self.files["worker"]]
+        self.link = WeakLink(root / "link.sock", state / "coordinator.sock")
+        worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
         self.worker = Kept(worker, root / "worker.log")
         self._agent = root / "agent.py"
         self._agent.write_text(AGENT % (SUBMITS, EPISODES))
@@ -165,6 +169,7 @@ class FaultCluster:
 
     def close(self) -> None:
         self.worker.end()
+        self.link.close()
         self.coordinator.end()
 
 

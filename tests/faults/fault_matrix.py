@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, fault_cluster, record
 
@@ -37,12 +38,17 @@ FREEZE_S = 0.7
 LONG_FREEZE_S = 4.0
 """Longer than a lease lives in `fixed_coordinator`."""
 DISK_FULL_S = 1.5
+CUT_S = 1.5
+SLOW_S = 2.0
 TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway")
 FAULTS = (
     *((target, "SIGKILL") for target in TARGETS),
     *((target, "SIGSTOP") for target in TARGETS),
     ("worker", "SIGSTOP past its leases"),
     ("coordinator", "disk full"),
+    ("link", "cut"),
+    ("link", "stalled past its leases"),
+    ("link", "slow"),
 )
 
 
@@ -90,12 +96,18 @@ class Row:
         )
 
 
-def cases(seeds: int) -> list[Case]:
-    return [Case(target, fault, seed) for seed in range(seeds) for target, fault in FAULTS]
+def cases(seeds: int, part: int = 0, parts: int = 1) -> list[Case]:
+    """All cases, or every `parts`-th from the `part`-th on."""
+    return [Case(target, fault, seed) for seed in range(seeds) for target, fault in FAULTS][part::parts]
 
 
 def strike(cluster: FaultCluster, case: Case) -> bool:
     """Carries the fault out; False when there is no such process now."""
+    if case.target == "link":
+        how: Literal["cut", "stalled", "slow"] = case.fault.partition(" ")[0]  # type: ignore[assignment]
+        with cluster.link.weak(how):
+            time.sleep({"cut": CUT_S, "stalled": LONG_FREEZE_S, "slow": SLOW_S}[how])
+        return True
     pids = cluster.find(case.target)
     if not pids:
         return False
@@ -196,14 +208,14 @@ def check(cluster: FaultCluster, row: Row, folder: Path, undisturbed: Path) -> N
     row.wrong += [f"left over: {stray}" for stray in strays]
 
 
-def play_all(seeds: int, on_row: Callable[[Row], None], root: Path, only: str = "") -> bool:
+def play_all(wanted: list[Case], on_row: Callable[[Row], None], root: Path) -> bool:
     """Plays the undisturbed run, then every case; True when each came to the same run."""
     well = True
     with fault_cluster(root) as cluster:
         first = play(cluster, "undisturbed")
         check(cluster, first, cluster.folder("undisturbed"), cluster.folder("undisturbed"))
         on_row(first)
-        for number, case in enumerate(case for case in cases(seeds) if only in case.name):
+        for number, case in enumerate(wanted):
             name = f"run-{number}"
             row = play(cluster, name, case)
             check(cluster, row, cluster.folder(name), cluster.folder("undisturbed"))
@@ -221,6 +233,14 @@ def main() -> None:
     )
     parser.add_argument("--fault-seeds", type=int, default=1, help="instants for each kind of fault")
     parser.add_argument("--only", default="", help="cases whose name holds this, such as 'worker SIGKILL'")
+    parser.add_argument(
+        "--part",
+        type=int,
+        nargs=2,
+        default=(0, 1),
+        metavar=("K", "N"),
+        help="every N-th case from the K-th on",
+    )
     parser.add_argument("--json", action="store_true", help="a JSON line for each row")
     parser.add_argument("--keep", type=Path, help="folder for the cluster and the runs; default: thrown away")
     options = parser.parse_args()
@@ -239,7 +259,8 @@ def main() -> None:
         if root is None:
             root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="evof-")))
         root.mkdir(parents=True, exist_ok=True)
-        well = play_all(options.fault_seeds, tell, root, options.only)
+        wanted = [case for case in cases(options.fault_seeds, *options.part) if options.only in case.name]
+        well = play_all(wanted, tell, root)
     sys.exit(0 if well else 1)
 
 

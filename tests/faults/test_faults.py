@@ -19,14 +19,18 @@ from fault_matrix import Case, cases
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-class Matrix:
-    """The rows that the program has printed so far."""
+PARTS = 2
+"""Clusters at once: most of a run with a fault is waiting."""
 
-    def __init__(self, seeds: int) -> None:
+
+class Matrix:
+    """The rows that one program has printed so far."""
+
+    def __init__(self, seeds: int, part: int) -> None:
         self.process = subprocess.Popen(
             [
-                *(sys.executable, str(Path(__file__).with_name("fault_matrix.py"))),
-                *("--json", "--fault-seeds", str(seeds)),
+                *(sys.executable, str(Path(__file__).with_name("fault_matrix.py")), "--json"),
+                *("--fault-seeds", str(seeds), "--part", str(part), str(PARTS)),
             ],
             stdout=subprocess.PIPE,
             text=True,
@@ -45,31 +49,40 @@ class Matrix:
 
 
 @pytest.fixture(scope="module")
-def matrix(request: pytest.FixtureRequest) -> Iterator[Matrix]:
-    matrix = Matrix(request.config.getoption("--fault-seeds"))
-    yield matrix
+def matrices(request: pytest.FixtureRequest) -> Iterator[list[Matrix]]:
+    matrices = [Matrix(request.config.getoption("--fault-seeds"), part) for part in range(PARTS)]
+    yield matrices
     # Also when only some rows were asked for: it takes everything down that it has started.
-    matrix.process.terminate()
-    matrix.process.communicate(timeout=60)
+    for matrix in matrices:
+        matrix.process.terminate()
+    for matrix in matrices:
+        matrix.process.communicate(timeout=60)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "case" in metafunc.fixturenames:
-        found = cases(metafunc.config.getoption("--fault-seeds"))
-        metafunc.parametrize("case", found, ids=[case.name.replace(" ", "-") for case in found])
+        found = [
+            (case, part)
+            for part in range(PARTS)
+            for case in cases(metafunc.config.getoption("--fault-seeds"), part, PARTS)
+        ]
+        ids = [case.name.replace(" ", "-") for case, _ in found]
+        metafunc.parametrize(("case", "part"), found, ids=ids)
 
 
-def test_an_undisturbed_run_spends_its_budget_and_leaves_no_process(matrix: Matrix) -> None:
-    assert matrix.row("nothing", "", 0)["wrong"] == []
+def test_an_undisturbed_run_spends_its_budget_and_leaves_no_process(matrices: list[Matrix]) -> None:
+    for matrix in matrices:
+        assert matrix.row("nothing", "", 0)["wrong"] == []
 
 
-def test_a_run_comes_to_the_same_through(case: Case, matrix: Matrix) -> None:
-    row = matrix.row(case.target, case.fault, case.seed)
+def test_a_run_comes_to_the_same_through(case: Case, part: int, matrices: list[Matrix]) -> None:
+    row = matrices[part].row(case.target, case.fault, case.seed)
     assert row["wrong"] == []
     assert row["phase"]
 
 
-def test_nothing_is_left_of_the_cluster(matrix: Matrix) -> None:
-    matrix.process.wait()
-    assert matrix.process.stdout is not None
-    assert [line for line in matrix.process.stdout if json.loads(line)["wrong"]] == []
+def test_nothing_is_left_of_the_clusters(matrices: list[Matrix]) -> None:
+    for matrix in matrices:
+        assert matrix.process.stdout is not None
+        assert [line for line in matrix.process.stdout if json.loads(line)["wrong"]] == []
+        matrix.process.wait()
