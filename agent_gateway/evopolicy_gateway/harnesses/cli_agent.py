@@ -21,7 +21,7 @@ import structlog
 
 from evopolicy_gateway.harnesses import prompts, session
 from evopolicy_gateway.harnesses.base import AgentError, Doing, Ending, Harness, Stage
-from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader
+from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.session import SessionState
 from evopolicy_gateway.harnesses.trouble import Trouble, backoff_s
 from evopolicy_gateway.harnesses.turn import play_turn
@@ -196,7 +196,8 @@ class CliAgent(Harness):
         if lacking:
             raise AgentError(
                 f"{name} {self._version or 'of an unknown version'} has no {', '.join(lacking)};"
-                f" known to work: {dialect.tested_version} ({dialect.install}@{dialect.tested_version})"
+                f" known to work: {dialect.tested_version} ({dialect.install}@{dialect.tested_version});"
+                f" asked for its options it said: {first_line(self._options) or 'nothing'}"
             )
         if self._version != dialect.tested_version:
             log.warning(

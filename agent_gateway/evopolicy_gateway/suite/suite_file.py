@@ -23,6 +23,7 @@ from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import RunFolder, run_folder
 
 Positive = Annotated[int, Meta(ge=1)]
@@ -67,6 +68,8 @@ class AgentTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     parallel: Positive | None = None
     """Runs of it at once."""
     run: RunTable = RunTable()
+    jail: JailSettings = JailSettings()
+    """What its jail shows and lets through besides its harness's own."""
 
 
 class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -117,6 +120,7 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     parallel: int | None
     """Runs of its agent at once."""
+    jail: JailSettings = JailSettings()
 
     @property
     def digest(self) -> str:
@@ -178,8 +182,6 @@ def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> li
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise ConfigError(f"agents of one name: {', '.join(doubled)}")
-    for agent in suite.agents:
-        _check_agent(agent, started_in)
     runs: list[SuiteRun] = []
     chosen = {
         agent.name: catalogue.resolve(agent.environments or suite.environments) for agent in suite.agents
@@ -199,16 +201,19 @@ def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> li
         runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
         if not runs:
             raise ConfigError(f"--only {' '.join(only)} fits no run of the suite")
+    taking_part = {run.agent for run in runs}
+    for agent in suite.agents:
+        if agent.name in taking_part:
+            _check_agent(agent, started_in)
     return runs
 
 
 def _check_agent(agent: AgentTable, started_in: Path) -> None:
-    if (agent.config is None) == (not agent.agent):
-        raise ConfigError(f"agent {agent.name!r} needs either `agent` or `[agents.config]`")
     if not agent.name or "/" in agent.name:
         raise ConfigError(f"agent {agent.name!r}: a name without '/' is needed")
     try:
         harnesses.make(agent.agent, started_in, agent.config)
+        agent.jail.check()
     except ConfigError as error:
         raise ConfigError(f"agent {agent.name!r}: {error}") from error
 
@@ -237,6 +242,8 @@ def _resolved(name: str) -> list[str]:
 
 
 def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunTable) -> SuiteRun:
+    if (agent.config is None) == (not agent.agent):
+        raise ConfigError(f"agent {agent.name!r} needs either `agent` or `[agents.config]`")
     harness = agent.agent or agent.config.harness if agent.config else agent.agent
     model = agent.config.model if agent.config is not None else None
     settings = RunSettings(
@@ -266,6 +273,7 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         settings=settings,
         wall_s=table.agent_wall_s or WALL_S,
         parallel=agent.parallel,
+        jail=agent.jail,
     )
 
 

@@ -200,6 +200,7 @@ class Sweep:
             started_in=self._started_in,
             wall_limit_s=run.wall_s,
             config=run.config,
+            jail=run.jail,
         )
         play = RunPlay(
             plan,

@@ -1,0 +1,268 @@
+"""`evopolicy suite` as an operator uses it: real cluster, toy environments, the built-in search and the fake CLIs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common.run_record import decode_run_record
+
+FAKES = Path(__file__).parents[2] / "support" / "fake_clis"
+PATIENCE_S = 150.0
+MARK = "EVOTEST_MARK"
+
+SUITE = """
+name = "t"
+environments = ["toy/line"]
+[defaults]
+budget = 4
+validation = 2
+heldout = 2
+[parallel]
+machine = 3
+[[agents]]
+name = "evolve"
+agent = "evolve"
+[[agents]]
+name = "fake codex"
+[agents.config]
+harness = "codex"
+program = ["{python}", "{fakes}/codex"]
+environment = {{ FAKE_STATE = ".fake", FAKE_SCENARIO = "{codex}" }}
+backoff_s = 0.01
+[agents.jail]
+read = ["{fakes}"]
+[[agents]]
+name = "fake claude"
+[agents.config]
+harness = "claude-code"
+program = ["{python}", "{fakes}/claude"]
+environment = {{ FAKE_STATE = ".fake", FAKE_SCENARIO = "{claude}" }}
+backoff_s = 0.01
+[agents.jail]
+read = ["{fakes}"]
+"""
+
+
+def write_suite(folder: Path, codex: str = "work", claude: str = "work") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "t.toml").write_text(
+        SUITE.format(python=sys.executable, fakes=FAKES, codex=codex, claude=claude)
+    )
+
+
+class Sweep:
+    """A running `evopolicy suite`, with everything below it findable."""
+
+    def __init__(self, cwd: Path, *arguments: str) -> None:
+        self.mark = uuid.uuid4().hex
+        self.out = cwd / f"{self.mark}.out"
+        with self.out.open("wb") as out:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "evopolicy_gateway.cli", "suite", "t.toml", *arguments],
+                cwd=cwd,
+                env={**os.environ, "XDG_STATE_HOME": str(cwd / "xdg"), MARK: self.mark},
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
+
+    @property
+    def text(self) -> str:
+        return self.out.read_text()
+
+    def finish(self) -> int:
+        return self.process.wait(timeout=PATIENCE_S)
+
+    def kill(self) -> None:
+        """SIGKILL to the command alone: what it started has to notice."""
+        self.process.kill()
+        self.process.wait()
+        wait_until(lambda: not self.alive(), self)
+
+    def alive(self) -> list[int]:
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdecimal():
+                with contextlib.suppress(OSError):
+                    state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+                    if state != "Z" and f"{MARK}={self.mark}".encode() in (entry / "environ").read_bytes():
+                        found.append(int(entry.name))
+        return found
+
+    def kill_all(self) -> None:
+        for pid in self.alive():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.wait()
+
+
+def wait_until(what: Any, sweep: Sweep) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < deadline, sweep.text
+        time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def sweep(cwd: Path, *arguments: str) -> Iterator[Sweep]:
+    running = Sweep(cwd, *arguments)
+    try:
+        yield running
+    finally:
+        running.kill_all()
+
+
+def index_in(root: Path) -> dict[str, Any]:
+    return dict(json.loads((root / "suite.json").read_text())["runs"])
+
+
+def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
+    # The second turn of either fake never ends, until the third start, which works.
+    write_suite(tmp_path, codex="work,endless,work", claude="work,endless,work")
+    root = tmp_path / "runs" / "t"
+    sessions = [root / "fake codex/toy_line/t-0/.gateway", root / "fake claude/toy_line/t-0/.gateway"]
+    with sweep(tmp_path, "--local") as first:
+        wait_until(
+            lambda: (
+                index_in(root).get("evolve/toy/line/0", {}).get("state") == "completed"
+                if (root / "suite.json").exists()
+                else False
+            ),
+            first,
+        )
+        wait_until(lambda: all(_turns(folder) == 1 for folder in sessions), first)
+        first.kill()
+    evolved = root / "evolve/toy_line/t-0/run.json"
+    written = evolved.stat().st_mtime_ns
+    kept = [json.loads((folder / "session.json").read_text())["session"] for folder in sessions]
+    with sweep(tmp_path, "--local") as second:
+        wait_until(lambda: "runs:" in second.text, second)
+        second.kill()
+    with sweep(tmp_path, "--local") as third:
+        assert third.finish() == 0, third.text
+        assert third.alive() == []
+        text = third.text
+    assert "1 kept" in text
+    assert "goes on in its session" in text
+    assert evolved.stat().st_mtime_ns == written
+    for harness, session in zip(("codex", "claude"), kept, strict=True):
+        folder = root / f"fake {harness}/toy_line/t-0"
+        record = decode_run_record((folder / "run.json").read_bytes())
+        assert record.outcome.status == "completed"
+        assert record.outcome.budget_used == 4
+        assert record.attempt == 1
+        assert record.agent.harness == ("codex" if harness == "codex" else "claude-code")
+        assert record.agent.tokens is not None
+        starts = (folder / "workspace/.fake/starts").read_text()
+        assert session in starts.splitlines()[-1]
+    assert {entry["state"] for entry in index_in(root).values()} == {"completed"}
+    with sweep(tmp_path, "--local", "--dry-run") as after:
+        assert after.finish() == 0
+        assert "3 runs: 3 kept" in after.text
+
+
+def _turns(folder: Path) -> int:
+    try:
+        return int(json.loads((folder / "session.json").read_text())["turns"])
+    except (OSError, ValueError):
+        return 0
+
+
+def test_a_run_without_a_session_is_begun_again_and_the_old_one_kept_aside(tmp_path: Path) -> None:
+    agent = tmp_path / "agent.py"
+    agent.write_text(
+        "import os, json, time, urllib.request\n"
+        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
+        "data = json.dumps({'env_instances': [0]}).encode()\n"
+        "urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
+        "time.sleep(3600)\n"
+    )
+    text = (
+        'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 1\nvalidation = 1\nheldout = 1\n'
+        f'[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent}"\n'
+    )
+    (tmp_path / "t.toml").write_text(text.replace("budget = 1", "budget = 2"))
+    root = tmp_path / "runs" / "t"
+    feedback = root / "own/toy_line/t-0/workspace/feedback/submit_000/summary.json"
+    with sweep(tmp_path, "--local") as first:
+        wait_until(feedback.exists, first)
+        first.kill()
+    agent.write_text(agent.read_text().replace("3600", "0"))
+    with sweep(tmp_path, "--local") as second:
+        assert second.finish() == 0, second.text
+        assert "begun again as a new attempt (its agent keeps no session" in second.text
+    record = decode_run_record((root / "own/toy_line/t-0/run.json").read_bytes())
+    assert record.attempt == 2
+    aside = root / ".attempts/own/toy_line/t-0.1/workspace/feedback/submit_000/summary.json"
+    assert aside.exists()
+
+
+@pytest.fixture
+def operator_file(tmp_path: Path) -> Iterator[Path]:
+    """Credentials for a coordinator with a worker of two slots."""
+    state = tmp_path / "s"
+    ready = tmp_path / "ready.json"
+    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "xdg")}
+    with (tmp_path / "cluster.log").open("wb") as log:
+        start = [sys.executable, "-m"]
+        coordinator = subprocess.Popen(
+            [*start, "evopolicy_coordinator.cli", "--state", str(state), "--ready-file", str(ready)],
+            env=environment,
+            stdout=log,
+            stderr=log,
+        )
+        deadline = time.monotonic() + PATIENCE_S
+        while not ready.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        credentials = json.loads(ready.read_text())["credentials"]
+        options = ["--env", "toy", "--slots", "2", "--grace", "0", "--credentials", credentials["worker"]]
+        worker = subprocess.Popen(
+            [*start, "evopolicy_worker.cli", *options], env=environment, stdout=log, stderr=log
+        )
+        try:
+            yield Path(credentials["operator"])
+        finally:
+            for process in (worker, coordinator):
+                process.terminate()
+                process.wait(timeout=PATIENCE_S)
+
+
+def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, operator_file: Path) -> None:
+    hosts = [tmp_path / "one", tmp_path / "two"]
+    for host in hosts:
+        write_suite(host)
+    arguments = ("--credentials", str(operator_file), "--parallel", "1")
+    with sweep(hosts[0], *arguments) as one, sweep(hosts[1], *arguments) as two:
+        assert one.finish() == 0, one.text
+        assert two.finish() == 0, two.text
+    records = [path for host in hosts for path in host.glob("runs/t/*/*/*/run.json")]
+    assert sorted(path.parts[-4] for path in records) == ["evolve", "fake claude", "fake codex"]
+    for host in hosts:
+        assert {entry["state"] for entry in index_in(host / "runs" / "t").values()} == {"completed"}
+        assert len(index_in(host / "runs" / "t")) == 3
+
+
+def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file: Path) -> None:
+    write_suite(tmp_path)
+    arguments = ("--credentials", str(operator_file), "--only", "evolve/*", "--json")
+    with sweep(tmp_path, *arguments) as running:
+        assert running.finish() == 0, running.text
+        lines = [json.loads(line) for line in running.text.splitlines() if line.startswith("{")]
+    kinds = [line["event"] for line in lines]
+    assert kinds[0] == "planned"
+    assert kinds[1] == "started"
+    assert kinds[-1] == "finished"
+    assert lines[-1]["state"] == "completed"
+    assert "submit" in kinds

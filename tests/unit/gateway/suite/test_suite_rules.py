@@ -1,0 +1,206 @@
+"""Suites: their files, what becomes of each run at a start, what is shown, the index on disk."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.control import AgentDoing, Progress
+from evopolicy_gateway.suite import suite_index
+from evopolicy_gateway.suite.decisions import Found, check_changes, decide, told
+from evopolicy_gateway.suite.suite_file import SuiteRun, expand, read
+from evopolicy_gateway.suite.suite_index import Entry, Index
+from evopolicy_gateway.suite.suite_view import TableView
+from evopolicy_gateway.suite.sweep import used
+
+FILE = """
+name = "s"
+environments = ["toy/line", "toy/maze"]
+[defaults]
+budget = 8
+repeats = 2
+[[agents]]
+name = "evolve"
+agent = "evolve"
+[[agents]]
+name = "GPT"
+[agents.config]
+harness = "codex"
+model = "gpt-5.5"
+[agents.run]
+budget = 16
+[[overrides]]
+environments = ["*/maze"]
+agents = ["GPT"]
+repeats = 1
+heldout = 4
+"""
+
+
+def suite_in(tmp_path: Path, text: str = FILE) -> list[SuiteRun]:
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    return expand(read(str(path)), tmp_path)
+
+
+def test_runs_are_agents_times_environments_times_repeats_with_overrides(tmp_path: Path) -> None:
+    runs = suite_in(tmp_path)
+    assert [run.name for run in runs] == [
+        *("evolve/toy/line/0", "GPT/toy/line/0", "evolve/toy/maze/0", "GPT/toy/maze/0"),
+        *("evolve/toy/line/1", "GPT/toy/line/1", "evolve/toy/maze/1"),
+    ]
+    by_name = {run.name: run for run in runs}
+    assert by_name["evolve/toy/line/0"].settings.budget == 8
+    assert by_name["GPT/toy/line/0"].settings.budget == 16
+    assert by_name["GPT/toy/line/0"].settings.model == "gpt-5.5"
+    assert by_name["GPT/toy/line/0"].provider == "openai"
+    assert by_name["GPT/toy/maze/0"].settings.n_heldout == 4
+    assert by_name["GPT/toy/line/1"].settings.exp_id == "s-1"
+    assert len({run.digest for run in runs}) == len(runs)
+
+
+def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
+    before = {run.name: run.digest for run in suite_in(tmp_path)}
+    retried = {
+        run.name: run.digest
+        for run in suite_in(tmp_path, FILE.replace('model = "gpt-5.5"', 'model = "gpt-5.5"\nretries = 9'))
+    }
+    assert retried == before
+    changed = {run.name: run.digest for run in suite_in(tmp_path, FILE.replace("budget = 16", "budget = 32"))}
+    assert [name for name in before if changed[name] != before[name]] == [
+        *("GPT/toy/line/0", "GPT/toy/maze/0", "GPT/toy/line/1"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name = 's'", "environments"),
+        (FILE.replace("budget = 8", "budgte = 8"), "budgte"),
+        (FILE.replace("budget = 8", "budget = 0"), "budget"),
+        (FILE.replace('name = "GPT"', 'name = "evolve"'), "agents of one name: evolve"),
+        (FILE.replace('agent = "evolve"', 'agent = "nobody"'), "'evolve': --agent 'nobody'"),
+        (FILE.replace('name = "s"', 'name = "s/t"'), "letters, digits"),
+        (FILE.replace('"toy/line", ', '"no/such", '), "no/such"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_place(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        suite_in(tmp_path, text)
+
+
+@pytest.mark.parametrize("name", ["smoke.toml", "core16.toml", "core16-paper.toml"])
+def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ANTHROPIC_AUTH_TOKEN", "set")
+    suite = read(name)
+    runs = expand(suite, tmp_path)
+    core16 = catalogue.resolve(["core16"])
+    assert len(runs) == len(suite.agents) * 16
+    assert {run.settings.env for run in runs} == set(core16)
+    if name == "core16-paper.toml":
+        assert {run.settings.model for run in runs} == {
+            *("gpt-5.5", "claude-opus-4-7-thinking-max", "MiniMax-M3", "deepseek-v4-pro"),
+        }
+    if name != "smoke.toml":
+        (numbers,) = {
+            (run.settings.budget, run.settings.n_validation, run.settings.n_heldout) for run in runs
+        }
+        assert numbers == (128, 16, 32)
+        scopes = {run.settings.policy_scope for run in runs}
+        assert scopes == {"submit" if "paper" in name else "episode"}
+
+
+def entry(run: SuiteRun, **more: object) -> Entry:
+    fields = {
+        "name": run.name,
+        "agent": run.agent,
+        "env": run.settings.env,
+        "repeat": 0,
+        "digest": run.digest,
+    }
+    return Entry(**(fields | more))  # type: ignore[arg-type]
+
+
+def test_what_becomes_of_each_run(tmp_path: Path) -> None:
+    run = suite_in(tmp_path)[0]
+    running = entry(run, state="running")
+    cases = [
+        (Found(), "new", 1),
+        (Found(status="completed", entry=entry(run, state="completed")), "keep", 1),
+        (Found(status="no_ok_submit"), "keep", 1),
+        (Found(entry=entry(run, state="completed", host="other")), "keep", 1),
+        (Found(status="error", entry=entry(run, state="error", attempt=2)), "restart", 3),
+        (Found(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
+        (Found(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
+        (Found(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
+        (Found(opened=True, phase=None, has_session=True, entry=running), "restart", 2),
+        (Found(entry=running), "restart", 2),
+    ]
+    for found, kind, attempt in cases:
+        decision = decide(run, found)
+        assert (decision.kind, decision.attempt) == (kind, attempt), found
+
+
+def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
+    run = suite_in(tmp_path)[0]
+    found = Found(status="completed", entry=entry(run, state="completed", digest="another"))
+    refused = [decide(run, found, "refuse")]
+    with pytest.raises(ConfigError, match="evolve/toy/line/0 was played: say --changed keep"):
+        check_changes(refused, "refuse")
+    assert decide(run, found, "keep").kind == "keep"
+    again = decide(run, found, "rerun")
+    assert (again.kind, again.attempt) == ("restart", 2)
+    check_changes([again], "rerun")
+    lines = told([again], ["gone/toy/line/0"])
+    assert lines[0] == "1 runs: 1 begun again as a new attempt"
+    assert "the file has other settings" in lines[1]
+    assert "no longer in the file" in lines[2]
+
+
+def test_the_index_is_another_sweeps_or_is_read_back(tmp_path: Path) -> None:
+    run = suite_in(tmp_path)[0]
+    index = Index(suite="s", runs={run.name: entry(run, state="completed", score=1.5)})
+    suite_index.save(tmp_path, index)
+    assert suite_index.load(tmp_path, "s") == index
+    with pytest.raises(ConfigError, match="is of suite 's'"):
+        suite_index.load(tmp_path, "other")
+    (tmp_path / "suite.json").write_text("{")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        suite_index.load(tmp_path, "s")
+
+
+def test_a_sweeps_use_adds_up_over_its_runs(tmp_path: Path) -> None:
+    one, two, three = suite_in(tmp_path)[:3]
+    tokens = {"input_noncached": 1, "cache_read": 2, "cache_creation": 3, "output": 4, "reasoning": 4}
+    runs = {
+        one.name: entry(one, tokens=tokens),
+        two.name: entry(two, tokens={**tokens, "cost": 0.5}),
+        three.name: entry(three),
+    }
+    assert used(Index(suite="s", runs=runs)) == (20, 0.5)
+
+
+def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
+    runs = suite_in(tmp_path)
+    out = io.StringIO()
+    console = Console(file=out, width=160)
+    view = TableView([run.name for run in runs], 2, console)
+    first, second = runs[0], runs[1]
+    view.kept(first.name, entry(first, state="completed", score=-1.25, wall_s=60.0))
+    view.started(second.name, 1)
+    view.progress(second.name, Progress(episode_budget=16, remaining_budget=10, n_submits=2, best_mean=-3.5))
+    tokens = {"input_noncached": 1000, "cache_read": 500, "output": 0}
+    view.doing(second.name, AgentDoing(action="$ curl /submit", tokens=tokens))
+    console.print(view.render())
+    text = out.getvalue()
+    assert "6/16" in text
+    assert "-3.5" in text
+    assert "1.5k" in text
+    assert "$ curl /submit" in text
+    assert "score -1.25" in text
+    assert "1 of 7 runs done, 1 running, 1.5k tokens, about 3 min left" in text
