@@ -22,7 +22,12 @@ PROVED: Mapping[str, tuple[str, ...]] = {
     "numpy": ("2.4.6",),
     "pygame-ce": ("2.5.8",),
 }
-"""Versions with which the exhaustive comparison was run and found no difference, by distribution."""
+"""Versions with which the exhaustive comparison was run and found no difference, by distribution.
+
+That was 128 seeds of each environment, half with random actions and half with a competent driver, whole episodes of
+MiniGrid (349,956 steps) and roundabout (991); of parking the first 200 steps (17,618 in all); of CarRacing the first 100 steps of 128 seeds, whole
+episodes of 24 more, and 4,000 pictures of a car put anywhere at any angle, speed and moment.
+"""
 
 
 _told: set[str] = set()
