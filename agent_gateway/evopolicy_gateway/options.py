@@ -63,7 +63,8 @@ JailBindWritable = Annotated[
     list[str] | None, typer.Option("--jail-bind-rw", help="File or folder that it may also change.")
 ]
 JailVariable = Annotated[
-    list[str] | None, typer.Option("--jail-env", help="Variable that is passed on to it, such as an API key's.")
+    list[str] | None,
+    typer.Option("--jail-env", help="Variable that is passed on to it, such as an API key's."),
 ]
 AllowHost = Annotated[
     list[str] | None,

@@ -1,0 +1,156 @@
+"""A cluster to be cheated: a coordinator and a worker with something listening beside them, on this machine alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import sysconfig
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from evopolicy_common.run_record import RunRecord, decode_run_record
+
+PATIENCE_S = 120.0
+SECRET = "the operator's own"
+AGENT = Path(__file__).parents[1] / "conformance" / "cheats" / "cheating_agent.py"
+
+
+class Listener:
+    """A server that nobody has business with: says hello to whoever comes, and remembers them."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+        self._tcp = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._tcp.getsockname()[1]
+        self.abstract = f"evopolicy-test-{os.getpid()}-{self.port}"
+        self._unix = socket.socket(socket.AF_UNIX)
+        self._unix.bind("\0" + self.abstract)
+        self._unix.listen()
+        self._threads = [
+            threading.Thread(target=self._accept, args=(sock,)) for sock in (self._tcp, self._unix)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _accept(self, sock: socket.socket) -> None:
+        while True:
+            try:
+                peer, _ = sock.accept()
+            except OSError:
+                return
+            with peer:
+                peer.settimeout(0.5)
+                try:
+                    peer.sendall(b"hello")
+                    self.heard.append(peer.recv(2000).decode("latin-1"))
+                except OSError:
+                    self.heard.append("")
+
+    def close(self) -> None:
+        for sock in (self._tcp, self._unix):
+            sock.shutdown(socket.SHUT_RDWR)
+            sock.close()
+        for thread in self._threads:
+            thread.join()
+
+
+class Cheated:
+    """The cluster, its operator's folder, and what an agent may be after."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.home = root / "home"
+        self.home.mkdir()
+        (self.home / "notes").write_text(SECRET)
+        self.state = root / "state"
+        self.runs = root / "runs"
+        other = self.runs / "other" / "toy_line" / "t" / "checkpoints"
+        other.mkdir(parents=True)
+        (other / "policy.py").write_text(SECRET)
+        self.other_run = other / "policy.py"
+        self.environment = {
+            **os.environ,
+            "HOME": str(self.home),
+            "XDG_STATE_HOME": str(root / "xdg"),
+            "OPERATORS_SECRET": SECRET,
+        }
+        self._log = (root / "log").open("wb")
+        ready = root / "ready.json"
+        self.coordinator = self._start(
+            "evopolicy_coordinator.cli", "--state", str(self.state), "--ready-file", str(ready)
+        )
+        deadline = time.monotonic() + PATIENCE_S
+        while not ready.exists():
+            assert time.monotonic() < deadline, (root / "log").read_text()
+            time.sleep(0.05)
+        self.credentials: dict[str, str] = json.loads(ready.read_text())["credentials"]
+        self._worker = self._start(
+            *("evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
+            *("--credentials", self.credentials["worker"]),
+        )
+        self.listener = Listener()
+
+    def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            env=self.environment,
+            stdout=self._log,
+            stderr=self._log,
+        )
+
+    def targets(self) -> dict[str, Any]:
+        (sock,) = self.state.glob("*.sock")
+        return {
+            "state": str(self.state),
+            "operator": self.credentials["operator"],
+            "socket": str(sock),
+            "pid": self.coordinator.pid,
+            "runs": str(self.runs),
+            "other_run": str(self.other_run),
+            "home": str(self.home / "notes"),
+            "port": self.listener.port,
+            "abstract": self.listener.abstract,
+            "site": sysconfig.get_path("platlib"),
+            "python": sys.executable,
+        }
+
+    def play(self, agent: str, exp_id: str, *options: str) -> tuple[int, str, Path]:
+        """Plays a run: exit code, what the command said, and the run's folder."""
+        words = ["run", "--env", "toy/line", "--agent", agent, "--entry", "e", "--exp-id", exp_id]
+        words += ["--credentials", self.credentials["operator"]]
+        words += ["--budget", "4", "--validation", "2", "--heldout", "2", "--runs", str(self.runs)]
+        done = subprocess.run(
+            [sys.executable, "-m", "evopolicy_gateway.cli", *words, *options],
+            env=self.environment,
+            cwd=self.root,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+        return done.returncode, done.stdout + done.stderr, self.runs / "e" / "toy_line" / exp_id
+
+    def close(self) -> None:
+        self.listener.close()
+        for process in (self._worker, self.coordinator):
+            process.terminate()
+            process.wait(timeout=PATIENCE_S)
+        self._log.close()
+
+
+class CheatingRun:
+    """What a cheating agent came to."""
+
+    def __init__(self, cheated: Cheated, name: str, *options: str) -> None:
+        before = len(cheated.listener.heard)
+        words = f"command:{sys.executable} {AGENT} '{json.dumps(cheated.targets())}'"
+        code, said, self.folder = cheated.play(words, name, *options)
+        assert code == 0, said
+        self.report: dict[str, Any] = json.loads((self.folder / "workspace" / "report.json").read_text())
+        self.record: RunRecord = decode_run_record((self.folder / "run.json").read_bytes())
+        self.heard = cheated.listener.heard[before:]

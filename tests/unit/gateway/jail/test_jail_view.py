@@ -1,0 +1,111 @@
+"""Which files a program's jail shows, and which it covers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from evopolicy_gateway.jail.installs import needs_of, simulators_below
+from evopolicy_gateway.jail.view import View
+
+
+def program(path: Path, first_line: str = "#!/bin/sh") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(first_line + "\n")
+    path.chmod(0o755)
+    return path
+
+
+def arguments(tmp_path: Path, command: list[str], **fields: object) -> list[str]:
+    workspace = tmp_path / "runs" / "w"
+    (workspace / "feedback").mkdir(parents=True)
+    (workspace / "AGENTS.md").touch()
+    usual: dict[str, object] = {
+        "workspace": workspace,
+        "private": tmp_path / "private",
+        "home": "/home/somebody",
+        "needs": needs_of(command, None),
+        "read": (),
+        "write": (),
+        "hidden": (tmp_path / "runs",),
+        "open_network": False,
+    }
+    return View(**(usual | fields)).arguments()  # type: ignore[arg-type]
+
+
+def triples(words: list[str], option: str) -> list[tuple[str, str]]:
+    return [(words[i + 1], words[i + 2]) for i, word in enumerate(words) if word == option]
+
+
+def test_a_program_brings_its_installation_and_the_interpreter_of_its_first_line(tmp_path: Path) -> None:
+    node = program(tmp_path / "node" / "bin" / "node")
+    (tmp_path / "node" / "lib").mkdir()
+    cli = program(
+        tmp_path / "npm" / "lib" / "node_modules" / "cli" / "cli.js", f"#!/usr/bin/env -S {node} --flag"
+    )
+    link = tmp_path / "npm" / "bin" / "cli"
+    link.parent.mkdir()
+    link.symlink_to("../lib/node_modules/cli/cli.js")
+    needs = needs_of([str(link)], None)
+    assert str(cli.parents[1]) in needs.paths
+    assert str(tmp_path / "node") in needs.paths
+    assert needs.links[str(link)] == "../lib/node_modules/cli/cli.js"
+
+
+def test_a_lone_program_brings_itself_and_the_files_its_command_names(tmp_path: Path) -> None:
+    tool, data = program(tmp_path / "tools" / "tool"), tmp_path / "data.json"
+    data.touch()
+    (tmp_path / "tools" / "secret").touch()
+    needs = needs_of([str(tool), "--data", str(data), "/no/such/file", "word"], None)
+    found = {path for path in needs.paths if path.startswith(str(tmp_path))}
+    assert found == {str(tool), str(data)}
+
+
+def test_our_environments_packages_are_not_shown_as_a_whole() -> None:
+    needs = needs_of([sys.executable], None)
+    assert not any("site-packages" in path for path in needs.paths)
+    assert sys.prefix not in needs.paths or sys.prefix == sys.base_prefix
+
+
+@pytest.mark.parametrize(
+    "place", ["lib/python3.11", "versions/3.12.1/lib/python3.12", "local/lib/python3.13"]
+)
+def test_simulators_are_found_wherever_a_python_keeps_its_packages(tmp_path: Path, place: str) -> None:
+    site = tmp_path / place / "site-packages"
+    for name in ("gymnasium", "numpy", "mujoco", "gymnasium-1.0.dist-info"):
+        (site / name).mkdir(parents=True)
+    (site / "Box2D.so").touch()
+    found = {Path(path).name for path in simulators_below(str(tmp_path))}
+    assert found == {"gymnasium", "mujoco", "Box2D.so"}
+
+
+def test_what_is_hidden_is_covered_in_a_folder_that_the_operator_shows(tmp_path: Path) -> None:
+    words = arguments(tmp_path, [], read=(str(tmp_path),))
+    covers = [words[i + 1] for i, word in enumerate(words) if word == "--tmpfs"]
+    assert str(tmp_path / "runs") in covers
+    shown = words.index(str(tmp_path))
+    assert shown < words.index(str(tmp_path / "runs"), shown) < words.index(str(tmp_path / "runs" / "w"))
+
+
+def test_what_is_hidden_is_covered_behind_a_link_too(tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    words = arguments(tmp_path, [], read=(str(link),))
+    assert str(link / "runs") in [words[i + 1] for i, word in enumerate(words) if word == "--tmpfs"]
+
+
+def test_feedback_and_rules_lie_read_only_over_the_writable_workspace(tmp_path: Path) -> None:
+    words = arguments(tmp_path, [])
+    workspace = str(tmp_path / "runs" / "w")
+    assert (workspace, workspace) in triples(words, "--bind")
+    for name in ("feedback", "AGENTS.md"):
+        assert (f"{workspace}/{name}", f"{workspace}/{name}") in triples(words, "--ro-bind")
+        assert words.index(workspace) < words.index(f"{workspace}/{name}")
+
+
+def test_only_an_open_network_shares_this_machines(tmp_path: Path) -> None:
+    assert "--unshare-net" in arguments(tmp_path / "a", [])
+    assert "--unshare-net" not in arguments(tmp_path / "b", [], open_network=True)
