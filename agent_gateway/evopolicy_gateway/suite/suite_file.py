@@ -81,6 +81,8 @@ class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Of each agent, on each host."""
     providers: dict[str, Positive] = {}
     """Of each provider, on each host."""
+    claim_ttl_s: Annotated[float, Meta(ge=1, le=3600)] = 60.0
+    """A host that is not heard of for so long loses its runs to the others."""
 
 
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

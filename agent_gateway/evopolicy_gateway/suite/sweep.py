@@ -38,9 +38,7 @@ from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
-CLAIM_TTL_S = 60.0
-_RENEW_S = CLAIM_TTL_S / 4
-_ASK_AGAIN_S = 10.0
+_ASK_AGAIN_S = 5.0
 ATTEMPTS = ".attempts"
 
 
@@ -217,7 +215,7 @@ class Sweep:
     async def _renew(self, by_name: dict[str, Decision]) -> None:
         """Keeps the claims of what goes on here."""
         while True:
-            await asyncio.sleep(_RENEW_S)
+            await asyncio.sleep(self._suite.parallel.claim_ttl_s / 4)
             for name, task in list(self._active.items()):
                 with contextlib.suppress(EvopolicyError):
                     claim = await self._ask(by_name[name].run)
@@ -226,12 +224,17 @@ class Sweep:
                         task.cancel()
 
     async def _ask(
-        self, run: SuiteRun, ttl_s: float = CLAIM_TTL_S, result: dict[str, Any] | None = None
+        self, run: SuiteRun, ttl_s: float | None = None, result: dict[str, Any] | None = None
     ) -> ClaimState:
         # With other settings it is another run, whatever has become of the one before.
         name = f"{run.name}@{run.digest}"
         return await self._operations.claim(
-            self._suite.name, name, self._holder, ttl_s, self._run_of(run), result
+            self._suite.name,
+            name,
+            self._holder,
+            self._suite.parallel.claim_ttl_s if ttl_s is None else ttl_s,
+            self._run_of(run),
+            result,
         )
 
     async def _put_aside(self, folder: RunFolder, attempt: int) -> None:

@@ -31,6 +31,7 @@ validation = 2
 heldout = 2
 [parallel]
 machine = 3
+claim_ttl_s = 3.0
 [[agents]]
 name = "evolve"
 agent = "evolve"
@@ -252,6 +253,20 @@ def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, oper
     for host in hosts:
         assert {entry["state"] for entry in index_in(host / "runs" / "t").values()} == {"completed"}
         assert len(index_in(host / "runs" / "t")) == 3
+
+
+def test_a_dead_hosts_runs_are_taken_over(tmp_path: Path, operator_file: Path) -> None:
+    hosts = [tmp_path / "one", tmp_path / "two"]
+    write_suite(hosts[0], codex="endless")
+    write_suite(hosts[1], codex="endless")
+    arguments = ("--credentials", str(operator_file), "--only", "fake codex/*")
+    session = hosts[0] / "runs/t/fake codex/toy_line/t-0/workspace/.fake/starts"
+    with sweep(hosts[0], *arguments) as one:
+        wait_until(session.exists, one)
+        one.kill()
+    with sweep(hosts[1], *arguments) as two:
+        wait_until(lambda: "taken over" in two.text, two)
+        wait_until(lambda: "begins" in two.text, two)
 
 
 def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file: Path) -> None:
