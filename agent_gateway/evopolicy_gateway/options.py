@@ -34,7 +34,11 @@ CredentialsFile = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
 Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.")]
 AgentName = Annotated[
-    str, typer.Option(help="evolve, random, replay:DIR or command:PROGRAM…", show_default=False)
+    str,
+    typer.Option(
+        help="evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, file:AGENT.toml",
+        show_default=False,
+    ),
 ]
 Limits = Annotated[
     list[str] | None,
