@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import clip, not_zero, wrap
@@ -49,6 +49,8 @@ def _nothing() -> Any:
 
 
 @given(ANY, st.sampled_from([(-1.0, 1.0), (0.0, 20.0), (-math.pi / 4, math.pi / 4), (-6.0, 6.0)]))
+@example(-0.0, (0.0, 20.0))
+@example(math.nan, (0.0, 20.0))
 def test_clip_is_numpys_for_every_double(value: float, limits: tuple[float, float]) -> None:
     assert bits(clip(value, *limits)) == bits(np.clip(value, *limits))
 

@@ -14,9 +14,10 @@ TWO_PI = 2 * math.pi
 
 
 def clip(value: float, low: float, high: float) -> float:
-    """`np.clip` of one number, ties (zeros of both signs) and NaN included."""
-    raised = value if value > low or value != value else low
-    return raised if raised < high or raised != raised else high
+    """`np.clip` of one number: NaN stays, and so does a zero at a limit of zero, whatever its sign."""
+    if value < low:
+        return low
+    return high if value > high else value
 
 
 def wrap(angle: float) -> float:
