@@ -92,6 +92,7 @@ def run_record(
         exp_id=settings.exp_id,
         repeat=settings.repeat,
         attempt=settings.attempt,
+        run=finished.run,
         agent=_agent(plan, finished.agent),
         sandbox_tier=settings.sandbox_tier,
         jail=plan.jail.recorded,

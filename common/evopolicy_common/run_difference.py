@@ -22,6 +22,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "run.json": {
         "exp_id": "the run's own name",
         "attempt": "counts what was begun anew",
+        "run": "the coordinator's name of the run",
         "timing": "times",
         "agent.retries": "counts what was asked again",
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",

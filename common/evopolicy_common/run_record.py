@@ -214,6 +214,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Counts the repeats of one agent on one environment from 0."""
     attempt: int = 0
     """Times the operator started this run again from nothing."""
+    run: str = ""
+    """The coordinator's own name of the run, by which it finds what it stored of it; empty in older files."""
     agent: Agent
     sandbox_tier: Tier
     jail: str

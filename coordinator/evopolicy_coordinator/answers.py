@@ -22,7 +22,7 @@ from evopolicy_common.blobs import BlobStore, digest_of, is_digest
 from evopolicy_common.errors import StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
-from evopolicy_common.messages.operator import EvaluationPage, RunProgress
+from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
@@ -31,6 +31,7 @@ from evopolicy_coordinator.store import Reader
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_PAGE_BYTES = 256 << 10
+MAX_SEQ = 2**31 - 1
 _READERS = 2
 _BLOB_LANES = 4
 _NO_BYTES = BlobRef(digest=digest_of(b""), size=0, inline=b"")
@@ -60,6 +61,15 @@ class Answers:
     def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
         """Sends one chunk of a blob; with `run`, only of one that this run's train feedback names."""
         self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
+
+    def recorded(self, message: RecordedRequest, answer: Answer) -> None:
+        """Sends stored outcomes of a finished run."""
+        self._pages.submit(self._answer, lambda: self._recorded(message), answer)
+
+    def finished_secret(self, run: str) -> bytes | None:
+        """What a finished run's policy seeds are derived from; None for any other run. Reads the database."""
+        row = self._reader.run(run) if self._reader.finished(run) is not None else None
+        return None if row is None else row.secret
 
     def close(self) -> None:
         for pool in (self._pages, *self._lanes):
@@ -121,6 +131,25 @@ class Answers:
             outcomes=tuple(found.outcome for found in page.rows),
             finished=effect.finished and page.cursor >= effect.upto,
             waits_for=effect.waits_for,
+        )
+
+    def _recorded(self, message: RecordedRequest) -> Message:
+        run = message.run
+        if self._reader.finished(run) is None:
+            return Refused(status="unknown_run", message=f"there is no finished run {run[:64]!r} here")
+        name = {
+            "train": records.train_group,
+            "validation": records.validation_group,
+            "heldout": records.heldout_group,
+        }[message.split]
+        group = records.random_group(run) if message.submit_index < 0 else name(run, message.submit_index)
+        cursor = min(max(0, message.cursor), MAX_SEQ)
+        page = self._reader.outcomes(group, cursor, MAX_SEQ, MAX_PAGE_BYTES)
+        return EvaluationPage(
+            cursor=page.cursor,
+            total=page.cursor,
+            outcomes=tuple(found.outcome for found in page.rows),
+            finished=not page.rows,
         )
 
     def _put(self, sender: str, message: BlobPut, max_bytes: int) -> Message:

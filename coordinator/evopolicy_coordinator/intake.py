@@ -280,6 +280,7 @@ class Intake:
         except ConfigError as error:
             raise RefusedError("invalid_settings", str(error)) from error
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
+        self._check_again(m, len(ids))
         wrong = next((case_id for case_id in ids if not 0 <= case_id < len(cases)), None)
         if wrong is not None or not ids:
             raise RefusedError(
@@ -302,7 +303,19 @@ class Intake:
             record=m.record,
             tier=m.sandbox_tier,
             limits=m.limits,
+            replays=m.replays,
+            as_in=m.as_in,
         )
+
+    def split_hashes(self, m: operator.DescribeEnvironment) -> dict[str, str]:
+        """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits."""
+        try:
+            suite = catalogue.suite_of(m.env)
+            return self._source.splits(
+                suite.name, m.env, self._counts(suite, m.n_validation, m.n_heldout)
+            ).hashes()
+        except ConfigError as error:
+            raise RefusedError("invalid_settings", str(error)) from error
 
     def run_waited(self, m: operator.WaitRun, request: int, stimulus: str) -> AnyEvent:
         return events.RunWaited(stimulus_id=stimulus, request=request, run=m.run, wait_s=_wait(m.wait_s))
@@ -348,6 +361,29 @@ class Intake:
         if self._source.from_files:
             return {split: n for split, n in asked.items() if n is not None}
         return {split: _or(asked[split], n) for split, n in usual.items()}
+
+    def _check_again(self, m: operator.Evaluate, n: int) -> None:
+        """Whether what is to be played again is told without contradiction."""
+        if m.replays and (m.bundle is not None or len(m.replays) != n):
+            raise RefusedError(
+                "bad_message", f"{len(m.replays)} recordings for {n} cases, or a bundle beside them"
+            )
+        for ref in m.replays:
+            if not (is_digest(ref.digest) and self._blobs.has(ref.digest)):
+                raise RefusedError(
+                    "missing_blob", f"blob {ref.digest[:64]!r} is not stored here; upload it first"
+                )
+        place = m.as_in
+        if place is None:
+            return
+        whole = len(place.env_instances)
+        fits = len(place.indexes) == n and all(0 <= index < whole for index in place.indexes)
+        if not fits or not 1 <= place.modulo <= _MAX_COUNT or not -1 <= place.submit_index <= _MAX_COUNT:
+            raise RefusedError(
+                "bad_message", f"{n} cases do not fit the list of {whole} they are said to be of"
+            )
+        if place.policy_scope == "submit" and m.bundle is not None and place.indexes != tuple(range(whole)):
+            raise RefusedError("bad_message", "with policy scope submit only whole submits are played again")
 
     def _check_bundle(self, digest: str | None) -> None:
         if digest is not None and not (is_digest(digest) and self._blobs.has(digest)):

@@ -26,12 +26,12 @@ import structlog
 from evopolicy_common import bundles, codec
 from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.worker import BlobGet, BlobPut, Message, Refused
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answer, Answers
 from evopolicy_coordinator.claims import Claims
 from evopolicy_coordinator.core.effects import Effect, Log, ReadEvaluation, ReadFinished, ReadResults, Reply
-from evopolicy_coordinator.core.events import AnyEvent, LivenessLost
+from evopolicy_coordinator.core.events import AnyEvent, EvaluationRequested, LivenessLost
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.core.workers import Worker
@@ -173,6 +173,16 @@ class Service:
             self._spawn(self._serve_claim(query, message))
         elif isinstance(message, operator.StatusRequest):
             query.reply(codec.encode(self._status(core)), _lane(parsed.asker))
+        elif isinstance(message, operator.RecordedRequest):
+            self._answers.recorded(message, _answer_to(query, parsed.asker))
+        elif isinstance(message, operator.DescribeEnvironment):
+            offering = [
+                each for each in core.fleet.workers.values() if message.env in each.profile.descriptions
+            ]
+            fingerprints = tuple(
+                {repr(each.profile.fingerprint): each.profile.fingerprint for each in offering}.values()
+            )
+            self._spawn(self._serve_description(query, message, fingerprints))
         elif isinstance(message, _READS_FILES):
             self._spawn(self._serve_from_thread(query, parsed))
         else:
@@ -194,7 +204,7 @@ class Service:
         request = self._admit(query, parsed)
         stimulus = self._stimulus_of(parsed.message)
         try:
-            event = await asyncio.to_thread(self._intake.event, parsed, request, stimulus)
+            event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
         except RefusedError as error:
             self._take(request)
             self._refuse(query, error)
@@ -207,6 +217,35 @@ class Service:
         if request in self._pending:  # else the core was dropped meanwhile, and the query with it
             self._handle(event)
             self._flush()
+
+    def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
+        event = self._intake.event(parsed, request, stimulus)
+        if isinstance(event, EvaluationRequested) and event.as_in is not None and event.as_in.run:
+            # The policy seeds of the run itself; the secret they come from does not leave.
+            secret = self._answers.finished_secret(event.as_in.run)
+            return event if secret is None else msgspec.structs.replace(event, secret=secret)
+        return event
+
+    async def _serve_description(
+        self,
+        query: IncomingQuery,
+        message: operator.DescribeEnvironment,
+        fingerprints: tuple[Fingerprint, ...],
+    ) -> None:
+        """What is here for playing a run's episodes again."""
+        try:
+            hashes = await asyncio.to_thread(self._intake.split_hashes, message)
+            secret = await asyncio.to_thread(self._answers.finished_secret, message.run)
+        except RefusedError as error:
+            self._refuse(query, error)
+        except Exception:
+            log.exception("request failed", key=query.key)
+            query.drop()
+        else:
+            known = operator.EnvironmentState(
+                split_hashes=hashes, knows_run=secret is not None, fingerprints=fingerprints
+            )
+            query.reply(codec.encode(known))
 
     async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
         """Claims are beside the core: what they decide changes no run."""
@@ -242,10 +281,10 @@ class Service:
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":
             worker = _check_session(core, parsed.asker, message.token)
-            held = (lease.job.group.template.bundle for lease in worker.leases.values())
-            if message.digest not in held:
+            if not any(lease.job.names_blob(message.digest) for lease in worker.leases.values()):
                 raise RefusedError(
-                    "unknown_blob", f"worker {parsed.asker!r} holds no job of bundle {message.digest[:64]!r}"
+                    "unknown_blob",
+                    f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
                 )
         run = parsed.asker if parsed.room == "gw" else None
         self._answers.get(run, message, _answer_to(query, parsed.asker))

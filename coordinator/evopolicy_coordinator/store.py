@@ -72,6 +72,7 @@ SCHEMA_VERSION = len(_MIGRATIONS)
 _encode = msgspec.msgpack.Encoder().encode
 _outcomes = msgspec.msgpack.Decoder(OutcomeRow)
 _heads = msgspec.msgpack.Decoder(OutcomeHead)
+_runs = msgspec.msgpack.Decoder(RunRow)
 _submits = msgspec.msgpack.Decoder(SubmitRow)
 _finished = msgspec.msgpack.Decoder(FinishedRow)
 
@@ -236,6 +237,10 @@ class Reader:
         """What came of a run; None while it is not finished."""
         row = self._one(_finished, "SELECT data FROM finished WHERE run = ?", (run,))
         return None if row is None else row.result
+
+    def run(self, run: str) -> RunRow | None:
+        """The run as it was created; None for an unknown one."""
+        return self._one(_runs, "SELECT data FROM runs WHERE run = ?", (run,))
 
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""

@@ -235,6 +235,12 @@ def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: fr
         if row.bundle is not None and row.evaluation not in old_evaluations
     }
     named |= {
+        ref.digest
+        for row in _decoded(db, _evaluations, "SELECT data FROM evaluations")
+        if row.evaluation not in old_evaluations
+        for ref in row.replays
+    }
+    named |= {
         digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
     }
     hidden = "SELECT data FROM outcomes WHERE grp NOT LIKE '%/train'"

@@ -4,6 +4,8 @@ Rules:
 - The policy is given observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, an info.
 - A policy that fails is replaced for the rest of the episode by uniform random actions keyed by the policy seed, and
   every row with such an action says `policy_failed`. An action outside the space is repaired and its row marked.
+- A recording that is played again takes the policy's place: its actions, to its last step; then the episode stops,
+  whether or not the environment ended it.
 - What the policy did is a result; what the environment or the sandbox did wrong is raised.
 """
 
@@ -33,7 +35,7 @@ from evopolicy_common.messages.episode import (
     PolicyFailure,
     ResourceLimits,
 )
-from evopolicy_common.trajectory import Recorder
+from evopolicy_common.trajectory import Recorder, decode
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
@@ -291,7 +293,8 @@ class _Episode:
         codec = environment.action_codec
         repair, step, append = codec.repair, environment.step, recorder.append
         actions_only = self._job.record == "actions"
-        rng = None if policy is not None else random_actions(self._spec.policy_seed)
+        recorded = _recorded_actions(self._spec)
+        rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
         failed = self._job.bundle is not None and policy is None
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
@@ -309,6 +312,9 @@ class _Episode:
                     rng = random_actions(self._spec.policy_seed)
             if rng is not None:
                 action = returned = codec.sample(rng)
+            elif recorded is not None:
+                returned = recorded[t]
+                action, invalid = repair(returned)
             next_obs, reward, terminated, truncated, info = step(action)
             for name in names:
                 sums[name] += _number(info.get(name))
@@ -320,7 +326,7 @@ class _Episode:
             total += reward
             t += 1
             progress.steps += 1
-            if terminated or truncated:
+            if terminated or truncated or (recorded is not None and t == len(recorded)):
                 break
             if progress.cancelled:
                 raise CancelledJobError
@@ -335,6 +341,18 @@ def random_actions(policy_seed: bytes) -> np.random.Generator:
     """The generator of the uniform random actions that play in place of a policy."""
     digest = hashlib.sha256(b"evopolicy random actions\0" + policy_seed).digest()
     return np.random.default_rng(int.from_bytes(digest, "little"))
+
+
+def _recorded_actions(spec: EpisodeSpec) -> list[Any] | None:
+    """The actions that are played again, at least one; None where a policy acts."""
+    if spec.replay is None:
+        return None
+    if spec.replay.inline is None:
+        raise WorkerError(f"episode {spec.index} came without the recording that it plays")
+    actions = [row.action for row in decode(spec.replay.inline).rows()]
+    if not actions:
+        raise WorkerError(f"episode {spec.index}: its recording has no step")
+    return actions
 
 
 def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:

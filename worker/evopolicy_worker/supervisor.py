@@ -297,7 +297,7 @@ class Supervisor:
                     await stack.enter_async_context(self._bundles.use(job.bundle)) if job.bundle else None
                 )
                 self._capacity_freed.set()
-                outcomes = await slot.play(job, folder, on_progress)
+                outcomes = await slot.play(await self._with_recordings(job), folder, on_progress)
             self._warm_environments[job.env] = None
             if lease.lease_id in self._cancelled:
                 self._put_result(lease, "returned")
@@ -323,6 +323,19 @@ class Supervisor:
             self._cancelled.discard(lease.lease_id)
             self._capacity_freed.set()
         return healthy
+
+    async def _with_recordings(self, job: Job) -> Job:
+        """The job with the recordings that it plays again inline."""
+        if all(spec.replay is None or spec.replay.inline is not None for spec in job.episodes):
+            return job
+        specs = []
+        for spec in job.episodes:
+            ref = spec.replay
+            if ref is not None and ref.inline is None:
+                data = await self._ask.download(self._options.name, self._session, ref.digest)
+                spec = msgspec.structs.replace(spec, replay=msgspec.structs.replace(ref, inline=data))
+            specs.append(spec)
+        return msgspec.structs.replace(job, episodes=tuple(specs))
 
     async def _fetch_bundle(self, digest: str) -> bytes:
         return await self._ask.download(self._options.name, self._session, digest)

@@ -61,6 +61,16 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 
 
+class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
+    """Names bytes in a content-addressed store, or carries them where they are few."""
+
+    digest: str
+    """SHA-256 of the bytes, lowercase hex."""
+    size: int
+    inline: bytes | None = None
+    """The bytes themselves; None when they must be fetched by digest."""
+
+
 class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """One episode to play."""
 
@@ -71,6 +81,9 @@ class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     case: Case
     policy_seed: bytes
     """16 bytes that seed the policy process's generators and the random actions that replace a failed policy."""
+    replay: BlobRef | None = None
+    """A trajectory (of either record) whose actions are played in place of a policy's, to see whether the environment
+    answers as it did; None for an episode of the job's own policy."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -93,16 +106,6 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     tier: Tier = "bwrap"
     """The sandbox tier that the run demands."""
     limits: ResourceLimits = ResourceLimits()
-
-
-class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
-    """Names bytes in a content-addressed store, or carries them where they are few."""
-
-    digest: str
-    """SHA-256 of the bytes, lowercase hex."""
-    size: int
-    inline: bytes | None = None
-    """The bytes themselves; None when they must be fetched by digest."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
-from evopolicy_common.messages.episode import EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
 from evopolicy_common.messages.worker import (
     BlobAck,
@@ -128,6 +128,25 @@ class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
     finished: RunFinished | None = None
 
 
+class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
+    """Where episodes that are played again stood when a run played them: the policy is told the same."""
+
+    run: str
+    """The coordinator's id of the run; its policy seeds are used where the coordinator knows it. May be empty."""
+    submit_index: int
+    """-1 for the random reference."""
+    env_instances: tuple[int, ...]
+    """The whole list of cases that they were part of, in order."""
+    indexes: tuple[int, ...]
+    """Their positions in that list."""
+    modulo: int
+    """Episodes of the checkpoint's own submit: episode indexes count modulo this."""
+    remaining_budget_after: int
+    policy_scope: PolicyScope = "episode"
+    """With `submit`, `indexes` must be the whole list."""
+    observations: ObservationForm = "arrays"
+
+
 class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     """Play cases outside any run: `evopolicy try`, `evopolicy random`."""
 
@@ -142,6 +161,41 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     record: Record = "full"
     sandbox_tier: Tier = "bwrap"
     limits: ResourceLimits = ResourceLimits()
+    replays: tuple[BlobRef, ...] = ()
+    """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded before, `bundle` None."""
+    as_in: PlayedAs | None = None
+    """None for what was not played in a run before."""
+
+
+class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):
+    """What a cluster has for playing a finished run's episodes again."""
+
+    token: str
+    env: str
+    run: str = ""
+    n_validation: int | None = None
+    n_heldout: int | None = None
+    """Of the run, where they were not the suite's own."""
+
+
+class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_state"):
+    split_hashes: dict[str, str]
+    """SHA-256 by split name: equal to a run's where the cases are the same."""
+    knows_run: bool
+    """The run is finished here, and its episodes' records may still be stored."""
+    fingerprints: tuple[Fingerprint, ...]
+    """Of the connected workers that offer the environment, each once."""
+
+
+class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
+    """Outcomes of a finished run's episodes as they were stored; answered with an `EvaluationPage`."""
+
+    token: str
+    run: str
+    split: Split
+    submit_index: int
+    """-1 for the random reference."""
+    cursor: int
 
 
 class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_started"):
@@ -275,6 +329,8 @@ OperatorRequest = (
     | WaitRun
     | Evaluate
     | EvaluationPoll
+    | DescribeEnvironment
+    | RecordedRequest
     | CancelRun
     | RepinRun
     | SetWorker
@@ -288,6 +344,7 @@ OperatorReply = (
     | RunProgress
     | EvaluationStarted
     | EvaluationPage
+    | EnvironmentState
     | Done
     | ClaimState
     | StatusReply

@@ -1,4 +1,4 @@
-"""Evaluations: cases that an operator has played outside any run (`try`, `random`).
+"""Evaluations: cases that an operator has played outside any run (`try`, `random`), or again (`verify`).
 
 Rules that this module owns: no budget is concerned; the same key gives the same evaluation; a bundle that brings its slots
 down too often ends its evaluation with that word.
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from evopolicy_common.messages import operator
+from evopolicy_common.messages.environment import PolicyScope
 
 from . import events
 from .effects import ReadEvaluation
@@ -62,6 +63,8 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
         record=event.record,
         tier=event.tier,
         limits=event.limits,
+        replays=event.replays,
+        as_in=event.as_in,
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )
@@ -82,29 +85,42 @@ def enter(core: Core, row: EvaluationRow) -> Evaluation:
 def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
     row = evaluation.row
     n = len(row.cases)
+    # What is played again stands where it stood in its run; anything else is a list of its own.
+    place = row.as_in or operator.PlayedAs(
+        run="",
+        submit_index=-1,
+        env_instances=row.case_ids,
+        indexes=tuple(range(n)),
+        modulo=n,
+        remaining_budget_after=0,
+    )
+    scope: PolicyScope = place.policy_scope if row.bundle is not None else "episode"
+    counts = occurrences(place.env_instances)
     template = Template(
         env=row.env,
         bundle=row.bundle,
         cases=row.cases,
         case_ids=row.case_ids,
-        occurrences=occurrences(row.case_ids),
+        occurrences=tuple(counts[index] for index in place.indexes),
         secret=row.secret,
         split=row.split,
-        submit_index=-1,
-        modulo=n,
-        per_job=1,
-        scope="episode",
+        submit_index=place.submit_index,
+        modulo=place.modulo,
+        per_job=place.modulo if scope == "submit" else 1,
+        scope=scope,
         env_meta={
             "env": row.env,
-            "submit_index": 0,
-            "n_episodes_this_submit": n,
-            "remaining_budget_after": 0,
+            "submit_index": max(0, place.submit_index),
+            "n_episodes_this_submit": place.modulo,
+            "remaining_budget_after": place.remaining_budget_after,
         },
-        observations="arrays",
+        observations=place.observations,
         record=row.record,
         video="off",
         tier=row.tier,
         limits=row.limits,
+        replays=row.replays,
+        indexes=place.indexes,
     )
     group = JobGroup(
         id=evaluation_group(row.evaluation),

@@ -17,8 +17,8 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
-from evopolicy_common.messages.episode import PolicyFailure, Record, ResourceLimits, Tier
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.episode import BlobRef, PolicyFailure, Record, ResourceLimits, Tier
+from evopolicy_common.messages.operator import PlayedAs, RunSettings
 from evopolicy_common.messages.worker import Fingerprint, HeldLease, JobResult
 
 RequestId = int | str
@@ -94,6 +94,9 @@ class EvaluationRequested(Event, frozen=True, kw_only=True):
     record: Record
     tier: Tier
     limits: ResourceLimits = ResourceLimits()
+    replays: tuple[BlobRef, ...] = ()
+    """Recorded actions for each case, in place of a policy; empty for none."""
+    as_in: PlayedAs | None = None
 
 
 class EvaluationPolled(Event, frozen=True, kw_only=True):

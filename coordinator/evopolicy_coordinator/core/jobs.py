@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import (
+    BlobRef,
     EpisodeOutcome,
     EpisodeSpec,
     FailureCategory,
@@ -82,6 +83,10 @@ class Template:
     video: VideoOption
     tier: Tier
     limits: ResourceLimits
+    replays: tuple[BlobRef, ...] = ()
+    """Recorded actions for each index, in place of a policy; empty for none."""
+    indexes: tuple[int, ...] = ()
+    """For each index the one that it had in the list it was taken from; empty where it is the same."""
 
 
 @dataclass(slots=True, eq=False)
@@ -114,6 +119,12 @@ class JobState:
     """When it last began to wait."""
     holders: dict[int, str] = field(default_factory=dict)
     """Attempts of this incarnation and who got them."""
+
+    def names_blob(self, digest: str) -> bool:
+        """Whether its worker needs the blob: the bundle, or a recording that it plays."""
+        template = self.group.template
+        recordings = template.replays[self.first : self.first + self.n]
+        return digest == template.bundle or any(ref.digest == digest for ref in recordings)
 
 
 @dataclass(slots=True, eq=False)
@@ -195,7 +206,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
     episodes = tuple(
         EpisodeSpec(
             index=index,
-            episode_index=index % template.modulo,
+            episode_index=(template.indexes[index] if template.indexes else index) % template.modulo,
             case=template.cases[index],
             policy_seed=policy_seed(
                 template.secret,
@@ -204,6 +215,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
                 template.case_ids[index],
                 template.occurrences[index],
             ),
+            replay=template.replays[index] if template.replays else None,
         )
         for index in range(job.first, job.first + job.n)
     )

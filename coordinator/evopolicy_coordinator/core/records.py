@@ -15,6 +15,7 @@ import msgspec
 
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
 from evopolicy_common.messages.episode import (
+    BlobRef,
     EpisodeOutcome,
     FailureCategory,
     PolicyFailure,
@@ -23,7 +24,7 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
-from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.messages.operator import PlayedAs, RunFinished, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
 Phase = Literal["open", "closed", "finished"]
@@ -159,6 +160,8 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     finished: bool = False
     error: str = ""
     """Why it ended early (the policy brought its slot down too often); empty when it ran through."""
+    replays: tuple[BlobRef, ...] = ()
+    as_in: PlayedAs | None = None
 
 
 class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
