@@ -21,12 +21,17 @@ STOPPED = (
     *("find the cluster's processes", "knock at the coordinator's socket", "open a Zenoh session"),
     *("connect to a port of this machine", "connect to an abstract socket", "ask the proxy for another port"),
     *("import a simulator", "find a simulator's files", "send to the world", "list the runs"),
+    *("open a socket to the machine below", "open a ring that makes sockets"),
     *("read another process's variables", "change the kernel's settings"),
 )
 HOME = "read the operator's home"
 NEEDS_MORE_THAN_NO_JAIL = {
     *("mount over feedback", "send to the world", "change the kernel's settings"),
-    "read another process's variables",
+    *(
+        "read another process's variables",
+        "open a socket to the machine below",
+        "open a ring that makes sockets",
+    ),
 }
 """Whether they succeed without a jail depends on the machine: on root, on a route, on what processes keep to themselves."""
 
