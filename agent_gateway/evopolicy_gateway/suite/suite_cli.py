@@ -73,10 +73,7 @@ def suite(
     data: options.DataFolder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
-    """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was.
-
-    Example: evopolicy suite core16.toml --connect tcp/10.0.0.5:7447
-    """
+    """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was."""
     with fail_on_our_errors():
         if local and (connect or credentials_file):
             raise ConfigError("--local brings up a cluster of its own; it does not go with --connect")

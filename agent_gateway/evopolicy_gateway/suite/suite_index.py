@@ -20,6 +20,8 @@ from evopolicy_gateway.suite.suite_file import SuiteRun
 SCHEMA_VERSION = 1
 FILE_NAME = "suite.json"
 
+_NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
+
 State = Literal["pending", "running", "completed", "no_ok_submit", "error"]
 FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
@@ -82,6 +84,13 @@ def save(root: Path, index: Index) -> None:
     write_atomically(root / FILE_NAME, msgspec.json.format(msgspec.json.encode(index), indent=2) + b"\n")
 
 
+def state_of(record: RunRecord) -> State:
+    """How a sweep takes a finished run: one whose agent failed before it used any budget was no run of that agent."""
+    outcome = record.outcome
+    failed = outcome.closed_reason == "agent_failed" and outcome.budget_used == 0
+    return "error" if failed else outcome.status
+
+
 def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path, **more: Any) -> Entry:
     """What the index tells of a finished run."""
     outcome = record.outcome
@@ -91,7 +100,7 @@ def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path
         agent=suite_run.agent,
         env=suite_run.settings.env,
         repeat=suite_run.settings.repeat,
-        state=outcome.status,
+        state=state_of(record),
         attempt=record.attempt,
         directory=str(directory.relative_to(root.absolute())),
         score=outcome.final_score,
@@ -99,7 +108,7 @@ def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path
         n_submits=len(outcome.val_scores),
         budget_used=outcome.budget_used,
         tokens=None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens),
-        error=outcome.error,
+        error=outcome.error or (_NO_RUN if state_of(record) == "error" else None),
         wall_s=record.timing.wall_s,
         finished_at=record.timing.finished_at,
         **more,

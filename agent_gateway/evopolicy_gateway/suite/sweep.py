@@ -296,7 +296,7 @@ async def look(run: SuiteRun, root: Path, started_in: Path, index: Index, operat
     folder = run.folder(root)
     status: str | None = None
     with contextlib.suppress(OSError, EvopolicyError):
-        status = decode_run_record(folder.run_json.read_bytes()).outcome.status
+        status = suite_index.state_of(decode_run_record(folder.run_json.read_bytes()))
     opened = status is None and folder.opened.exists() and folder.credentials.exists()
     phase: str | None = None
     has_session = False

@@ -269,6 +269,26 @@ def test_a_dead_hosts_runs_are_taken_over(tmp_path: Path, operator_file: Path) -
         wait_until(lambda: "begins" in two.text, two)
 
 
+def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
+    tmp_path: Path, operator_file: Path
+) -> None:
+    write_suite(tmp_path, claude="bad_key,work")
+    arguments = ("--credentials", str(operator_file), "--only", "fake claude/*")
+    root = tmp_path / "runs" / "t"
+    with sweep(tmp_path, *arguments) as first:
+        assert first.finish() == 1, first.text
+        assert "401" in first.text
+    (entry,) = index_in(root).values()
+    assert entry["state"] == "error"
+    assert "before its first submit" in entry["error"]
+    # What the fake plays is told by its settings, which make another run of it.
+    write_suite(tmp_path, claude="work")
+    with sweep(tmp_path, *arguments, "--changed", "rerun") as second:
+        assert second.finish() == 0, second.text
+    (entry,) = index_in(root).values()
+    assert (entry["state"], entry["attempt"]) == ("completed", 2)
+
+
 def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file: Path) -> None:
     write_suite(tmp_path)
     arguments = ("--credentials", str(operator_file), "--only", "evolve/*", "--json")
