@@ -25,6 +25,8 @@ _ETC = (
     *("localtime", "magic", "mime.types", "nsswitch.conf", "os-release", "passwd", "pki", "profile"),
     *("protocols", "services", "ssl", "terminfo", "timezone"),
 )
+_PRIVATE = ("/etc/ssl/private", "/etc/pki/tls/private")
+"""The machine's own keys, which root may read."""
 _COVERED = ("/proc/sys", "/proc/sysrq-trigger", "/proc/irq", "/proc/bus")
 
 
@@ -139,6 +141,9 @@ def _system(open_network: bool) -> list[str]:
             words += ["--ro-bind", path, path]
     for name in (*_ETC, *(["resolv.conf"] if open_network else [])):
         words += ["--ro-bind-try", f"/etc/{name}", f"/etc/{name}"]
+    for path in _PRIVATE:
+        if os.path.isdir(path):
+            words += ["--tmpfs", path]
     return words
 
 
