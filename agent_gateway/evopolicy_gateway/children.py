@@ -9,11 +9,13 @@ import asyncio
 import contextlib
 import os
 import signal
+import weakref
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 import msgspec
 
+from evopolicy_gateway import processes
 from evopolicy_gateway.control import AnyEvent, Order, event_of, line
 from evopolicy_gateway.leash import leashed
 
@@ -23,13 +25,28 @@ live: set[int] = set()
 """Ids of the running children of this process, which its search for orphans leaves alone."""
 
 
+_locks: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = weakref.WeakKeyDictionary()
+
+
+def _starting() -> asyncio.Lock:
+    return _locks.setdefault(asyncio.get_running_loop(), asyncio.Lock())
+
+
+async def end_orphans() -> None:
+    """Ends what has become this process's child by its parent's death.
+
+    No child is started meanwhile: between its birth and its place in `live` it would be taken for an orphan.
+    """
+    async with _starting():
+        await asyncio.to_thread(processes.end_orphans, frozenset(live))
+
+
 class Child:
     """A running child. Start it on the main thread: its leash is that thread's life."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
         self._process = process
         self.log = log
-        live.add(process.pid)
 
     @classmethod
     async def start(cls, program: Sequence[str], log: Path, *, talks: bool = False) -> Child:
@@ -37,17 +54,21 @@ class Child:
         log.parent.mkdir(parents=True, exist_ok=True)
         pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
         with log.open("ab") as out:
-            process = await asyncio.create_subprocess_exec(
-                *leashed(program),
-                stdin=pipe,
-                stdout=pipe,
-                stderr=out,
-                start_new_session=True,
-                limit=_LINE_LIMIT,
-                env={
-                    name: value for name, value in os.environ.items() if not name.startswith("EVOPOLICYGYM_")
-                },
-            )
+            async with _starting():
+                process = await asyncio.create_subprocess_exec(
+                    *leashed(program),
+                    stdin=pipe,
+                    stdout=pipe,
+                    stderr=out,
+                    start_new_session=True,
+                    limit=_LINE_LIMIT,
+                    env={
+                        name: value
+                        for name, value in os.environ.items()
+                        if not name.startswith("EVOPOLICYGYM_")
+                    },
+                )
+                live.add(process.pid)
         return cls(process, log)
 
     @property

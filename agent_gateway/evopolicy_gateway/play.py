@@ -23,7 +23,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord
-from evopolicy_gateway import children, control, processes, record
+from evopolicy_gateway import children, control, record
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
     AgentDoing,
@@ -205,7 +205,7 @@ class RunPlay:
             for child in (self._keeper, self._gateway):
                 if child is not None:
                     await child.end(END_GRACE_S)
-            await asyncio.to_thread(processes.end_orphans, frozenset(children.live))
+            await children.end_orphans()
         return time.monotonic() - started
 
     async def _close(self, ended: AgentEnded) -> None:
@@ -297,7 +297,7 @@ class RunPlay:
                 ended = event
         await self._keeper.ended()
         # What a keeper that died has left behind has become ours.
-        await asyncio.to_thread(processes.end_orphans, frozenset(children.live))
+        await children.end_orphans()
         return ended
 
     async def _finish(self, run: str) -> RunFinished:

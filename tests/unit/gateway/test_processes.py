@@ -102,3 +102,36 @@ def test_a_program_that_is_not_there_is_told_in_one_line() -> None:
     done = subprocess.run(leash.leashed(["/no/such/program"]), capture_output=True, text=True, check=False)
     assert done.returncode == 127
     assert done.stderr == "cannot start /no/such/program: No such file or directory\n"
+
+
+BREEDER = """
+import os, sys, time
+# Starts a process at every moment, and tells if one of them was touched.
+while not os.path.exists(sys.argv[1]):
+    pid = os.fork()
+    if pid == 0:
+        time.sleep(0.002)
+        os._exit(0)
+    _, status = os.waitpid(pid, os.WUNTRACED)
+    if status:
+        open(sys.argv[2], "w").write(str(status))
+        break
+"""
+
+SEARCHER = """
+import subprocess, sys
+from evopolicy_gateway import processes
+processes.become_subreaper()
+breeder = subprocess.Popen([sys.executable, "-c", sys.argv[1], *sys.argv[2:]])
+for _ in range(400):
+    processes.end_orphans({breeder.pid})
+open(sys.argv[2], "w").close()
+sys.exit(breeder.wait())
+"""
+
+
+def test_what_a_spared_process_starts_meanwhile_is_spared_too(tmp_path: Path) -> None:
+    done, touched = tmp_path / "done", tmp_path / "touched"
+    command = [sys.executable, "-c", SEARCHER, BREEDER, str(done), str(touched)]
+    assert subprocess.run(command, timeout=60, check=False).returncode == 0
+    assert not touched.exists()
