@@ -1,0 +1,131 @@
+"""`evopolicy verify` on runs that were really played: untouched ones are identical, tampered ones are found out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+VERIFY = (
+    "from evopolicy_common.cli import run_app; from evopolicy_coordinator.verify_cli import app; run_app(app)"
+)
+AGENT = """
+import json, os, urllib.request
+with open("system/policy.py", "w") as file:
+    file.write('''
+import random
+import numpy as np
+
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        self.space = action_space
+    def reset(self, episode_index):
+        self.scale = 0.5 + episode_index / 4
+    def act(self, obs):
+        if self.space["type"] == "Discrete":
+            return random.randrange(self.space["n"])
+        return np.random.uniform(-1, 1, self.space["shape"]) * self.scale
+''')
+request = urllib.request.Request(
+    os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": [0, 1, 1]}).encode()
+)
+urllib.request.urlopen(request).read()
+"""
+ENVIRONMENTS = ("toy/line", "gym/acrobot")
+
+
+class Played:
+    """A state folder, and the runs that were made with it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.state = root / "st"
+        agent = root / "agent.py"
+        agent.write_text(AGENT)
+        command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--jail", "none", "--budget", "3"]
+        command += ["--agent", f"command:{sys.executable} {agent}", "--validation", "1", "--heldout", "2"]
+        command += ["--state", str(self.state)]
+        for env in ENVIRONMENTS:
+            command += ["--env", env]
+        done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=150, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    def run(self, env: str) -> Path:
+        return next(self.root.glob(f"runs/*/{env.replace('/', '_')}/*/run.json")).parent
+
+    def verify(self, run: Path, *options: str, state: bool = True) -> subprocess.CompletedProcess[str]:
+        where = ["--local", *(["--state", str(self.state)] if state else [])]
+        command = [sys.executable, "-c", VERIFY, str(run), "--json", *where, *options]
+        return subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    return Played(tmp_path_factory.mktemp("verify"))
+
+
+def tampered(run: Path, target: Path, step: int, **changes: Any) -> Path:
+    """A copy of the run with one row of its first episode changed."""
+    shutil.copytree(run, target)
+    path = next(target.glob("workspace/feedback/submit_000/episodes/ep_000/trajectory.jsonl"))
+    path.chmod(0o644)
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    rows[step] |= changes
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return target
+
+
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: str) -> None:
+    done = played.verify(played.run(env))
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert report["identical"]
+    assert report["episodes"] == 3 + 1 + 2 + 2  # train, validation, held-out, random reference
+    assert report["policy_episodes"] == 3
+    assert not report["policy_differences"]
+    assert not report["not_checked"]
+    assert not report["fingerprint_differences"]
+
+
+def test_a_tampered_reward_is_found(played: Played, tmp_path: Path) -> None:
+    run = tampered(played.run("gym/acrobot"), tmp_path / "run", 4, reward=-0.5)
+    done = played.verify(run, "--no-policy")
+    assert done.returncode == 1, done.stdout + done.stderr
+    (found,) = json.loads(done.stdout)["differences"]
+    assert found["episode"] == "submit 0, ep_000"
+    assert "step 4: reward" in found["difference"]
+
+
+def test_without_the_coordinators_records_a_tampered_action_shows_in_what_comes_of_it(
+    played: Played, tmp_path: Path
+) -> None:
+    run = tampered(played.run("toy/line"), tmp_path / "run", 0, action=[0.9])
+    record = json.loads((run / "run.json").read_text())
+    record["run"] = "r-unknown"
+    record["versions"]["fingerprint"]["numpy"] = "1.0"
+    (run / "run.json").write_text(json.dumps(record))
+    done = played.verify(run)
+    assert done.returncode == 1, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert {found["episode"] for found in report["differences"]} == {"submit 0, ep_000"}
+    assert report["from_files"] == report["episodes"] == 3
+    assert any(text.startswith("numpy: 1.0 in the run") for text in report["fingerprint_differences"])
+
+
+def test_a_cluster_with_other_cases_says_so_and_stops(played: Played) -> None:
+    done = played.verify(played.run("toy/line"), state=False)
+    assert done.returncode == 2
+    assert "train cases of toy/line are not the run's" in done.stderr
+
+
+def test_a_folder_without_a_run_is_wrong_usage(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", VERIFY, str(tmp_path), "--local"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "no finished run's directory" in done.stderr
