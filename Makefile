@@ -2,6 +2,8 @@
 # make test   installs, then runs every test
 # make check  ruff and mypy
 # make bench  what an episode costs, beside a bare loop
+# make bench-throughput   episodes per second through the coordinator
+# make faults real processes killed, frozen and starved through whole runs
 # make sim    the coordinator's core under a simulated network with faults
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +12,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench sim clean
+.PHONY: help install demo test check bench bench-throughput faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -40,6 +42,14 @@ check: install
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 bench: install
 	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/runtime_bench.py $(ARGS)
+
+# Episodes per second through coordinator and Zenoh, beside Dask's no-op tasks.
+bench-throughput: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/throughput.py $(ARGS)
+
+# Real processes killed, frozen and starved: what is hit × when → outcome. More instants: ARGS="--fault-seeds 4"
+faults: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/faults/fault_matrix.py $(ARGS)
 
 # The coordinator's core under seeded faults, then 2,000 workers; one seed again: make sim ARGS="--seed 17 --trace"
 sim: install

@@ -18,6 +18,7 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.run_difference import differences
 from evopolicy_gateway import harnesses, options, processes, trials
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.options import RunOptions
@@ -242,6 +243,24 @@ def play_random(
             raise ConfigError(f"--split {split!r}: there are train, validation, heldout")
         where = _trial_cluster(connect, credentials_file, slots, state, data)
         _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+
+
+@app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
+def diff_runs(
+    left: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="A run directory.")],
+    right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
+) -> None:
+    """Says where two runs differ, leaving out times, logs and what else may differ between equal runs.
+
+    Exit code 0 when they are equal, 1 when they are not.
+    """
+    found = differences(left, right)
+    if as_json:
+        typer.echo(msgspec.json.encode(found).decode())
+    else:
+        typer.echo("\n".join(found) if found else "no difference (times and logs aside)")
+    raise typer.Exit(1 if found else 0)
 
 
 app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_suite)

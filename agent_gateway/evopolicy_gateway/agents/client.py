@@ -91,7 +91,9 @@ class Client:
         if status == 400:
             refusal = self._json(answer)
             error = refusal.get("error") or {}
-            return Refusal(status=str(refusal.get("status", "refused")), message=str(error.get("message", "")))
+            return Refusal(
+                status=str(refusal.get("status", "refused")), message=str(error.get("message", ""))
+            )
         reply = self._expect_json(status, answer)
         return self._await(reply)
 

@@ -75,7 +75,9 @@ class Agent:
             self._next_case = first_case
             self._play_population(f"final {number}", [self._search.finalist()], n_episodes=spend)
 
-    def _play_population(self, title: str, candidates: list[Candidate], n_episodes: int | None = None) -> None:
+    def _play_population(
+        self, title: str, candidates: list[Candidate], n_episodes: int | None = None
+    ) -> None:
         """One submit in which the candidates take turns: each of them on the same case, then on the next one."""
         total = max(n_episodes or len(candidates), self._bounds[0])
         total = min(total, self._bounds[1], self._budget)
@@ -101,7 +103,9 @@ class Agent:
         self._learn(verdict, candidates, schedule, cases)
         self._report(title, verdict, candidates)
 
-    def _learn(self, verdict: Verdict, candidates: list[Candidate], schedule: list[int], cases: list[int]) -> None:
+    def _learn(
+        self, verdict: Verdict, candidates: list[Candidate], schedule: list[int], cases: list[int]
+    ) -> None:
         returns = verdict.summary.get("returns")
         if verdict.status != "ok" or not returns:
             return

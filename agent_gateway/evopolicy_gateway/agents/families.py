@@ -63,7 +63,9 @@ def families_for(obs_space: Schema, action_space: Schema) -> list[Family]:
     if action_space["type"] == "Discrete":
         families.append(_explorer(n_outputs))
     if n_features:
-        families.append(_bang_bang(n_outputs, _switchable(obs_space, n_features), n_features, chooses=chooses))
+        families.append(
+            _bang_bang(n_outputs, _switchable(obs_space, n_features), n_features, chooses=chooses)
+        )
         families.append(_linear(n_outputs, n_features))
     if n_outputs:
         families.append(_oscillator(count("oscillator"), n_outputs))
@@ -175,7 +177,9 @@ def _bang_bang(n_outputs: int, switchable: list[int], n_features: int, *, choose
 
 
 def _oscillator(size: int, n_outputs: int) -> Family:
-    spread = np.concatenate([[0.7], np.full(n_outputs, 0.6), np.full(n_outputs, 0.7), np.full(n_outputs, 0.3)])
+    spread = np.concatenate(
+        [[0.7], np.full(n_outputs, 0.6), np.full(n_outputs, 0.7), np.full(n_outputs, 0.3)]
+    )
     centre = np.zeros(size)
     centre[1 : 1 + n_outputs] = 0.5
     return Family(

@@ -27,7 +27,9 @@ class Step:
     terminated: bool
 
 
-def episode_folders(workspace: Path, submit_id: str, n_episodes: int, first_global_episode: int) -> list[Path]:
+def episode_folders(
+    workspace: Path, submit_id: str, n_episodes: int, first_global_episode: int
+) -> list[Path]:
     """Folders of the submit's episodes in request order; they need not exist (not-ok submits leave none)."""
     folder = workspace / "feedback" / submit_id / "episodes"
     if not folder.is_dir():

@@ -23,9 +23,7 @@ REACTION_STEPS = 2
 """An action's effect is looked for in the displacement over this many steps."""
 
 
-def find_plant(
-    obs_space: Schema, action_space: Schema, episodes: list[list[Step]]
-) -> dict[str, Any] | None:
+def find_plant(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> dict[str, Any] | None:
     """Settings for the `pusher` and `carrier` controllers, or None where the spaces or the trajectories do not give any."""
     if not goal_keys(obs_space) or action_space["type"] != "Box":
         return None
@@ -57,7 +55,9 @@ def _stack(episodes: list[list[Step]]) -> tuple[Rows, Rows, Rows, Rows, Rows]:
     for steps in episodes:
         seen = [np.array([np.ravel(s.obs[key]) for s in steps], dtype=float) for key in _KEYS]
         acted = np.array([np.ravel(s.action) for s in steps], dtype=float)
-        for part, rows in zip(parts, [*(rows[:-k] for rows in seen), seen[0][k:] - seen[0][:-k]], strict=False):
+        for part, rows in zip(
+            parts, [*(rows[:-k] for rows in seen), seen[0][k:] - seen[0][:-k]], strict=False
+        ):
             part.append(rows)
         parts[4].append(np.mean([acted[i : len(acted) - k + i] for i in range(k)], axis=0))
     observed, achieved, desired, displacement, actions = (np.concatenate(part) for part in parts)

@@ -98,9 +98,7 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
     left = searching - opening
     least = max(4, min_per_submit)
     n_rounds = min(-(-left // max(most, least)), left // least)
-    rounds = tuple(
-        min(left // n_rounds + (i < left % n_rounds), max_per_submit) for i in range(n_rounds)
-    )
+    rounds = tuple(min(left // n_rounds + (i < left % n_rounds), max_per_submit) for i in range(n_rounds))
     return Plan(
         opening=opening,
         rounds=tuple(size for size in rounds if size >= min_per_submit),
@@ -216,7 +214,9 @@ class Search:
             return 2
         if max(len(c.episodes) for c in tried) < 2:
             return 2  # nothing is known of the noise yet
-        last = [c.episodes[-1].episode_return for c in tried if c.episodes[-1].case == tried[-1].episodes[-1].case]
+        last = [
+            c.episodes[-1].episode_return for c in tried if c.episodes[-1].case == tried[-1].episodes[-1].case
+        ]
         tied = last.count(max(last)) > len(last) * TIED_SHARE
         ratio = self._effects(tried)[1]
         return 4 if ratio > VERY_NOISY_RATIO else 2 if tied or ratio > NOISY_RATIO else 1
@@ -342,7 +342,9 @@ def _fit(scores: list[list[tuple[int, float]]]) -> tuple[Vector, float]:
         effect = np.bincount(owner, values - case_effect[cases], n_candidates) / np.bincount(
             owner, minlength=n_candidates
         )
-        case_effect = np.bincount(cases, values - effect[owner], n_cases) / np.bincount(cases, minlength=n_cases)
+        case_effect = np.bincount(cases, values - effect[owner], n_cases) / np.bincount(
+            cases, minlength=n_cases
+        )
         case_effect -= case_effect.mean()
     residual = values - effect[owner] - case_effect[cases]
     freedom = len(values) - n_candidates - n_cases + 1

@@ -104,7 +104,11 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
     """Variables whose values may be secrets: what an agent's settings name for passing on is one whatever its name."""
-    named = {} if config is None else {f"{name}_KEY": environment.get(name, "") for name in config.pass_environment}
+    named = (
+        {}
+        if config is None
+        else {f"{name}_KEY": environment.get(name, "") for name in config.pass_environment}
+    )
     return {**environment, **named}
 
 

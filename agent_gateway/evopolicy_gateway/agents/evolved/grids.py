@@ -59,7 +59,9 @@ class GridSeeker:
 
     PARAMETERS = 3
 
-    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any], rng: np.random.Generator) -> None:
+    def __init__(
+        self, head: ActionHead, vector: Vector, settings: dict[str, Any], rng: np.random.Generator
+    ) -> None:
         self._head, self._rng = head, rng
         self._key = settings["key"]
         self._maps = {int(action): np.array(cells) for action, cells in settings["maps"].items()}

@@ -20,7 +20,9 @@ CANDIDATES_FILE = "candidates.json"
 class Policy:
     """The contract of a run: `__init__(obs_space, action_space, env_meta)`, `reset(episode_index)`, `act(obs)`."""
 
-    def __init__(self, obs_space: dict[str, Any], action_space: dict[str, Any], env_meta: dict[str, Any]) -> None:
+    def __init__(
+        self, obs_space: dict[str, Any], action_space: dict[str, Any], env_meta: dict[str, Any]
+    ) -> None:
         path = Path(__file__).resolve().parent.parent / CANDIDATES_FILE
         plan = json.loads(path.read_text(encoding="utf-8"))
         self._candidates: list[dict[str, Any]] = plan["candidates"]

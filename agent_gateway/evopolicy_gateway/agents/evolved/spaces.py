@@ -42,7 +42,9 @@ def _floats(value: Any) -> list[float]:
 
 def goal_keys(schema: Schema) -> bool:
     """True for the goal convention: a Dict with `observation`, `achieved_goal` and `desired_goal`."""
-    return schema["type"] == "Dict" and {"observation", "achieved_goal", "desired_goal"} <= set(schema["spaces"])
+    return schema["type"] == "Dict" and {"observation", "achieved_goal", "desired_goal"} <= set(
+        schema["spaces"]
+    )
 
 
 class Features:
