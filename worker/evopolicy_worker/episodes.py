@@ -6,6 +6,7 @@ Rules:
   every row with such an action says `policy_failed`. An action outside the space is repaired and its row marked.
 - A recording that is played again takes the policy's place: its actions, to its last step; then the episode stops,
   whether or not the environment ended it.
+- A video is made of the episode's actions after its end (see `video.py`); playing it never draws.
 - What the policy did is a result; what the environment or the sandbox did wrong is raised.
 """
 
@@ -40,6 +41,7 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
 from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
+from evopolicy_worker.recording import VideoRecorder
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Zygote
 
@@ -81,6 +83,7 @@ class Player:
         self._prepared: Child | None = None
         self._n_policies = 0
         self._folders: list[Path] = []
+        self._videos = VideoRecorder()
 
     def play(self, job: Job, folder: str | None, progress: Progress) -> list[EpisodeOutcome]:
         """Play the job's episodes in order.
@@ -91,11 +94,13 @@ class Player:
         files = self._read_bundle(folder) if job.bundle is not None else None
         policies = _Policies(self, job, files, environment)
         outcomes: list[EpisodeOutcome] = []
+        if not job.video:
+            self._videos.close()
         try:
             for k, spec in enumerate(job.episodes):
                 if progress.cancelled:
                     raise CancelledJobError
-                outcome = _Episode(job, spec, environment, policies, progress).play(k)
+                outcome = _Episode(job, spec, environment, policies, progress, self._videos).play(k)
                 outcomes.append(outcome)
                 progress.episodes_done += 1
                 if _yields_no_policy(job, outcome):
@@ -135,6 +140,7 @@ class Player:
         for environment in self._environments.values():
             environment.close()
         self._environments.clear()
+        self._videos.close()
         self._zygote.close()
 
     def _environment(self, env_id: str) -> Environment:
@@ -229,12 +235,14 @@ class _Episode:
         environment: Environment,
         policies: _Policies,
         progress: Progress,
+        videos: VideoRecorder,
     ) -> None:
         self._job = job
         self._spec = spec
         self._environment = environment
         self._policies = policies
         self._progress = progress
+        self._videos = videos
         self._failure: PolicyFailure | None = None
 
     def play(self, k: int) -> EpisodeOutcome:
@@ -251,7 +259,9 @@ class _Episode:
                 wall_s=time.monotonic() - start,
             )
         recorder = Recorder(job.record, job.observations)
-        total, components, length, terminated, truncated = self._steps(policy, recorder)
+        films = job.video and (not job.video_episodes or k < job.video_episodes)
+        played = Recorder("actions") if films else None
+        total, components, length, terminated, truncated = self._steps(policy, recorder, played)
         wall_s = time.monotonic() - start
         ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
         return EpisodeOutcome(
@@ -263,11 +273,22 @@ class _Episode:
             failure=self._failure,
             reward_components=components,
             trajectory=_blob(recorder.finish()),
+            video=None if played is None else self._video(played.finish(), length),
             stdout=ended.stdout,
             stderr=ended.stderr,
             wall_s=wall_s,
             policy_cpu_s=ended.cpu_s,
         )
+
+    def _video(self, actions: bytes, length: int) -> BlobRef | None:
+        """The episode's video; None where there can be none."""
+        progress = self._progress
+        mp4 = self._videos.record(
+            self._environment.description, self._spec.case, actions, length, lambda: progress.cancelled
+        )
+        if progress.cancelled:
+            raise CancelledJobError
+        return None if mp4 is None else _blob(mp4)
 
     def _begin(self, k: int) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
@@ -286,9 +307,12 @@ class _Episode:
         self._failure = msgspec.structs.replace(failure, step_index=step)
 
     def _steps(
-        self, policy: PolicyProcess | None, recorder: Recorder
+        self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
     ) -> tuple[float, dict[str, float], int, bool, bool]:
-        """Play to the end: return, components of the reward, length, terminated, truncated."""
+        """Play to the end: return, components of the reward, length, terminated, truncated.
+
+        `played` is given the actions as they were played, for the video.
+        """
         environment, progress = self._environment, self._progress
         codec = environment.action_codec
         repair, step, append = codec.repair, environment.step, recorder.append
@@ -323,6 +347,8 @@ class _Episode:
             if failed:
                 info = {**info, "policy_failed": True}
             append(obs, action if actions_only else returned, reward, terminated, truncated, info)
+            if played is not None:
+                played.append(None, action, reward, terminated, truncated, info)
             total += reward
             t += 1
             progress.steps += 1

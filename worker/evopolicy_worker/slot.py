@@ -197,7 +197,10 @@ class Slot:
                 return
             text = line.decode("utf-8", "replace").rstrip()[:500]
             self._said.append(text)
-            log.debug("slot says", text=text)
+            if text.startswith(messages.NOTE):
+                log.warning("slot notes", text=text.removeprefix(messages.NOTE))
+            else:
+                log.debug("slot says", text=text)
 
 
 def _error(answer: messages.Answer) -> WorkerError | SandboxError:

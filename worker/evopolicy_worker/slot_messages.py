@@ -9,6 +9,8 @@ import msgspec
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 
 LENGTH = struct.Struct("<I")
+NOTE = "note: "
+"""Begins a line on the process's standard error that an operator should see."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):

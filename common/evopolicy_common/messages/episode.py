@@ -103,6 +103,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     record: Record = "full"
     video: bool = False
     """Also record a video of each episode (a rendered frame a row)."""
+    video_episodes: int = 0
+    """With `video`: only of the job's first so many episodes; 0 for all."""
     tier: Tier = "bwrap"
     """The sandbox tier that the run demands."""
     limits: ResourceLimits = ResourceLimits()

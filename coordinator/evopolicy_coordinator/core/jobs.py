@@ -234,6 +234,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         observations=template.observations,
         record=template.record,
         video=video,
+        video_episodes=1 if template.video == "first" else 0,
         tier=template.tier,
         limits=template.limits,
     )
