@@ -27,6 +27,8 @@ class Ready(Event, frozen=True, kw_only=True, tag="ready"):
     info_url: str
     task_url: str
     submit_url: str
+    notes: tuple[str, ...] = ()
+    """What the operator should know of the run that was opened."""
 
 
 class Progress(Event, frozen=True, kw_only=True, tag="progress"):

@@ -248,6 +248,8 @@ class RunPlay:
     async def _on_gateway_event(self, event: object) -> None:
         if isinstance(event, Ready):
             if not self._ready.done():
+                for text in event.notes:
+                    self._watch.note(self._name, text)
                 self._ready.set_result(event)
             if self._order is not None and self._gateway is not None:
                 await self._gateway.tell(self._order)

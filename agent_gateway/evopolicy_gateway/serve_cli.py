@@ -76,7 +76,17 @@ def _failures_in_the_log() -> Iterator[None]:
 async def _serve(folder: RunFolder, connect: tuple[str, ...], json_output: bool, controlled: bool) -> bool:
     def ready(urls: Urls, desk: Desk) -> None:
         if controlled:
-            control.emit(Ready(info_url=urls.info, task_url=urls.task, submit_url=urls.submit))
+            opened = desk.run
+            undrawn = opened.video != "off" and not opened.env.renders
+            notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
+            control.emit(
+                Ready(
+                    info_url=urls.info,
+                    task_url=urls.task,
+                    submit_url=urls.submit,
+                    notes=notes if undrawn else (),
+                )
+            )
         elif json_output:
             print(orjson.dumps(urls.environment()).decode(), flush=True)
         else:

@@ -195,6 +195,18 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
         assert json.loads(line)["event"]
 
 
+def test_video_all_leaves_a_video_beside_each_trajectory(tmp_path: Path) -> None:
+    small = ["--budget", "2", "--validation", "1", "--heldout", "1"]
+    arguments = ["local", "--env", "toy/line", "--agent", "random", "--exp-id", "t", "--video", "all", *small]
+    with command(tmp_path, *arguments) as running:
+        code, _, err = running.finish()
+    assert code == 0, err
+    episodes = [path.parent for path in (run_dir(tmp_path) / "workspace").rglob("trajectory.jsonl")]
+    assert episodes
+    for folder in episodes:
+        assert (folder / "video.mp4").read_bytes()[4:8] == b"ftyp"
+
+
 def test_a_spoken_agent_gets_turns_until_it_stops_and_the_run_is_finalised(
     operator_file: Path, tmp_path: Path
 ) -> None:
