@@ -112,7 +112,9 @@ def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
         # Repaired already, and once more for its type: the codec's arrays may come back as other views.
         step = environment.step(environment.action_codec.repair(row.action)[0])
         if (step.reward, step.terminated, step.truncated) != (row.reward, row.terminated, row.truncated):
-            raise WorkerError(f"{environment.description.env} departs from the recorded episode at step {row.t}")
+            raise WorkerError(
+                f"{environment.description.env} departs from the recorded episode at step {row.t}"
+            )
     return encoder.finish()
 
 
