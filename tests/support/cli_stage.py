@@ -27,21 +27,26 @@ PATH_TOKEN = "0123456789abcdef0123456789abcdef"
 
 
 @contextmanager
-def counting_gateway(budget: int) -> Iterator[dict[str, str]]:
+def counting_gateway(budget: int, asked_in_flight: int = 0) -> Iterator[dict[str, str]]:
     """The three URLs of a gateway that answers every submit with `ok` and counts the budget down."""
-    left = [budget]
+    left, in_flight = [budget], [asked_in_flight]
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, format: str, *args: Any) -> None:
             pass
 
         def do_GET(self) -> None:
-            self._answer(
-                {"state": {"remaining_budget": left[0], "n_submits": 0, "is_finalized": left[0] <= 0}}
-            )
+            state = {"remaining_budget": left[0], "n_submits": 0, "is_finalized": left[0] <= 0}
+            # The first answers of `in_flight` tell of a submit that still runs.
+            running = {"submit_id": "submit_000"} if in_flight[0] > 0 else None
+            in_flight[0] -= 1
+            self._answer({"state": state, "submit_in_flight": running})
 
         def do_POST(self) -> None:
             body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+            if in_flight[0] > 0:
+                self._answer({"status": "conflict"})
+                return
             left[0] -= len(body["env_instances"])
             self._answer({"status": "ok", "submit_id": "submit_000", "summary": {}})
 
@@ -108,13 +113,14 @@ def play(
     scenario: str,
     budget: int = 4,
     over_when: Callable[[Played], bool] | None = None,
+    asked_in_flight: int = 0,
     **env: str,
 ) -> Played:
     """Plays the agent to its end, or until its time is over: when `over_when` says so."""
     workspace = folder / "workspace"
     (workspace / "system").mkdir(parents=True, exist_ok=True)
     played = Played(folder)
-    with counting_gateway(budget) as urls:
+    with counting_gateway(budget, asked_in_flight) as urls:
         environment = {
             "PATH": f"{FAKES}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "HOME": str(folder),

@@ -29,6 +29,7 @@ from evopolicy_gateway.harnesses.usage import Usage
 
 _PROBE_PATIENCE_S = 60.0
 _MAX_PAUSE_S = 3600.0
+_IN_FLIGHT_PAUSE_S = 0.5
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -101,7 +102,7 @@ class CliAgent(Harness):
         if (why := self._capped(state.usage)) is not None:
             return self._ending("agent_stopped", why)
         left = await left_of(stage)
-        if left == 0:
+        if left == 0 or stage.over.is_set():
             return self._ending()
         if state.reprompts >= self._config.reprompts:
             remaining = "budget" if left is None else f"{left} episodes"
@@ -248,9 +249,14 @@ class CliAgent(Harness):
 
 
 async def left_of(stage: Stage) -> int | None:
-    """Episodes that are left; None when the gateway does not answer."""
+    """Episodes that are left, once no submit is in flight any more; None when the gateway does not answer.
+
+    An agent that is prompted while its submit runs could only say that it waits, and would use its reminders up.
+    """
     try:
-        state = (await stage.info())["state"]
+        while (info := await stage.info()).get("submit_in_flight") and not stage.over.is_set():
+            await stage.sleep(_IN_FLIGHT_PAUSE_S)
+        state = info["state"]
         return 0 if state["is_finalized"] else int(state["remaining_budget"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -169,6 +169,13 @@ def test_an_agent_that_does_nothing_is_reminded_up_to_the_limit(tmp_path: Path, 
 
 
 @both
+def test_an_agent_is_not_reminded_while_its_submit_runs(tmp_path: Path, harness: str) -> None:
+    # A submit while another runs is refused: without the wait the only reminder would come to nothing.
+    played = play(tmp_path, settings(harness, reprompts=1), "idle,work", budget=2, asked_in_flight=3)
+    assert (ended(played).turns, ended(played).detail) == (2, "")
+
+
+@both
 def test_a_cap_on_tokens_ends_the_run(tmp_path: Path, harness: str) -> None:
     played = play(tmp_path, settings(harness, max_tokens=1500), "idle", budget=4)
     assert ended(played).reason == "agent_stopped"
