@@ -338,7 +338,7 @@ BREAKERS = (
     ),
     Breaker(
         name="a thread that goes on answering",
-        act="threading.Thread(target=lambda: [os.write(4, struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for _ in range(9999)]).start(); time.sleep(0.1)",
+        act="threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for _ in range(9999)]).start(); time.sleep(0.1)",
         verdict="killed",
     ),
 )
