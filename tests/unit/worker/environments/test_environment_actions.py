@@ -112,7 +112,7 @@ NONSENSE = [
     [1, 2],
     [[]],
     [None],
-    object(),
+    pytest.param(object(), id="an object"),
     np.array(["2"]),
     np.array([1, 2]),
     np.array(None),
