@@ -32,7 +32,7 @@ demo: install
 
 test: install
 	@bash deploy/setup-host.sh --tests
-	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+	@$(BIN)/python -m pytest $(ARGS)
 
 check: install
 	@$(BIN)/ruff check .
