@@ -32,7 +32,7 @@ demo: install
 
 test: install
 	@bash deploy/setup-host.sh --tests
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest --basetemp="$$(mktemp -d /tmp/evp-XXXXXX)/t" $(ARGS)
 
 check: install
 	@$(BIN)/ruff check .
