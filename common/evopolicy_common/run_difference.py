@@ -26,6 +26,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "timing": "times",
         "agent.retries": "counts what was asked again",
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",
+        "audit": "which workers played, and played again",
         "versions.agents_md_hash": "of a file that names the gateway's port",
     },
     "summary.json": {

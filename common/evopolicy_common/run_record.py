@@ -13,6 +13,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
@@ -226,6 +227,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     rejected_submits: tuple[RejectedSubmit, ...] = ()
     artifacts: Artifacts = Artifacts()
     versions: Versions
+    audit: AuditRecord | None = None
+    """What was played again on other workers; None where nothing was."""
 
 
 class CheckpointMetrics(msgspec.Struct, frozen=True, kw_only=True):

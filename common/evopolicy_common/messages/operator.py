@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
@@ -94,6 +95,8 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     infrastructure_retries: int = 0
     nondeterministic_results: int = 0
     """Repeated attempts of one job whose results differed."""
+    audit: AuditRecord | None = None
+    """None where nothing was to be audited and no forger is known."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -283,7 +286,7 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     worker: str
     host: str
     slots: int
-    state: Literal["active", "draining", "lost"]
+    state: Literal["active", "draining", "lost", "quarantined"]
     tiers: tuple[Tier, ...]
     environments: tuple[str, ...]
     fingerprint: str
@@ -311,6 +314,17 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     waits_for: str = ""
 
 
+class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
+    """A worker whose registration was refused."""
+
+    worker: str
+    """As it called itself."""
+    host: str
+    why: str
+    ago_s: float
+    """Seconds since the last time."""
+
+
 class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     cluster: str
     version: str
@@ -322,6 +336,15 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     runs: tuple[RunStatus, ...]
     stalls: tuple[str, ...] = ()
     """What waits longer than it should, and for what."""
+    audit_share: float = 0.0
+    """Share of the episodes of new runs that is played again elsewhere."""
+    audits: dict[str, int] = {}
+    """Of the unfinished runs: audited episodes by where they stand (`open`, `agreed`, `disputed`, `not_audited`)."""
+    disputes: tuple[str, ...] = ()
+    """What workers disagree on, the latest last."""
+    quarantined: dict[str, str] = {}
+    """Workers that get no more leases, and why."""
+    turned_away: tuple[TurnedAway, ...] = ()
 
 
 OperatorRequest = (

@@ -56,6 +56,8 @@ class Registered(Message, frozen=True, kw_only=True, tag="registered"):
     lease_ttl_s: float
     """A lease that no heartbeat renews for so long is taken away."""
     heartbeat_s: float
+    refused: dict[str, str] = {}
+    """Run id to why this worker gets no work of it, such as other versions than the run began with."""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
