@@ -32,7 +32,8 @@ demo: install
 
 test: install
 	@bash deploy/setup-host.sh --tests
-	@$(BIN)/python -m pytest --basetemp="$$(mktemp -d /tmp/evp-XXXXXX)/t" $(ARGS)
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest --basetemp="$$short/t" $(ARGS); status=$$?; \
+	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
 check: install
 	@$(BIN)/ruff check .

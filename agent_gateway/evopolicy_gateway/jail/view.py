@@ -71,7 +71,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
             (inside if self._is_hidden(path) else outside).append(path)
         command += self._binds(outside)
         for path, target in self.needs.links.items():
-            if not any(_is_in(path, shown) for shown in outside):
+            if not any(_is_in(path, shown) for shown in outside) and not self._has_link(path, target):
                 command += ["--symlink", target, path]
         for source, target in our_packages():
             command += ["--ro-bind", source, target]
@@ -85,6 +85,14 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
                 command += ["--ro-bind", f"{workspace}/{name}", f"{workspace}/{name}"]
         command += ["--ro-bind", str(Path(__file__).with_name("doorway.py")), DOORWAY]
         return [*command, "--remount-ro", "/", "--chdir", workspace]
+
+    def _has_link(self, path: str, target: str) -> bool:
+        """Whether an earlier program of this agent left the link: its /tmp and home outlive each of its programs."""
+        for shown, name in ((self.home, "home"), ("/tmp", "tmp")):
+            if _is_in(path, shown):
+                kept = self.private / name / os.path.relpath(path, shown)
+                return kept.is_symlink() and os.readlink(kept) == target
+        return False
 
     def _binds(self, paths: Sequence[str]) -> list[str]:
         """Parents before what lies in them; writable ones over read-only ones."""

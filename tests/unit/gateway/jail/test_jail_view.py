@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -109,3 +110,28 @@ def test_feedback_and_rules_lie_read_only_over_the_writable_workspace(tmp_path: 
 def test_only_an_open_network_shares_this_machines(tmp_path: Path) -> None:
     assert "--unshare-net" in arguments(tmp_path / "a", [])
     assert "--unshare-net" not in arguments(tmp_path / "b", [], open_network=True)
+
+
+def test_a_second_program_of_an_agent_finds_the_links_of_the_first_in_its_tmp_and_home(
+    tmp_path: Path,
+) -> None:
+    for home in ("/home/somebody", str(tmp_path)):
+        needs = needs_of([], None)
+        for place in ("/tmp/some/python", f"{home}/some/python"):
+            needs.links[place] = "/usr/bin/env"
+        view = View(
+            workspace=tmp_path / "w",
+            private=tmp_path / "private",
+            home=home,
+            needs=needs,
+            read=(),
+            write=(),
+            hidden=(),
+            open_network=False,
+        )
+        view.workspace.mkdir(exist_ok=True)
+        view.prepare()
+        for _ in range(2):
+            command = [*view.arguments(), "/tmp/some/python", f"{home}/some/python", "true"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
