@@ -6,6 +6,7 @@ A sample of what `python tests/conformance/environments/acceleration_checks.py` 
 from __future__ import annotations
 
 import numpy as np
+import pygame
 import pytest
 from acceleration_checks import DifferenceError, DriverFactory, accelerated_ids, compare, compare_car_pictures
 from acceleration_drivers import competent_driver, random_driver
@@ -68,6 +69,20 @@ def test_pictures_of_an_accelerated_environment_are_the_plain_ones(env_id: str) 
 
 def test_a_car_put_anywhere_is_seen_as_by_the_plain_environment() -> None:
     compare_car_pictures(seed=2, count=50)
+
+
+def test_a_car_drives_on_after_another_environment_of_its_process_ended_pygame() -> None:
+    frames = []
+    for accelerations in (True, False):
+        environment = make("gym/racing", accelerations=accelerations)
+        environment.reset(Case(seed=5))
+        rng = np.random.default_rng(5)
+        for _ in range(3):
+            pygame.quit()
+            frames.append(environment.step(environment.action_codec.sample(rng)).observation)
+        environment.close()
+    for accelerated, plain in zip(frames[:3], frames[3:], strict=True):
+        assert np.array_equal(accelerated, plain)
 
 
 def test_the_comparison_notices_a_polygon_that_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,8 +41,7 @@ class _Canvases:
     """Surfaces and the font, used by one environment again and again."""
 
     def __init__(self) -> None:
-        pygame.font.init()
-        self.font = pygame.font.Font(pygame.font.get_default_font(), FONT_SIZE)
+        self._font = _load_font()
         self.road = pygame.Surface((WINDOW_W, WINDOW_H))
         self.visible = self.road.subsurface(VISIBLE)
         self.narrow_road = pygame.Surface((STATE_W, ROAD_ROWS))
@@ -53,6 +52,16 @@ class _Canvases:
         self.narrow = pygame.Surface((STATE_W, WINDOW_H))
         self.small = pygame.Surface((STATE_W, STATE_H))
 
+    def text(self, words: str) -> pygame.Surface:
+        """White on black, as the library writes the score."""
+        white, black = (255, 255, 255), (0, 0, 0)
+        try:
+            return self._font.render(words, True, white, black)
+        except pygame.error:
+            # Another environment of this process was closed, and with it pygame and all its fonts.
+            self._font = _load_font()
+            return self._font.render(words, True, white, black)
+
     def shrink(self) -> None:
         """The road, flipped, above the panel, scaled down to the small picture."""
         scale = pygame.transform.smoothscale
@@ -61,6 +70,11 @@ class _Canvases:
         self.narrow.blit(pygame.transform.flip(self.narrow_road, False, True), (0, 0))
         self.narrow.blit(self.narrow_panel, (0, ROAD_ROWS))
         scale(self.narrow, (STATE_W, STATE_H), self.small)
+
+
+def _load_font() -> pygame.font.Font:
+    pygame.font.init()
+    return pygame.font.Font(pygame.font.get_default_font(), FONT_SIZE)
 
 
 class NarrowFrames(CarRacing):
@@ -93,7 +107,7 @@ class NarrowFrames(CarRacing):
 
         env.surf = canvases.whole
         env._render_indicators(WINDOW_W, WINDOW_H)
-        text = canvases.font.render(f"{self.reward:04.0f}", True, (255, 255, 255), (0, 0, 0))
+        text = canvases.text(f"{self.reward:04.0f}")
         place = text.get_rect()
         place.center = (60, WINDOW_H - WINDOW_H * 2.5 / 40.0)
         env.surf.blit(text, place)
