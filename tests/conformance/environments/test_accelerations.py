@@ -79,7 +79,7 @@ def test_a_car_drives_on_after_another_environment_of_its_process_ended_pygame()
         rng = np.random.default_rng(5)
         for _ in range(3):
             pygame.quit()
-            frames.append(environment.step(environment.action_codec.sample(rng)).observation)
+            frames.append(environment.step(environment.action_codec.sample(rng)).obs)
         environment.close()
     for accelerated, plain in zip(frames[:3], frames[3:], strict=True):
         assert np.array_equal(accelerated, plain)
