@@ -288,6 +288,8 @@ class Scheduler:
                     if wanted <= 0:
                         return
                     if lease.worker == avoided:
+                        # Once that is over it is as good as any, and nothing else need happen by then.
+                        core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
                         continue
                     if priority == HELDOUT and job.preemptions >= core.settings.preemptions_max:
                         del hidden[lease]

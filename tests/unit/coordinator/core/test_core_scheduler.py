@@ -166,6 +166,24 @@ def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the
     assert split_of(rig.poll(session, 2)[0].job) == "train"
 
 
+def test_a_train_job_stops_hidden_ones_on_the_worker_it_failed_on_once_it_may_go_there_again() -> None:
+    rig = Rig()
+    session = rig.register("w1", slots=1)
+    validating(rig, session)
+    other = rig.register("w2", slots=1)
+    rig.submit(5, 6, key="k1")
+    (failed,) = rig.poll(session, 1)
+    (busy,) = rig.poll(other, 1)
+    rig.hand_in(session, result(failed, "failed", episodes=()))
+    (hidden,) = rig.poll(session, 1)
+    assert [split_of(lease.job) for lease in (failed, busy, hidden)] == ["train", "train", "validation"]
+    rig.pass_time(4.0)
+    assert rig.beat(other, busy).cancelled == ()
+    assert rig.beat(session, hidden).cancelled == ()
+    rig.pass_time(4.0)
+    assert rig.beat(session, hidden).cancelled == (hidden.lease_id,)
+
+
 def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
     rig = Rig(preemptions_max=2)
     session = rig.register(slots=1)
