@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -36,7 +37,8 @@ request = urllib.request.Request(
 )
 urllib.request.urlopen(request).read()
 """
-ENVIRONMENTS = ("toy/line", "gym/acrobot")
+ENVIRONMENTS = ("toy/line", "gym/acrobot", "gymnasium/MiniGrid-FourRooms-v0")
+"""Arrays of numbers, and dictionaries of pictures and texts."""
 
 
 class Played:
@@ -91,6 +93,29 @@ def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: 
     assert not report["policy_differences"]
     assert not report["not_checked"]
     assert not report["fingerprint_differences"]
+
+
+def test_a_sample_draws_as_many_episodes_as_asked_and_the_same_ones_for_the_same_seed(played: Played) -> None:
+    run = played.run("toy/line")
+    for _ in range(2):
+        done = played.verify(run, "--sample", "3", "--seed", "7", "--no-policy")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout)["episodes"] == 3
+
+
+def test_a_run_is_verified_on_the_workers_that_are_connected(played: Played) -> None:
+    credentials = played.state / "credentials"
+    worker = ["--env", "gym/acrobot", "--slots", "1", "--credentials", str(credentials / "worker.json")]
+    with contextlib.ExitStack() as stack:
+        for room, options in {"coordinator": ["--state", str(played.state)], "worker": worker}.items():
+            command = [sys.executable, "-m", f"evopolicy_{room}.cli", *options]
+            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+            stack.callback(process.terminate)
+        command = [sys.executable, "-c", VERIFY, str(played.run("gym/acrobot")), "--json", "--no-policy"]
+        command += ["--credentials", str(credentials / "operator.json")]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout)["episodes"] == 8
 
 
 def test_a_tampered_reward_is_found(played: Played, tmp_path: Path) -> None:
