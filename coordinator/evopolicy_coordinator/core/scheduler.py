@@ -278,6 +278,10 @@ class Scheduler:
         The last that were leased go first: they have come least far, and of a batch they wait behind the others.
         """
         core = self._core
+        if any(profile.hidden[EARLY_VALIDATION] or profile.hidden[HELDOUT] for profile in lane.profiles):
+            # What is spared now may be stopped later with nothing else happening: a worker is avoided no longer, or one
+            # that was to let go of a hidden job is lost.
+            core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
         wanted = lane.n_ready[TRAIN] - lane.stopping
         avoided = core.queue.avoided(lane, TRAIN, turn.now)
         for priority in (EARLY_VALIDATION, HELDOUT):
@@ -288,8 +292,6 @@ class Scheduler:
                     if wanted <= 0:
                         return
                     if lease.worker == avoided:
-                        # Once that is over it is as good as any, and nothing else need happen by then.
-                        core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
                         continue
                     if priority == HELDOUT and job.preemptions >= core.settings.preemptions_max:
                         del hidden[lease]
