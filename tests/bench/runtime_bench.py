@@ -2,7 +2,8 @@
 
 Prints, per Core16 environment: the bare loop's time per step; the slot's time over the bare loop's with accelerations off
 and on; and a whole submit on two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means,
-a pipe's round trip on one core, the slot's overhead per step in such round trips, and its overhead per episode.
+a pipe's round trip on one core, the slot's overhead per step in such round trips, its overhead per episode, its memory,
+and what a one-episode submit takes beside its episode.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ from evopolicy_worker.slot import Slot
 HERE = Path(__file__).parent
 ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"
 AGENT = HERE / "submit_agent.py"
+TOY_EPISODES = 200
+SINGLES = 10
+"""One-episode submits of an environment, as `submit_agent.py` makes them."""
 
 
 def quietly(command: list[str], **environment: str) -> str:
@@ -81,8 +85,45 @@ def jobs(env: str, n: int) -> list[Job]:
     ]
 
 
-async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, int]:
-    """Seconds and steps of `n` episodes through one pinned, sandboxed slot that is warm."""
+def fsync_s(n: int = 50) -> float:
+    """Median seconds for writing 4 KiB to a file and having it on the disk."""
+    times = []
+    with tempfile.NamedTemporaryFile(prefix="evopolicy-bench-") as file:
+        for _ in range(n):
+            started = time.perf_counter()
+            file.write(bytes(4096))
+            file.flush()
+            os.fsync(file.fileno())
+            times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def peak_memory_mb() -> float:
+    """The peaks of this process's descendants (a slot's environment process, its zygote, its sandbox), added up."""
+    children: dict[int, list[int]] = {}
+    peaks: dict[int, float] = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdecimal():
+            try:
+                fields = (folder / "stat").read_text().rpartition(")")[2].split()
+                status = (folder / "status").read_text()
+            except OSError:
+                continue
+            children.setdefault(int(fields[1]), []).append(int(folder.name))
+            peaks[int(folder.name)] = sum(
+                int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM:")
+            )
+    found, queue = 0.0, [os.getpid()]
+    while queue:
+        for child in children.get(queue.pop(), []):
+            found += peaks[child]
+            queue.append(child)
+    return found
+
+
+async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, int, list[float], float]:
+    """`n` episodes through one pinned, sandboxed slot that is warm: seconds in all, steps, seconds of each of the
+    first episodes (of more than `n` where it is few, as single submits are held against them), peak memory in MB."""
     os.environ[ACCELERATIONS] = "on" if accelerations else "off"
     core = sorted(os.sched_getaffinity(0))[0]
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
@@ -93,11 +134,13 @@ async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, in
         await slot.start()
         try:
             await slot.play(jobs(env, 1)[0], bundle, lambda done, steps: None)
-            started = time.perf_counter()
-            steps = 0
-            for job in jobs(env, n):
-                steps += sum(o.length for o in await slot.play(job, bundle, lambda done, steps: None))
-            return time.perf_counter() - started, steps
+            steps, times = 0, []
+            for index, job in enumerate(jobs(env, max(n, SINGLES))):
+                started = time.perf_counter()
+                (outcome,) = await slot.play(job, bundle, lambda done, steps: None)
+                times.append(time.perf_counter() - started)
+                steps += outcome.length if index < n else 0
+            return sum(times[:n]), steps, times[:SINGLES], peak_memory_mb()
         finally:
             await slot.close()
             del os.environ[ACCELERATIONS]
@@ -154,8 +197,9 @@ def measure(env: str, seconds: float, most: int, *, submits: bool) -> dict[str, 
     n = int(bare["episodes"])
     row: dict[str, Any] = {"env": env, "episodes": n, "steps": bare["steps"], "bare_s": bare["seconds"]}
     for name, accelerations in (("plain", False), ("accelerated", True)):
-        slot_s, steps = asyncio.run(slot_time(env, n, accelerations=accelerations))
+        slot_s, steps, first, memory = asyncio.run(slot_time(env, n, accelerations=accelerations))
         row[f"slot_{name}_s"], row[f"slot_{name}_steps"] = slot_s, steps
+        row[f"first_{name}_s"], row[f"slot_{name}_mb"] = first, memory
         if submits:
             row[f"submit_{name}_s"], row[f"single_{name}_s"] = submit_time(
                 env, n, accelerations=accelerations
@@ -204,18 +248,40 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
     summary["pipe_round_trip_us"] = 1e6 * round_trip_s
     for name, value in summary.items():
         console.print(f"{name:28} {value:8.3f}")
-    singles = [1000 * (s) for row in rows for s in row.get("single_accelerated_s", [])]
-    if singles:
-        quantiles = statistics.quantiles(singles, n=20)
-        console.print(
-            f"one-episode submit, ms: median {statistics.median(singles):.0f}, 95 % {quantiles[-1]:.0f}"
+    singles = [
+        1000 * (submit - episode)
+        for row in rows
+        for submit, episode in zip(
+            row.get("single_accelerated_s", []), row["first_accelerated_s"], strict=False
         )
-    table = Table(title="slot overhead per step (accelerations off)")
-    table.add_column("environment")
-    table.add_column("µs", justify="right")
-    table.add_column("pipe round trips", justify="right")
+    ]
+    if singles:
+        summary["single_median_ms"] = statistics.median(singles)
+        summary["single_95_ms"] = statistics.quantiles(singles, n=20)[-1]
+        summary["fsync_ms"] = 1000 * fsync_s()
+        console.print(
+            f"one-episode submit without its episode, ms: median {summary['single_median_ms']:.1f}, "
+            f"95 % {summary['single_95_ms']:.1f}; one fsync here: {summary['fsync_ms']:.1f}"
+        )
+    table = Table(title="slot overhead (accelerations off), and the slot's peak memory")
+    for heading in (
+        "environment",
+        "µs per step",
+        "pipe round trips per step",
+        "ms per episode",
+        "MB",
+        "MB, acc.",
+    ):
+        table.add_column(heading, justify="left" if heading == "environment" else "right")
     for row, overhead in zip(rows, overheads, strict=True):
-        table.add_row(row["env"], f"{1e6 * overhead:.0f}", f"{overhead / round_trip_s:.1f}")
+        table.add_row(
+            row["env"],
+            f"{1e6 * overhead:.0f}",
+            f"{overhead / round_trip_s:.1f}",
+            f"{1000 * overhead * row['steps'] / row['episodes']:.1f}",
+            f"{row['slot_plain_mb']:.0f}",
+            f"{row['slot_accelerated_mb']:.0f}",
+        )
     console.print(table)
     return summary
 
@@ -239,6 +305,13 @@ def main() -> None:
         console.print(f"measuring {env}", style="dim")
         rows.append(measure(env, options.seconds, options.episodes, submits=not options.slots_only))
     summary = report(rows, round_trip_s, console)
+    # An environment that costs nothing: what is left is fork, seal, import, reset and the record.
+    toy_s, steps, _, _ = asyncio.run(slot_time("toy/line", TOY_EPISODES, accelerations=True))
+    summary["toy_episode_ms"] = 1000 * toy_s / TOY_EPISODES
+    console.print(
+        f"an episode of toy/line ({steps / TOY_EPISODES:.0f} steps) through a slot: "
+        f"{summary['toy_episode_ms']:.2f} ms"
+    )
     if options.json:
         options.json.write_text(json.dumps({"rows": rows, "summary": summary}, indent=2))
 
