@@ -55,6 +55,9 @@ Video = Annotated[str, typer.Option(help="Videos in the feedback: off, first, al
 Wall = Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")]
 Runs = Annotated[Path, typer.Option(help="Folder of run directories.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with the run of that --exp-id, whose command was killed.")
+]
 Parallel = Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")]
 WALL_S = 12 * 3600.0
 
@@ -91,6 +94,7 @@ def run(
     allow_host: options.AllowHost = None,
     runs: Runs = Path("runs"),
     overwrite: Overwrite = False,
+    resume: Resume = False,
     slots: options.Slots = 2,
     as_json: options.Json = False,
 ) -> None:
@@ -118,7 +122,7 @@ def run(
             limits=limit or (),
         )
         held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, overwrite, held)
+        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, (overwrite, resume), held)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
             where = Cluster(local_slots=slots)
@@ -157,6 +161,7 @@ def local(
     allow_host: options.AllowHost = None,
     runs: Runs = Path("runs"),
     overwrite: Overwrite = False,
+    resume: Resume = False,
     parallel: Parallel = 1,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
@@ -183,7 +188,7 @@ def local(
             limits=limit or (),
         )
         held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, overwrite, held)
+        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, (overwrite, resume), held)
         _play(plans, Cluster(local_slots=slots, state=state, data=data), parallel, as_json)
 
 
@@ -271,10 +276,16 @@ def _plans(
     env_ids: list[str],
     runs: Path,
     wall_limit_s: float,
-    overwrite: bool,
+    replaced: tuple[bool, bool],
     jail: JailSettings,
 ) -> list[Plan]:
-    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
+    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started.
+
+    `replaced`: what becomes of a run of that name, as `--overwrite` and `--resume` say.
+    """
+    overwrite, resume = replaced
+    if resume and (overwrite or given.exp_id is None):
+        raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
     started_in = Path.cwd()
     harnesses.make(given.agent, started_in)
     exp_id = given.exp_id or options.default_exp_id()
@@ -286,6 +297,7 @@ def _plans(
             started_in=started_in,
             wall_limit_s=wall_limit_s,
             overwrite=overwrite,
+            resume=resume,
             jail=jail,
         )
         for env_id in env_ids

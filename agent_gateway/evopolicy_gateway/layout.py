@@ -14,6 +14,7 @@ import msgspec
 from evopolicy_common import keys
 from evopolicy_common.blobs import write_atomically
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import RunSettings
 
 _ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
 
@@ -80,6 +81,16 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "run.json"
 
     @property
+    def lock(self) -> Path:
+        """Held by the process that plays the run."""
+        return self.state / "lock"
+
+    @property
+    def intended(self) -> Path:
+        """What the coordinator is asked to open, written before it is asked: `IntendedRun`."""
+        return self.state / "intended.json"
+
+    @property
     def session(self) -> Path:
         """A coding agent's session: `SessionState`."""
         return self.state / "session.json"
@@ -99,6 +110,13 @@ class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
     """Which run of the cluster a folder is for."""
 
     run: str
+
+
+class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """What a command that is killed in between must ask again, word for word, to come to the same run."""
+
+    key: str
+    settings: RunSettings
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):

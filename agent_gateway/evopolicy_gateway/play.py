@@ -2,17 +2,21 @@
 
 Order is what counts here: the run is opened, the gateway serves, the agent starts; the agent and all that it started are
 gone before the run is closed; only then hidden cases are scored, and only this process is told. A gateway that dies is
-started again on the same port while the agent goes on.
+started again on the same port while the agent goes on; a keeper that dies is started again with its agent. When this
+process itself is killed its children end, and the folder holds all that going on with the run needs.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
+import os
 import shutil
 import sys
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +26,7 @@ from evopolicy_common import credentials
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.operator import RunFinished, RunSettings
-from evopolicy_common.run_record import RunRecord
+from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_gateway import children, control, record
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
@@ -38,7 +42,7 @@ from evopolicy_gateway.control import (
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.layout import OpenedRun, RunFolder, run_folder, save
+from evopolicy_gateway.layout import IntendedRun, OpenedRun, RunFolder, run_folder, save
 from evopolicy_gateway.operations import Operations
 from evopolicy_gateway.watch import Watch
 
@@ -47,6 +51,7 @@ LAST_WORDS_S = 10.0
 END_GRACE_S = 15.0
 _QUICK_DEATH_S = 5.0
 _MAX_QUICK_DEATHS = 5
+_MAX_KEEPER_DEATHS = 5
 _USAGE_ERROR = 2
 
 
@@ -61,6 +66,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     wall_limit_s: float
     """The agent's time, seconds."""
     overwrite: bool = False
+    resume: bool = False
+    """What the folder holds of this run is gone on with."""
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
     jail: JailSettings = JailSettings()
@@ -77,11 +84,25 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             return
         if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):
             raise ConfigError(f"{folder.root} is not a run's folder; choose another --runs or --exp-id")
-        if not self.overwrite:
+        if self.resume:
+            intended = self.intended()
+            if intended is not None and intended.settings != self.settings:
+                raise ConfigError(
+                    f"{folder.root} holds a run with other settings; go on with it by the options it was begun with"
+                )
+        elif not self.overwrite:
             kind = "a finished" if folder.run_json.exists() else "an unfinished"
             raise ConfigError(
                 f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite"
+                + ("" if folder.run_json.exists() else ", or go on with it with --resume")
             )
+
+    def intended(self) -> IntendedRun | None:
+        """What was begun in the folder; None for nothing."""
+        try:
+            return msgspec.json.decode(self.folder.intended.read_bytes(), type=IntendedRun)
+        except FileNotFoundError:
+            return None
 
     def claim(self) -> None:
         """Makes the run's folder, empty. ConfigError as `check`."""
@@ -136,17 +157,36 @@ class RunPlay:
         """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
         plan = self._plan
         plan.claim()
-        try:
-            created = await self._operations.create(plan.settings, self._key)
-        except BaseException:
-            self._folder.root.rmdir()
-            raise
         self._folder.state.mkdir(mode=0o700)
+        save(self._folder.intended, IntendedRun(key=self._key, settings=plan.settings))
+        try:
+            run = await self._open(self._key)
+        except BaseException:
+            shutil.rmtree(self._folder.root)
+            raise
+        return await self._to_the_end(run, agents_side=True)
+
+    async def _open(self, key: str) -> str:
+        created = await self._operations.create(self._plan.settings, key)
         found = msgspec.structs.replace(self._credentials, token=created.capability)
         credentials.write(found, self._folder.credentials)
         save(self._folder.opened, OpenedRun(run=created.run))
         self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
-        return await self._to_the_end(created.run, agents_side=True)
+        return created.run
+
+    async def go_on(self) -> RunRecord:
+        """What the folder asks for: `play` where nothing was begun, `resume` where it was; a finished run's record."""
+        folder = self._folder
+        if folder.run_json.exists():
+            # Killed between the two, the command has left the gateway's folder.
+            shutil.rmtree(folder.state, ignore_errors=True)
+            return decode_run_record(folder.run_json.read_bytes())
+        intended = self._plan.intended()
+        if intended is None:
+            return await self.play()
+        if not folder.opened.exists():
+            return await self._to_the_end(await self._open(intended.key), agents_side=True)
+        return await self.resume()
 
     async def resume(self) -> RunRecord:
         """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
@@ -155,10 +195,16 @@ class RunPlay:
         found = msgspec.structs.replace(self._credentials, token=capability)
         credentials.write(found, self._folder.credentials)
         phase = await self._operations.phase(run)
+        if phase is None:
+            raise ConfigError(f"the cluster does not know run {run} of {self._folder.root} any more")
         self._watch.note(self._name, f"goes on with run {run} in {self._folder.root}")
         return await self._to_the_end(run, agents_side=phase == "open")
 
     async def _to_the_end(self, run: str, *, agents_side: bool) -> RunRecord:
+        with _held(self._folder):
+            return await self._played(run, agents_side=agents_side)
+
+    async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
         self.run = run
         plan, agent_s = self._plan, 0.0
         try:
@@ -270,6 +316,22 @@ class RunPlay:
         return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
 
     async def _keep_agent(self, ready: Ready) -> AgentEnded:
+        """Plays the agent to its end, beginning again when its keeper dies: that is our failure, and not the agent's.
+
+        An agent with a session goes on in it; any other program is started anew in its workspace.
+        """
+        until = time.monotonic() + self._plan.wall_limit_s
+        for _ in range(_MAX_KEEPER_DEATHS):
+            ended = await self._keep_agent_once(ready, max(1.0, until - time.monotonic()))
+            if ended is not None:
+                return ended
+            if self._spent.is_set():
+                break
+            self._watch.note(self._name, "the agent's keeper died; starting it again, and the agent with it")
+        return AgentEnded(reason="agent_failed", detail="its keeper died")
+
+    async def _keep_agent_once(self, ready: Ready, wall_limit_s: float) -> AgentEnded | None:
+        """How the agent ended; None when its keeper died."""
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.harnesses.keeper"]
         self._keeper = await Child.start(program, self._folder.harness_log, talks=True)
         await self._keeper.tell(
@@ -283,13 +345,13 @@ class RunPlay:
                     "EVOPOLICYGYM_SUBMIT_URL": ready.submit_url,
                 },
                 started_in=str(self._plan.started_in),
-                wall_limit_s=self._plan.wall_limit_s,
+                wall_limit_s=wall_limit_s,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
                 jail=self._jail(),
             )
         )
-        ended = AgentEnded(reason="agent_failed", detail="its keeper died")
+        ended: AgentEnded | None = None
         async for event in self._keeper.events():
             if isinstance(event, AgentTurn):
                 self._watch.turn(self._name, event.turn, event.text)
@@ -316,3 +378,17 @@ class RunPlay:
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
                 await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)
+
+
+@contextlib.contextmanager
+def _held(folder: RunFolder) -> Iterator[None]:
+    """Only one process at a time plays a run: ConfigError when another does. Let go of by its death, too."""
+    fd = os.open(folder.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{folder.root}: another command plays this run at the moment") from None
+        yield
+    finally:
+        os.close(fd)

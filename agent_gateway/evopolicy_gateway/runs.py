@@ -143,7 +143,7 @@ def report(results: Sequence[RunResult], console: Console) -> None:
 async def _play(plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> RunResult:
     play = RunPlay(plan, operations, gateway, watch)
     try:
-        return _result(plan, await play.play())
+        return _result(plan, await (play.go_on() if plan.resume else play.play()))
     except ConfigError as error:
         return RunResult(
             env=plan.settings.env,
