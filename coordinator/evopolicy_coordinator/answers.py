@@ -24,8 +24,10 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_coordinator import auditing
 from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.core.events import AuditEvent
 from evopolicy_coordinator.store import Reader
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -48,11 +50,16 @@ class Answers:
         self._blobs = blobs
         self._local = threading.local()
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
+        self._audits = ThreadPoolExecutor(1, thread_name_prefix="audits")
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
     def page(self, effect: ReadResults | ReadEvaluation | ReadFinished, answer: Answer) -> None:
         """Answers a read that the core asked for."""
         self._pages.submit(self._answer, lambda: self._page(effect), answer)
+
+    def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+        """Reads and compares recordings, one audit after another; `tell` is called from the thread."""
+        self._audits.submit(self._audit, effect, tell)
 
     def put(self, sender: str, message: BlobPut, max_bytes: int, answer: Answer) -> None:
         """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check."""
@@ -72,7 +79,7 @@ class Answers:
         return None if row is None else row.secret
 
     def close(self) -> None:
-        for pool in (self._pages, *self._lanes):
+        for pool in (self._pages, self._audits, *self._lanes):
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _lane(self, digest: str) -> ThreadPoolExecutor:
@@ -88,6 +95,13 @@ class Answers:
         except Exception:
             log.exception("cannot answer")
             answer(None)
+
+    def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+        try:
+            tell(auditing.carry_out(effect, self._reader, self._blobs))
+        except Exception:
+            # The audit stays open, and is given up in time.
+            log.exception("cannot audit", audit=effect.audit)
 
     @property
     def _reader(self) -> Reader:

@@ -16,6 +16,7 @@ from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator import process
 from evopolicy_coordinator.backup import back_up
+from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.process import Options, Ready
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -51,6 +52,16 @@ def serve(
         list[str] | None,
         typer.Option(help="Package that the workers let policies import beside numpy; may be repeated."),
     ] = None,
+    audit: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            metavar="SHARE",
+            help="Share of the episodes of new runs whose recorded actions are played again on a second worker and compared "
+            "bit for bit. A third decides where two disagree; a forger gets no more work.",
+        ),
+    ] = 0.0,
     ready_file: Annotated[
         Path | None,
         typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
@@ -73,6 +84,7 @@ def serve(
             listen=tuple(listen or ()),
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
+            core=CoreSettings(audit_share=audit),
         )
         try:
             asyncio.run(_run(options, ready_file))

@@ -14,6 +14,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import time
 from collections.abc import Callable, Coroutine
@@ -30,13 +31,14 @@ from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Mess
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answer, Answers
 from evopolicy_coordinator.claims import Claims
-from evopolicy_coordinator.core.effects import Effect, Log, ReadEvaluation, ReadFinished, ReadResults, Reply
-from evopolicy_coordinator.core.events import AnyEvent, EvaluationRequested, LivenessLost
+from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
+from evopolicy_coordinator.core.events import AnyEvent, AuditEvent, EvaluationRequested, LivenessLost
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.core.workers import Worker
 from evopolicy_coordinator.intake import Intake, Parsed
 from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.turned_away import TurnedAwayWorkers
 from evopolicy_coordinator.watchdog import LoopWatchdog
 from evopolicy_coordinator.writer import Outbox, Writer
 
@@ -80,6 +82,7 @@ class Service:
         self._loop = asyncio.get_running_loop()
         self._writer = Writer(store)
         self._claims = Claims(self._writer)
+        self._turned_away = TurnedAwayWorkers()
         self._outbox: Outbox | None = None
         self._core: Core | None = None
         self._pending: dict[int, _Pending] = {}
@@ -295,16 +298,15 @@ class Service:
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
             uptime_s=self.now() - self._started_at,
-            episodes_done=part.episodes_done,
-            episodes_per_s=part.episodes_per_s,
-            workers=part.workers,
-            runs=part.runs,
-            stalls=part.stalls,
+            turned_away=self._turned_away.told(self.now()),
+            **part._asdict(),
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
         log.info("refused", key=query.key, status=error.status, why=error.message)
-        query.reply(codec.encode(Refused(status=error.status, message=error.message)))
+        answer = Refused(status=error.status, message=error.message)
+        self._turned_away.answered(query.key, query.payload, answer, self.now())
+        query.reply(codec.encode(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core nothing can be served; who would change something is told why."""
@@ -421,13 +423,31 @@ class Service:
         if isinstance(effect, Reply):
             pending = self._take(effect.request)
             if pending is not None:
-                pending.query.reply(codec.encode(effect.message), _lane(pending.asker))
-        elif isinstance(effect, ReadResults | ReadEvaluation | ReadFinished):
+                query = pending.query
+                self._turned_away.answered(query.key, query.payload, effect.message, self.now())
+                query.reply(codec.encode(effect.message), _lane(pending.asker))
+        elif isinstance(effect, ReadEffect):
             pending = self._take(effect.request)
             if pending is not None:
                 self._answers.page(effect, _answer_to(pending.query, pending.asker))
+        elif isinstance(effect, AuditEffect):
+            self._answers.audit(effect, self._told_of_audit(self._incarnation))
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
+
+    def _told_of_audit(self, incarnation: int) -> Callable[[AuditEvent], None]:
+        """Hands what an audit came to to the core that asked; a later one asks anew for what it needs."""
+
+        def arrived(event: AuditEvent) -> None:
+            if incarnation == self._incarnation and not self._stopping:
+                self._handle(event)
+                self._flush()
+
+        def tell(event: AuditEvent) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+                self._loop.call_soon_threadsafe(arrived, event)
+
+        return tell
 
     def _take(self, request: int | str) -> _Pending | None:
         return self._pending.pop(request, None) if isinstance(request, int) else None

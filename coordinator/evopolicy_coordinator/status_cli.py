@@ -149,7 +149,7 @@ def resume(
     connect: Connect = None,
     file: CredentialsFile = None,
 ) -> None:
-    """Take a drained worker back."""
+    """Take a drained worker back, or one that was quarantined by an audit."""
     _asking(connect, file, lambda operator: operator.set_worker(worker, draining=False))
     typer.echo(f"{worker} is active")
 
@@ -195,6 +195,11 @@ def render(reply: StatusReply) -> RenderableType:
         f" {reply.episodes_done} episodes, {reply.episodes_per_s:.1f}/s over the last minute"
     )
     parts: list[RenderableType] = [Text(head), _workers(reply), _runs(reply)]
+    if reply.audit_share or reply.audits:
+        stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
+        parts.append(
+            Text(f"audits: {reply.audit_share:g} of the episodes of new runs; now {stand or 'none'}")
+        )
     parts += [Text(line, style="yellow") for line in _remarks(reply)]
     return Group(*parts)
 
@@ -239,6 +244,12 @@ def _runs(reply: StatusReply) -> Table:
 
 
 def _remarks(reply: StatusReply) -> Iterator[str]:
+    for name, why in reply.quarantined.items():
+        yield f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
+    for one in reply.turned_away:
+        where = f" of {one.host}" if one.host else ""
+        yield f"{one.worker}{where} was turned away {_age(one.ago_s)} ago: {one.why}"
+    yield from reply.disputes
     for run in reply.runs:
         if run.waits_for:
             yield f"{run.run} waits for {run.waits_for}"

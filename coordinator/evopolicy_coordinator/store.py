@@ -23,6 +23,7 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import (
+    AuditRow,
     EvaluationRow,
     FinishedRow,
     OutcomeHead,
@@ -65,6 +66,10 @@ _MIGRATIONS: tuple[str, ...] = (
     """,
     """
     CREATE TABLE claims (suite TEXT NOT NULL, name TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (suite, name));
+    """,
+    """
+    CREATE TABLE audits (audit TEXT PRIMARY KEY, run TEXT NOT NULL, data BLOB NOT NULL);
+    CREATE INDEX audits_by_run ON audits (run);
     """,
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
@@ -181,6 +186,7 @@ class Store:
             strikes=tuple(strikes),
             evaluations=evaluations,
             workers=_rows(db, WorkerRow, "SELECT data FROM workers"),
+            audits=_rows(db, AuditRow, f"SELECT data FROM audits WHERE run IN ({live_runs})"),
         )
 
     def close(self) -> None:
@@ -226,6 +232,10 @@ class Reader:
             return OutcomePage(tuple(rows), rows[-1].seq + 1 if rows else cursor)
 
         return _guard(self._path, read)
+
+    def outcome(self, group: str, index: int) -> OutcomeRow | None:
+        """The outcome at that place of its group; None when there is none."""
+        return self._one(_outcomes, "SELECT data FROM outcomes WHERE grp = ? AND idx = ?", (group, index))
 
     def submit(self, run: str, submit_index: int) -> SubmitRow | None:
         """The submit's row as it is now; None when there is none."""
@@ -314,6 +324,7 @@ _STRIKE = _upsert("strikes", "grp, lease_id, data", "grp, lease_id")
 _EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
 _FINISHED = _upsert("finished", "run, data", "run")
 _WORKER = _upsert("workers", "worker, data", "worker")
+_AUDIT = _upsert("audits", "audit, run, data", "audit")
 _CLAIM = _upsert("claims", "suite, name, data", "suite, name")
 
 
@@ -353,6 +364,10 @@ def _write_worker(db: sqlite3.Connection, row: WorkerRow) -> None:
     db.execute(_WORKER, (row.worker, _encode(row)))
 
 
+def _write_audit(db: sqlite3.Connection, row: AuditRow) -> None:
+    db.execute(_AUDIT, (row.audit, row.run, _encode(row)))
+
+
 _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     RunRow: _write_run,
     RunStateRow: _write_run_state,
@@ -362,6 +377,7 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     EvaluationRow: _write_evaluation,
     FinishedRow: _write_finished,
     WorkerRow: _write_worker,
+    AuditRow: _write_audit,
 }
 
 

@@ -25,6 +25,7 @@ import msgspec
 from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_coordinator.core.records import (
+    AuditRow,
     EvaluationRow,
     FinishedRow,
     OutcomeRow,
@@ -48,6 +49,7 @@ _submits = msgspec.msgpack.Decoder(SubmitRow)
 _outcomes = msgspec.msgpack.Decoder(OutcomeRow)
 _finished = msgspec.msgpack.Decoder(FinishedRow)
 _evaluations = msgspec.msgpack.Decoder(EvaluationRow)
+_audits = msgspec.msgpack.Decoder(AuditRow)
 
 
 class Collected(msgspec.Struct, frozen=True, kw_only=True):
@@ -129,6 +131,7 @@ def collect(
                 _delete(db, bounds)
             for run in old_runs:
                 db.execute("DELETE FROM train_blobs WHERE run = ?", (run,))
+                db.execute("DELETE FROM audits WHERE run = ?", (run,))
             for digest in unnamed:
                 blobs.delete(digest)
             shrunk = _shrink(state, db)
@@ -242,6 +245,11 @@ def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: fr
     }
     named |= {
         digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
+    }
+    named |= {
+        row.actions.digest
+        for row in _decoded(db, _audits, "SELECT data FROM audits")
+        if row.actions is not None
     }
     hidden = "SELECT data FROM outcomes WHERE grp NOT LIKE '%/train'"
     for row in _decoded(db, _outcomes, hidden):

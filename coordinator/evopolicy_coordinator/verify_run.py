@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from evopolicy_common import bundles, codec, keys
 from evopolicy_common.blobs import digest_of
@@ -38,9 +37,10 @@ from evopolicy_common.messages.operator import (
 )
 from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.requests import Requester
-from evopolicy_common.trajectory import Recorder, Trajectory, decode
+from evopolicy_common.trajectory import Trajectory, decode
 from evopolicy_common.transport import Link
 from evopolicy_coordinator import verify_compare
+from evopolicy_coordinator.auditing import action_log
 from evopolicy_coordinator.verify_source import RANDOM, Played, RunUnderTest
 
 _SENDER = "operator"
@@ -221,9 +221,9 @@ class Verifier:
             stored: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
                 stored = await self._fetch(outcome.trajectory)
-                actions = _log_of([row.action for row in decode(stored).rows()])
+                actions = action_log([row.action for row in decode(stored).rows()])
             elif rows is not None:
-                actions = _log_of(verify_compare.actions_of(rows))
+                actions = action_log(verify_compare.actions_of(rows))
                 self.report.from_files += 1
             else:
                 if not played.folders:
@@ -412,16 +412,6 @@ def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: Epi
         if not verify_compare.same(ours, theirs):
             return f"{name} {ours!r} and {theirs!r}"
     return None
-
-
-def _log_of(actions: Sequence[Any]) -> bytes:
-    """A trajectory's bytes with these actions and nothing else."""
-    recorder = Recorder("actions")
-    for action in actions:
-        recorder.append(
-            None, np.asarray(action) if isinstance(action, np.generic) else action, 0.0, False, False, {}
-        )
-    return recorder.finish()
 
 
 def _flat(fingerprint: Fingerprint) -> dict[str, str]:

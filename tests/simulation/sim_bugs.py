@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from evopolicy_coordinator.core import finalisation, handin, loading, machine, membership, runs
+from evopolicy_coordinator.core import audit, finalisation, handin, loading, machine, membership, runs
+from evopolicy_coordinator.core.jobs import JobGroup
 from evopolicy_coordinator.core.leases import LeaseBook
 from evopolicy_coordinator.core.ledger import Ledger
 from evopolicy_coordinator.core.queue import Profile
@@ -134,4 +135,8 @@ BUGS = (
     Bug("forget to tell a worker to stop", LeaseBook, "hear", "stop.append(item.lease_id)", "pass"),
     Bug("leave a lost worker's leases with it", LeaseBook, "lose", "list(worker.leases.values())", "[]"),
     Bug("refuse a worker that comes back", Fleet, "of_session", 'if worker.state == "lost":', "if False:"),
+    Bug("let a worker audit itself", JobGroup, "bars", "worker in self.not_on or", ""),
+    Bug("forget at a restart what is to be audited", audit, "resume", 'row.state != "open"', "True"),
+    Bug("wait for audits that nobody can play", machine.Core, "_fire", 'kind == "audits"', 'kind == "no"'),
+    Bug("draw episodes anew at a restart", audit, "sample", "run.row.audit_share", "0.5"),
 )

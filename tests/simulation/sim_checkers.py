@@ -17,7 +17,15 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import Log
 from evopolicy_coordinator.core.jobs import EARLY_VALIDATION, TRAIN
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import OutcomeRow, Row, RunStateRow, StrikeRow, SubmitRow, train_group
+from evopolicy_coordinator.core.records import (
+    AuditRow,
+    OutcomeRow,
+    Row,
+    RunStateRow,
+    StrikeRow,
+    SubmitRow,
+    train_group,
+)
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -78,6 +86,8 @@ class Checkers:
                 arrived[row.group] += 1
             elif isinstance(row, SubmitRow):
                 self._submit(row, rows)
+            elif isinstance(row, AuditRow):
+                self._audit(row)
             elif isinstance(row, StrikeRow):
                 self._strikes[row.group] = self._strikes.get(row.group, 0) + 1
                 known = self._disk.strikes.get((row.group, row.lease_id))
@@ -89,6 +99,13 @@ class Checkers:
                 want(forward, "a run's phase goes forward only", old, row)
                 pinned = old is None or old.fingerprint_class in (None, row.fingerprint_class)
                 want(pinned, "a run keeps its fingerprint class", old, row)
+
+    def _audit(self, row: AuditRow) -> None:
+        """All workers here are honest."""
+        want(row.state != "disputed" and not row.difference, "honest workers agree", row)
+        old = self._disk.audits.get(row.audit)
+        want(old is None or old.state == "open", "an audit is settled once", old, row)
+        want(row.player not in row.replayed_by, "nobody audits himself", row)
 
     def _outcome(self, row: OutcomeRow, arrived: int) -> None:
         """`arrived` counts the rows of its group ahead of it in the transaction."""
@@ -102,6 +119,8 @@ class Checkers:
             row,
             granted,
         )
+        if "/audit-" in row.group:
+            return
         parts = row.group.split("/")
         if len(parts) == 3:
             submit = self._disk.submits.get((parts[0], int(parts[1][1:])))
@@ -195,6 +214,8 @@ class Checkers:
     def _taken(self, result: wire.JobResult) -> None:
         """A result was acknowledged, so the worker forgets it."""
         group, _, first = result.job_id.rpartition("/")
+        if "/audit-" in group:
+            return
         parts = group.split("/")
         state = self._disk.states.get(parts[0])
         if state is None or state.phase == "finished":
@@ -311,9 +332,25 @@ class Checkers:
                 plan.name,
                 index,
             )
+        self._audited(plan, result)
         got = (result.status, result.best_submit_index, result.heldout_returns, result.random_heldout_returns)
         wanted = (expected.status, expected.best, expected.heldout, expected.random)
         want(got == wanted, "a run comes to what it does without faults", plan.name, got, wanted)
+
+    def _audited(self, plan: PlannedRun, result: operator.RunFinished) -> None:
+        """Of what was drawn each episode was confirmed, or it is told why it was not."""
+        share, audit = self._simulation.audit_share, result.audit
+        want((audit is None) == (share == 0.0), "audits are told where there are any", plan.name, audit)
+        if audit is None:
+            return
+        counted = audit.agreed + sum(audit.not_audited.values())
+        want(counted == audit.sampled and not audit.forgers, "honest workers are not accused", audit)
+        played = sum(
+            len(rows)
+            for group, rows in self._disk.outcomes.items()
+            if group.startswith(f"{plan.name}/") and "/audit-" not in group
+        )
+        want(share < 1.0 or audit.sampled == played, "all are drawn when all are asked for", audit, played)
 
     # ---- the core ----
 

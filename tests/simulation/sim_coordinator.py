@@ -13,11 +13,15 @@ from sim_checkers import Checkers
 from sim_store import Disk
 from sim_world import World
 
+from evopolicy_common.messages.episode import BlobRef
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import (
+    AuditEffect,
+    CompareAudit,
     Effect,
     Log,
     Persist,
+    PrepareAudit,
     ReadEvaluation,
     ReadFinished,
     ReadResults,
@@ -30,6 +34,8 @@ from evopolicy_coordinator.core.settings import CoreSettings
 PAGE = 5
 """Episodes in a page, at most."""
 FLUSH_S = 0.004
+AUDIT_S = 0.5
+"""Longest that reading and comparing a recording takes."""
 
 
 class Page:
@@ -158,11 +164,33 @@ class SimCoordinator:
                     return
                 self.checkers.committing(effect.rows)
                 self.disk.write(effect.rows)
+            elif isinstance(effect, AuditEffect):
+                world.after(AUDIT_S * world.chance.random(), self._audit, effect, self.life)
             else:
                 self._carry_out(effect)
                 if stormy and world.chance.random() < faults.coordinator_crash:
                     self.crash("after an effect")
                     return
+
+    def _audit(self, effect: PrepareAudit | CompareAudit, life: int) -> None:
+        """What the shell's thread does for an audit; a recording here is the return that was handed in."""
+        if life != self.life or self.core is None or self._later(self._audit, effect, life):
+            return
+        played = self.disk.outcomes[effect.group][effect.index].outcome
+        event: events.AuditEvent
+        if isinstance(effect, PrepareAudit):
+            actions = BlobRef(digest=repr(played.episode_return), size=1)
+            event = events.AuditPrepared(run=effect.run, audit=effect.audit, actions=actions)
+        else:
+            replays = [self.disk.outcomes[group][0].outcome.episode_return for group in effect.replays]
+            event = events.AuditCompared(
+                run=effect.run,
+                audit=effect.audit,
+                replay=len(replays),
+                with_player=None if replays[-1] == played.episode_return else "another return",
+            )
+        self._take(self.core.handle(event, self.world.now))
+        self.checkers.stepped(self.core)
 
     def _reload(self) -> None:
         self.world.note("the disk refuses; the core is discarded")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from evopolicy_coordinator.core.records import (
+    AuditRow,
     EvaluationRow,
     FinishedRow,
     OutcomeHead,
@@ -34,6 +35,7 @@ class Disk:
         self.evaluations: dict[str, EvaluationRow] = {}
         self.finished: dict[str, FinishedRow] = {}
         self.workers: dict[str, WorkerRow] = {}
+        self.audits: dict[str, AuditRow] = {}
 
     def write(self, rows: Iterable[Row]) -> None:
         for row in rows:
@@ -54,6 +56,8 @@ class Disk:
                     self.finished[row.run] = row
                 case WorkerRow():
                     self.workers[row.worker] = row
+                case AuditRow():
+                    self.audits[row.audit] = row
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         return self.outcomes.get(group, {}).get(index)
@@ -84,4 +88,5 @@ class Disk:
             strikes=tuple(row for row in self.strikes.values() if wanted(row.group)),
             evaluations=tuple(self.evaluations.values()),
             workers=tuple(self.workers.values()),
+            audits=tuple(row for row in self.audits.values() if row.run in live),
         )

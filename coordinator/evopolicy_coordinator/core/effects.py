@@ -77,6 +77,30 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
     stimulus_id: str = ""
 
 
+class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):
+    """Store the actions of the recording that outcome `index` of `group` names as a blob of its own, with nothing of what
+    came of them, and raise `AuditPrepared`. In the background: nothing waits for it."""
+
+    run: str
+    audit: str
+    group: str
+    index: int
+    stimulus_id: str = ""
+
+
+class CompareAudit(msgspec.Struct, frozen=True, kw_only=True):
+    """Compare the last of the outcomes at index 0 of `replays` with outcome `index` of `group`, and with the replay before
+    it, bit for bit; raise `AuditCompared`. In the background."""
+
+    run: str
+    audit: str
+    group: str
+    index: int
+    replays: tuple[str, ...]
+    """Groups of one outcome each, one or two of them."""
+    stimulus_id: str = ""
+
+
 class Log(msgspec.Struct, frozen=True, kw_only=True):
     """Write a log line."""
 
@@ -86,4 +110,9 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
     stimulus_id: str = ""
 
 
-Effect = Persist | Reply | ReadResults | ReadEvaluation | ReadFinished | Log
+ReadEffect = ReadResults | ReadEvaluation | ReadFinished
+
+AuditEffect = PrepareAudit | CompareAudit
+"""Answered by an event, in time."""
+
+Effect = Persist | Reply | ReadEffect | AuditEffect | Log

@@ -204,6 +204,40 @@ class LivenessLost(Event, frozen=True, kw_only=True):
     worker: str
 
 
+# ---- audits ----
+
+
+class AuditPrepared(Event, frozen=True, kw_only=True):
+    """A `PrepareAudit` was carried out."""
+
+    run: str
+    audit: str
+    actions: BlobRef | None
+    """By its digest; None when there are none to be had."""
+    error: str = ""
+    """Why there are none."""
+    at_fault: bool = False
+    """What the player handed in is no recording; else the coordinator's own store is to blame."""
+
+
+class AuditCompared(Event, frozen=True, kw_only=True):
+    """A `CompareAudit` was carried out."""
+
+    run: str
+    audit: str
+    replay: int
+    """Which replay was compared, from 1."""
+    with_player: str | None
+    """Where it parts from what the player handed in; None when they are the same."""
+    with_first: str | None = None
+    """Where it parts from the first replay; None when they are the same, or it is the first."""
+    error: str = ""
+    """Why they could not be compared, through no worker's fault."""
+
+
+AuditEvent = AuditPrepared | AuditCompared
+
+
 # ---- transport ----
 
 
@@ -231,5 +265,6 @@ AnyEvent = (
     | HeartbeatReceived
     | ResultsHandedIn
     | LivenessLost
+    | AuditEvent
     | RequestAbandoned
 )

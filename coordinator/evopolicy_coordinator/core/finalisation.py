@@ -19,7 +19,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import PolicyScope
 from evopolicy_common.messages.episode import PolicyFailure
 
-from . import events
+from . import audit, events
 from .jobs import EARLY_VALIDATION, HELDOUT, JobGroup, Template
 from .polls import Poll
 from .records import (
@@ -157,7 +157,7 @@ def advance(core: Core, run: Run, turn: Turn) -> None:
     if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
         _open(core, run, "heldout", best, HELDOUT, turn)
         return
-    if random_group(run.id) in run.hidden_returns:
+    if random_group(run.id) in run.hidden_returns and not audit.holds_up(core, run, turn):
         _finish(core, run, best, turn)
 
 
@@ -206,9 +206,11 @@ def cancel(core: Core, event: events.RunCancelled, turn: Turn) -> None:
 
 def _finish(core: Core, run: Run, best: SubmitRow | None, turn: Turn, *, cancelled: bool = False) -> None:
     """The run is over: its result becomes durable, and all that the core holds of it goes."""
+    audit.cancel(core, run, turn)
+    core.timers.disarm(("audits", run.id))
     for group in [group for group in core.groups.values() if group.run == run.id] if cancelled else []:
         core.close_group(group, turn, "run cancelled")
-    result = _result(run, best, turn.now, cancelled=cancelled)
+    result = _result(core, run, best, turn.now, cancelled=cancelled)
     turn.persist(FinishedRow(run=run.id, result=result))
     run.change(turn, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     core.forget_run(run)
@@ -217,7 +219,9 @@ def _finish(core: Core, run: Run, best: SubmitRow | None, turn: Turn, *, cancell
     turn.log("info", "run_finished", run=run.id, status=result.status, best=result.best_submit_index)
 
 
-def _result(run: Run, best: SubmitRow | None, now: float, *, cancelled: bool) -> operator.RunFinished:
+def _result(
+    core: Core, run: Run, best: SubmitRow | None, now: float, *, cancelled: bool
+) -> operator.RunFinished:
     row, state, ok = run.row, run.state, _ok(run)
     status: Literal["completed", "no_ok_submit", "error", "cancelled"] = "completed"
     error = None
@@ -270,6 +274,7 @@ def _result(run: Run, best: SubmitRow | None, now: float, *, cancelled: bool) ->
         wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
         infrastructure_retries=state.infrastructure_retries,
         nondeterministic_results=state.nondeterministic_results,
+        audit=audit.record(core, run),
     )
 
 
@@ -332,5 +337,5 @@ def progress(core: Core, run: Run) -> operator.RunProgress:
         phase, group = "random", core.groups.get(random_group(run.id))
     total = len(run.row.heldout)
     if group is None:
-        return operator.RunProgress(phase=phase, done=total, total=total)
+        return operator.RunProgress(phase=phase, done=total, total=total, waits_for=audit.waits_for(run))
     return operator.RunProgress(phase=phase, done=group.done, total=total, waits_for=core.waits_for(group))

@@ -5,7 +5,8 @@ Rules that this module owns:
   counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
   stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
-- An attempt that another worker was given, or that was never given, is ignored and logged.
+- An attempt that another worker was given, or that was never given, is ignored and logged; so is one of a worker that
+  the job's group bars.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
 - A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
   that.
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
 
+from . import audit
 from .jobs import JobState, mark_of
 from .leases import Lease, lease_id
 from .records import OutcomeRow, StrikeRow
@@ -38,7 +40,8 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         _closed(core, worker, lease, result, turn)
         return
     known = core.first_attempt >= result.attempt > 0
-    if job.holders.get(result.attempt, worker.name if known else None) != worker.name:
+    barred = job.group.bars(worker.name, worker.numerics)
+    if barred or job.holders.get(result.attempt, worker.name if known else None) != worker.name:
         turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
@@ -144,11 +147,16 @@ def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: T
         )
         group.marks[outcome.index] = mark_of(outcome)
         turn.persist(row)
-        group.flow.observe(outcome.wall_s)
-    core.count_done(len(result.episodes), turn.now)
+        if group.kind != "audit":
+            group.flow.observe(outcome.wall_s)
     core.chronicle.tell(
         turn.now, turn.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
     )
+    if group.kind == "audit":
+        audit.replayed(core, worker, group, turn)
+        return
+    core.count_done(len(result.episodes), turn.now)
+    audit.sample(core, worker, group, result.episodes, turn)
     core.concluded(group, result.episodes, turn)
 
 

@@ -17,6 +17,7 @@ def check(core: Core) -> None:
     _jobs(core)
     _queue(core)
     _workers(core)
+    _audits(core)
     for run in core.runs.values():
         run.ledger.validate()
         want(
@@ -31,6 +32,22 @@ def check(core: Core) -> None:
             len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
         )
         want(core, run.id, settled == run.ledger.settled, "settled is what ended submits took")
+
+
+def _audits(core: Core) -> None:
+    """What is open of a run's audits is with the shell, or waits for a worker."""
+    for run in core.runs.values():
+        for row in run.audits.values():
+            n = len(row.replayed_by)
+            waits = row.state == "open" and row.actions is not None and n == row.compared
+            playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in core.groups]
+            want(
+                core,
+                row.audit,
+                playing == ([n + 1] if waits else []),
+                f"an audit is played when it is due: {playing}",
+            )
+            want(core, row.audit, row.player not in row.replayed_by, "nobody audits himself")
 
 
 def want(core: Core, key: str, holds: bool, what: str) -> None:

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from .leases import Lease
     from .queue import Flow
 
-TRAIN, HELDOUT, EARLY_VALIDATION = 0, 1, 2
+TRAIN, HELDOUT, EARLY_VALIDATION, AUDIT = 0, 1, 2, 3
 """Priorities, first served first. Validation of a closed run, the random reference and evaluations are `HELDOUT`'s."""
-N_PRIORITIES = 3
+N_PRIORITIES = 4
 
-GroupKind = Literal["train", "validation", "heldout", "random", "evaluation"]
+GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
 
 class Mark(NamedTuple):
@@ -149,6 +149,14 @@ class JobGroup:
     first_leased_at: float | None = None
     n_leased: int = 0
     closed: bool = False
+    not_on: frozenset[str] = frozenset()
+    """Workers that never get it."""
+    numerics: str | None = None
+    """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
+
+    def bars(self, worker: str, numerics: str) -> bool:
+        """Whether a worker whose numbers depend on `numerics` must not play it."""
+        return worker in self.not_on or self.numerics not in (None, numerics)
 
     @property
     def n(self) -> int:

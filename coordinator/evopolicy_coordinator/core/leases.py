@@ -168,6 +168,7 @@ class LeaseBook:
             or item.lease_id != lease_id(item.job_id, item.attempt)
             or not 0 < item.attempt <= core.first_attempt
             or item.attempt in job.holders
+            or job.group.bars(worker.name, worker.numerics)
         ):
             return None
         core.queue.withdraw(job)
@@ -299,3 +300,18 @@ class LeaseBook:
             if live:
                 self.give_back(lease.job, "worker_lost", worker, turn, ran=lease.id in running)
         core.timers.arm(("forget", worker.name), turn.now + FORGET_S)
+
+    def take_away(self, name: str, turn: Turn) -> None:
+        """A worker is trusted no more: all it holds goes back, under no suspicion, and its polls end."""
+        core = self._core
+        worker = core.fleet.workers.get(name)
+        if worker is None:
+            return
+        core.scheduler.drop_poll(worker, turn)
+        if worker.beat is not None:
+            core.fleet.answer_beat(worker, tuple(worker.leases), turn)
+        for lease in list(worker.leases.values()):
+            live = lease.live
+            self.release(worker, lease, turn, "its worker is quarantined")
+            if live:
+                self.give_back(lease.job, "returned", worker, turn, ran=False)

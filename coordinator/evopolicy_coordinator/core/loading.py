@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from . import evaluations, finalisation, runs
+from . import audit, evaluations, finalisation, runs
 from .evaluations import Ended
 from .jobs import JobGroup
-from .records import RunStateRow, Snapshot, SubmitRow, validation_group
+from .records import AuditRow, RunStateRow, Snapshot, SubmitRow, validation_group
 from .runs import Run
 from .turn import Turn
 
@@ -24,16 +24,23 @@ if TYPE_CHECKING:
 def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
     """Fill an empty core."""
     core.loading = True
+    played: dict[str, dict[str, int]] = {}
     for head in snapshot.outcomes:
         core.heads.setdefault(head.group, []).append(head)
+        if "/audit-" not in head.group:
+            of_run = played.setdefault(head.group.partition("/")[0], {})
+            of_run[head.worker] = of_run.get(head.worker, 0) + 1
     for strike in snapshot.strikes:
         core.struck.setdefault(strike.group, []).append(strike.lease_id)
     for worker in snapshot.workers:
-        core.fleet.set_state(worker.worker, worker.state)
+        core.fleet.set_state(worker.worker, worker.state, worker.reason)
     states = {state.run: state for state in snapshot.states}
     submits: dict[str, list[SubmitRow]] = {}
     for submit in snapshot.submits:
         submits.setdefault(submit.run, []).append(submit)
+    audits: dict[str, list[AuditRow]] = {}
+    for each_audit in snapshot.audits:
+        audits.setdefault(each_audit.run, []).append(each_audit)
     for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
         state = states.get(row.run, RunStateRow(run=row.run))
         if state.phase == "finished":
@@ -41,7 +48,10 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
             core.capabilities[row.run] = row.capability
             core.finished[row.run] = runs.last_state(state)
         else:
-            _run(core, runs.enter(core, row, state), submits.get(row.run, []), turn)
+            run = runs.enter(core, row, state)
+            run.played = played.get(row.run, {})
+            run.audits.update((each.audit, each) for each in audits.get(row.run, ()))
+            _run(core, run, submits.get(row.run, []), turn)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
         if each.finished:
             core.evaluation_keys[each.key] = each.evaluation
@@ -86,6 +96,7 @@ def _run(core: Core, run: Run, submits: list[SubmitRow], turn: Turn) -> None:
             run.hidden_failures[validation_group(run.id, row.submit_index)] = failed
         elif row.status == "ok" and row.ineligible is None:
             finalisation.validate_early(core, run, row, turn)
+    audit.resume(core, run, turn)
     finalisation.advance(core, run, turn)
 
 

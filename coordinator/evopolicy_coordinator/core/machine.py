@@ -6,13 +6,14 @@ lateness expires nobody's lease. Every rule about budget, leases, placement and 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any, cast
 
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
 
-from . import evaluations, events, finalisation, invariants, membership, runs, status
+from . import audit, evaluations, events, finalisation, invariants, membership, runs, status
 from .effects import Effect
 from .evaluations import Ended, Evaluation
 from .jobs import JobGroup, JobState, open_jobs
@@ -32,6 +33,9 @@ from .workers import Fleet
 
 TICK_S = 1.0
 """While leases are out the core wants to be called at least so often, to notice when it is not."""
+
+DISPUTES_MAX = 50
+"""So many disputes are kept for the status."""
 
 
 class Core:
@@ -65,6 +69,8 @@ class Core:
         """What a gateway is still told of a finished run."""
         self.evaluation_keys: dict[str, str] = {}
         self.ended_evaluations: dict[str, Ended] = {}
+        self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
+        """What workers disagree on, in words, the latest last; since the core was loaded."""
         self.heads: dict[str, list[OutcomeHead]] = {}
         """While loading: what is stored of each group."""
         self.struck: dict[str, list[str]] = {}
@@ -184,6 +190,10 @@ class Core:
                 self.scheduler.reconsider(worker, turn)
         elif kind == "submit":
             self._submit_limit(key, turn)
+        elif kind == "audits":
+            run = self.runs.get(str(what))
+            if run is not None:
+                finalisation.advance(self, run, turn)
         elif kind == "forget":
             worker = self.fleet.workers.get(str(what))
             if worker is not None and worker.state == "lost":
@@ -334,6 +344,10 @@ class Core:
             finalisation.validate_early(self, run, row, turn)
         finalisation.advance(self, run, turn)
 
+    def audits_moved(self, run: Run, turn: Turn) -> None:
+        """An audit of a run is over: the run may have waited for it."""
+        finalisation.advance(self, run, turn)
+
     def counted_retry(self, job: JobState, turn: Turn) -> None:
         run = self.runs.get(job.group.run)
         if run is not None:
@@ -381,5 +395,7 @@ _HANDLERS: dict[type, Callable[[Core, Any, Turn], None]] = {
     events.HeartbeatReceived: membership.heartbeat,
     events.ResultsHandedIn: membership.handed_in,
     events.LivenessLost: membership.liveness_lost,
+    events.AuditPrepared: audit.prepared,
+    events.AuditCompared: audit.compared,
     events.RequestAbandoned: membership.abandoned,
 }

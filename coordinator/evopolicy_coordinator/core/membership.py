@@ -4,7 +4,9 @@ Rules that this module owns:
 - A request under a session that is not the worker's present one is refused, upon which the worker registers again.
 - A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
 - A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
-- Draining outlives restarts. An operator's change of a run's fingerprint class is recorded in the run.
+- Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it hands in
+  from then on is not taken. An operator may take it back.
+- Draining and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 
-from . import events, handin
+from . import events, handin, status
 from .records import WorkerRow
 from .turn import Turn
 from .workers import Worker
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 
 def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
+    if _refused_as_forger(core, event.worker, event.request, turn):
+        return
     old = core.fleet.workers.get(event.worker)
     if old is not None:
         core.scheduler.drop_poll(old, turn)
@@ -35,6 +39,7 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
         session=event.session,
         lease_ttl_s=core.settings.lease_ttl_s,
         heartbeat_s=core.settings.heartbeat_s,
+        refused=status.refused_runs(core, worker),
     )
     turn.reply(event.request, reply)
     name = worker.profile.fingerprint_class
@@ -44,7 +49,16 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
             core.pin(flow, turn)
 
 
+def _refused_as_forger(core: Core, name: str, request: events.RequestId, turn: Turn) -> bool:
+    why = core.fleet.quarantined.get(name)
+    if why is not None:
+        turn.refuse(request, "quarantined", f"worker {name!r} gets no more work here: {why}")
+    return why is not None
+
+
 def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
+    if _refused_as_forger(core, event.worker, event.request, turn):
+        return None
     worker = core.fleet.of_session(event.worker, event.session, turn.now)
     if worker is None:
         text = f"session of worker {event.worker!r} is not known here; register again"
@@ -91,6 +105,10 @@ def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
 
 
 def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
+    if event.state == "draining" and event.worker in core.fleet.quarantined:
+        text = f"{event.worker} is quarantined: {core.fleet.quarantined[event.worker]}"
+        turn.refuse(event.request, "quarantined", text)
+        return
     turn.persist(WorkerRow(worker=event.worker, state=event.state))
     worker = core.fleet.workers.get(event.worker)
     if worker is not None and event.state == "draining":

@@ -8,7 +8,7 @@ Rules that this module owns:
   has a virtual clock; a flow that was idle starts at the clock, so idleness earns nothing). A worker that has the
   environment or the bundle warm may bend this by a bounded amount.
 - Within a flow jobs go in order; what goes back after a mishap goes to the front.
-- A job is not given to a worker it avoids, as long as its lane has another.
+- A job is not given to a worker it avoids, as long as its lane has another; never to one that its group bars.
 - No operation looks at all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
 """
 
@@ -251,7 +251,9 @@ class Queue:
             if lane.n_ready[priority] == 0:
                 self._settle(lane)
 
-    def take(self, profile: Profile, worker: str, warm: Collection[str], now: float) -> JobState | None:
+    def take(
+        self, profile: Profile, worker: str, numerics: str, warm: Collection[str], now: float
+    ) -> JobState | None:
         """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
         for priority in range(N_PRIORITIES):
             passed: list[Flow] = []
@@ -261,7 +263,7 @@ class Queue:
                 if flow is None or flow.lane is None:
                     break
                 lane = flow.lane
-                job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
+                job = self._first(flow, priority, worker, numerics, now, sole=lane.workers() <= 1)
                 if job is None:
                     heapq.heappop(lane.heaps[priority])
                     flow.in_heap[priority] = False
@@ -308,8 +310,10 @@ class Queue:
         return best
 
     @staticmethod
-    def _first(flow: Flow, priority: int, worker: str, now: float, *, sole: bool) -> JobState | None:
-        """The flow's first job that does not avoid `worker`; void entries on the way are dropped."""
+    def _first(
+        flow: Flow, priority: int, worker: str, numerics: str, now: float, *, sole: bool
+    ) -> JobState | None:
+        """The flow's first job that may go to `worker` and does not avoid it; void entries on the way are dropped."""
         ready = flow.ready[priority]
         skipped: list[tuple[int, JobState]] = []
         found: JobState | None = None
@@ -317,7 +321,9 @@ class Queue:
             ticket, job = ready[0]
             if job.ticket != ticket:
                 ready.popleft()
-            elif job.avoid == worker and now < job.avoid_until and not sole:
+            elif (job.avoid == worker and now < job.avoid_until and not sole) or job.group.bars(
+                worker, numerics
+            ):
                 skipped.append(ready.popleft())
             else:
                 found = job

@@ -52,6 +52,8 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     split_secret: bool
     allowed_imports: tuple[str, ...] = ()
     denied_imports: tuple[str, ...] = ()
+    audit_share: float = 0.0
+    """Of the run's episodes, played again on another worker."""
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""
@@ -172,13 +174,55 @@ class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
 
 
 class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
-    """An operator's word on a worker. Key: `worker`."""
+    """An operator's word on a worker, or an audit's. Key: `worker`."""
 
     worker: str
-    state: Literal["active", "draining"]
+    state: Literal["active", "draining", "quarantined"]
+    reason: str = ""
+    """Why it is quarantined."""
 
 
-Row = RunRow | RunStateRow | SubmitRow | OutcomeRow | StrikeRow | EvaluationRow | FinishedRow | WorkerRow
+class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
+    """An episode that was drawn to be audited. Key: `audit`."""
+
+    run: str
+    audit: str
+    """See `audit.audit_id`; the groups of its replays begin with it."""
+    group: str
+    index: int
+    """The audited outcome's key."""
+    kind: Literal["train", "validation", "heldout", "random"]
+    """Of the group."""
+    submit_index: int
+    player: str
+    numerics: str
+    """What the player's numbers depend on; its auditors' must be the same."""
+    state: Literal["open", "agreed", "disputed", "not_audited"] = "open"
+    reason: str = ""
+    """Of the state, in words."""
+    actions: BlobRef | None = None
+    """What is played again, once it is stored and as long as the audit is open."""
+    replayed_by: tuple[str, ...] = ()
+    """Who has played it again, in order; their outcomes are durable."""
+    compared: int = 0
+    """How many of those have been compared."""
+    difference: str = ""
+    """Where the player and the first of them part."""
+    forger: str = ""
+    """The player, where it was refuted."""
+
+
+Row = (
+    RunRow
+    | RunStateRow
+    | SubmitRow
+    | OutcomeRow
+    | StrikeRow
+    | EvaluationRow
+    | FinishedRow
+    | WorkerRow
+    | AuditRow
+)
 
 
 class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
@@ -192,6 +236,8 @@ class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
     failure: FailureCategory | None = None
     trajectory: str | None = None
     """Digest of the trajectory; None when there is none."""
+    worker: str = ""
+    """Who played it; empty in rows of older versions."""
 
 
 def head_of(row: OutcomeRow) -> OutcomeHead:
@@ -205,14 +251,15 @@ def head_of(row: OutcomeRow) -> OutcomeHead:
         length=outcome.length,
         failure=None if outcome.failure is None else outcome.failure.category,
         trajectory=None if outcome.trajectory is None else outcome.trajectory.digest,
+        worker=row.worker,
     )
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """All that a core starts from, read in one transaction.
 
-    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `outcomes`
-    and `strikes` are wanted only for runs whose phase is not `finished`, and `outcomes` and `strikes` also for
+    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits`,
+    `outcomes` and `strikes` are wanted only for runs whose phase is not `finished`, and `outcomes` and `strikes` also for
     evaluations that are not finished; more does no harm. Order does not matter.
     """
 
@@ -225,6 +272,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     strikes: tuple[StrikeRow, ...] = ()
     evaluations: tuple[EvaluationRow, ...] = ()
     workers: tuple[WorkerRow, ...] = ()
+    audits: tuple[AuditRow, ...] = ()
 
 
 def submit_done(row: SubmitRow) -> SubmitDone | None:

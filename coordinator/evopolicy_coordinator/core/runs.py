@@ -25,7 +25,7 @@ from .jobs import TRAIN, JobGroup, Template
 from .ledger import Ledger, refusal
 from .polls import Poll
 from .queue import Flow
-from .records import RunRow, RunStateRow, SubmitRow, train_group
+from .records import AuditRow, RunRow, RunStateRow, SubmitRow, train_group
 from .seeds import occurrences
 from .turn import Turn
 
@@ -52,6 +52,12 @@ class Run:
     """Held-out and random group id to returns, of finished groups."""
     rollout_s: float = 0.0
     queue_s: float = 0.0
+    played: dict[str, int] = field(default_factory=dict)
+    """Worker to the run's episodes that it has played."""
+    audits: dict[str, AuditRow] = field(default_factory=dict)
+    """All that were drawn, by id."""
+    audits_until: float | None = None
+    """When the run, done otherwise, waits for its audits no more."""
 
     @property
     def id(self) -> str:
@@ -95,6 +101,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
         split_secret=event.split_secret,
         allowed_imports=event.allowed_imports,
         denied_imports=event.denied_imports,
+        audit_share=core.settings.audit_share,
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )

@@ -6,8 +6,8 @@ Rules that this module owns:
   for, and never so many that another idle worker goes without.
 - New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
 - A suspect runs alone: on an idle worker, or on one that is emptied for it; nothing else goes there meanwhile.
-- A waiting train job stops hidden jobs: early validation as often as it takes, others a bounded number of times. The
-  hidden job goes back into the queue; its worker lets go of it and polls again.
+- A waiting train job stops hidden jobs: audits and early validation as often as it takes, others a bounded number of
+  times. The hidden job goes back into the queue; its worker lets go of it and polls again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from evopolicy_common.messages import worker as wire
 
 from .events import LeaseRequested
-from .jobs import EARLY_VALIDATION, HELDOUT, N_PRIORITIES, TRAIN, JobState
+from .jobs import AUDIT, EARLY_VALIDATION, HELDOUT, N_PRIORITIES, TRAIN, JobState
 from .queue import Lane
 from .turn import Turn
 from .workers import LeasePoll, Worker
@@ -121,7 +121,7 @@ class Scheduler:
         leases: list[wire.Lease] = []
         limit = self._limit(worker, poll.n, free)
         while len(leases) < limit:
-            job = core.queue.take(worker.profile, worker.name, poll.warm, turn.now)
+            job = core.queue.take(worker.profile, worker.name, worker.numerics, poll.warm, turn.now)
             if job is None:
                 break
             leases.append(core.book.grant(job, worker, turn))
@@ -168,7 +168,9 @@ class Scheduler:
                 continue
             if job.avoid == worker.name and turn.now < job.avoid_until and lane.workers() > 1:
                 continue
-            if job.priority == EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
+            if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
+                continue
+            if job.group.bars(worker.name, worker.numerics):
                 continue
             if idle:
                 return self._alone(job, worker, turn)
@@ -278,13 +280,13 @@ class Scheduler:
         The last that were leased go first: they have come least far, and of a batch they wait behind the others.
         """
         core = self._core
-        if any(profile.hidden[EARLY_VALIDATION] or profile.hidden[HELDOUT] for profile in lane.profiles):
+        if any(any(profile.hidden) for profile in lane.profiles):
             # What is spared now may be stopped later with nothing else happening: a worker is avoided no longer, or one
             # that was to let go of a hidden job is lost.
             core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
         wanted = lane.n_ready[TRAIN] - lane.stopping
         avoided = core.queue.avoided(lane, TRAIN, turn.now)
-        for priority in (EARLY_VALIDATION, HELDOUT):
+        for priority in (AUDIT, EARLY_VALIDATION, HELDOUT):
             for profile in lane.profiles:
                 hidden = profile.hidden[priority]
                 for lease in list(islice(reversed(hidden), VICTIMS_MAX)):

@@ -46,5 +46,9 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """What waits longer is listed among the stalls."""
     fingerprint_cpu: bool = False
     """Count the CPU's features into a worker's fingerprint class too, not only packages and code."""
+    audit_share: float = 0.0
+    """Share of the episodes of new runs, 0 to 1, whose recorded actions are played again on another worker."""
+    audit_wait_s: float = 300.0
+    """A run that is done otherwise waits for its audits at most so long."""
     max_wait_s: float = 60.0
     """Upper bound on any long poll."""

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 
+from . import audit
 from .finalisation import progress
 from .jobs import JobGroup
-from .queue import Flow, Lane
+from .queue import Flow, Lane, Profile
 from .runs import Run
 
 if TYPE_CHECKING:
@@ -32,6 +33,11 @@ class CoreStatus(NamedTuple):
     workers: tuple[WorkerStatus, ...]
     runs: tuple[RunStatus, ...]
     stalls: tuple[str, ...]
+    audit_share: float
+    audits: dict[str, int]
+    """Of the unfinished runs, by state."""
+    disputes: tuple[str, ...]
+    quarantined: dict[str, str]
 
 
 class Rate:
@@ -76,22 +82,25 @@ def _a_worker(flow: Flow) -> str:
 def status(core: Core, now: float) -> CoreStatus:
     workers = tuple(_worker(core, worker, now) for worker in core.fleet.workers.values())
     runs = tuple(_run(core, run) for run in core.runs.values())
-    return CoreStatus(core.rate.total, core.rate.per_s(now), workers, runs, _stalls(core, now))
+    audits: dict[str, int] = {}
+    for row in [row for run in core.runs.values() for row in run.audits.values()]:
+        audits[row.state] = audits.get(row.state, 0) + 1
+    return CoreStatus(
+        episodes_done=core.rate.total,
+        episodes_per_s=core.rate.per_s(now),
+        workers=workers,
+        runs=runs,
+        stalls=_stalls(core, now),
+        audit_share=core.settings.audit_share,
+        audits=audits,
+        disputes=(*core.disputes, *audit.undecided(core)),
+        quarantined=dict(core.fleet.quarantined),
+    )
 
 
 def _worker(core: Core, worker: Worker, now: float) -> WorkerStatus:
     profile = worker.profile
     live = [lease for lease in worker.leases.values() if lease.live]
-    refused = {
-        run.id: _mismatch(run, profile.fingerprint_class)
-        for run in core.runs.values()
-        if run.flow.env in profile.descriptions and run.flow.pin not in (None, profile.fingerprint_class)
-    }
-    refused |= {
-        run.id: f"the run demands sandbox tier {run.flow.tier}; the worker has {', '.join(sorted(profile.key[1]))}"
-        for run in core.runs.values()
-        if run.flow.env in profile.descriptions and run.flow.tier not in profile.key[1]
-    }
     return WorkerStatus(
         worker=worker.name,
         host=worker.host,
@@ -103,16 +112,45 @@ def _worker(core: Core, worker: Worker, now: float) -> WorkerStatus:
         held=len(live),
         running=sum(lease.running for lease in live),
         last_seen_s=max(0.0, now - worker.last_seen),
-        refused=refused,
+        refused=refused_runs(core, worker),
     )
 
 
-def _mismatch(run: Run, offered: str) -> str:
-    return f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class {offered}"
+def refused_runs(core: Core, worker: Worker) -> dict[str, str]:
+    """Runs of its environments that a worker gets no work of, and why."""
+    profile = worker.profile
+    refused = {
+        run.id: _mismatch(run, profile)
+        for run in core.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.pin not in (None, profile.fingerprint_class)
+    }
+    return refused | {
+        run.id: f"the run demands sandbox tier {run.flow.tier}; the worker has {', '.join(sorted(profile.key[1]))}"
+        for run in core.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.tier not in profile.key[1]
+    }
+
+
+def _mismatch(run: Run, profile: Profile) -> str:
+    text = (
+        f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class"
+        f" {profile.fingerprint_class}"
+    )
+    began, here = run.state.fingerprint, profile.fingerprint
+    if began is None:
+        return text
+    theirs = {**began.packages, "python": began.python, "evopolicy-worker": began.code_version}
+    ours = {**here.packages, "python": here.python, "evopolicy-worker": here.code_version}
+    differing = [
+        f"{name} {theirs.get(name, 'none')} there, {ours.get(name, 'none')} here"
+        for name in sorted(theirs.keys() | ours.keys())
+        if theirs.get(name) != ours.get(name)
+    ]
+    return f"{text} ({'; '.join(differing)})" if differing else text
 
 
 def _run(core: Core, run: Run) -> RunStatus:
-    groups = [group for group in core.groups.values() if group.run == run.id]
+    groups = [group for group in core.groups.values() if group.run == run.id and group.kind != "audit"]
     waiting = [text for group in groups if (text := waits_for(core, group))]
     return RunStatus(
         run=run.id,
@@ -134,6 +172,8 @@ def _stalls(core: Core, now: float) -> tuple[str, ...]:
     stalls: list[str] = []
     limit_s = core.settings.stall_s
     for group in core.groups.values():
+        if group.kind == "audit":  # which wait as long as there is anything else to do
+            continue
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         if waiting:
             oldest = min(waiting, key=lambda job: job.since)

@@ -4,7 +4,7 @@ Rules that this module owns:
 - A worker is named; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of the
   new one may claim them for a short while, then they are lost like a lost worker's.
 - Workers of one profile (environments, tiers, fingerprint class) are interchangeable but for what they have warm.
-- A worker that is draining, lost, benched or taken by a suspect gets no more work.
+- A worker that is draining, lost, quarantined, benched or taken by a suspect gets no more work.
 - A worker whose jobs keep failing through its own fault is benched for a growing time.
 """
 
@@ -60,7 +60,9 @@ class Worker:
     host: str
     profile: Profile
     last_seen: float
-    state: Literal["active", "draining", "lost"] = "active"
+    numerics: str = ""
+    """What its numbers depend on: equal for workers that come to the same bits, the processor's features included."""
+    state: Literal["active", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; given-up ones too, until the worker no longer names them."""
     held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
@@ -96,6 +98,8 @@ class Fleet:
         self.workers: dict[str, Worker] = {}
         self.draining: dict[str, None] = {}
         """Names that an operator drained; kept over restarts."""
+        self.quarantined: dict[str, str] = {}
+        """Names that an audit found to forge, and why; until an operator takes them back."""
         self.sessions: dict[str, str] = {}
         """Present sessions to the workers whose they are."""
 
@@ -121,6 +125,7 @@ class Fleet:
             host=event.host,
             profile=profile,
             last_seen=turn.now,
+            numerics=fingerprint_class(event.fingerprint, cpu=True),
             state="lost",
         )
         if old is not None:
@@ -159,7 +164,7 @@ class Fleet:
             worker.profile.workers[worker.name] = None
             worker.profile.slots += worker.slots
 
-    def count_out(self, worker: Worker, state: Literal["draining", "lost"] = "lost") -> None:
+    def count_out(self, worker: Worker, state: Literal["draining", "lost", "quarantined"] = "lost") -> None:
         """No more work for it."""
         if worker.state == "active":
             del worker.profile.workers[worker.name]
@@ -170,19 +175,23 @@ class Fleet:
             worker.reserved.reserved = None
             worker.reserved = None
 
-    def set_state(self, name: str, state: Literal["active", "draining"]) -> None:
-        """An operator's word; holds for a worker that is not there yet, too."""
+    def set_state(
+        self, name: str, state: Literal["active", "draining", "quarantined"], reason: str = ""
+    ) -> None:
+        """An operator's word, or an audit's; holds for a worker that is not there yet, too."""
+        self.draining.pop(name, None)
+        self.quarantined.pop(name, None)
         if state == "draining":
             self.draining[name] = None
-        else:
-            self.draining.pop(name, None)
+        elif state == "quarantined":
+            self.quarantined[name] = reason
         worker = self.workers.get(name)
         if worker is None or worker.state in ("lost", state):
             return
-        if state == "draining":
-            self.count_out(worker, "draining")
-        else:
+        if state == "active":
             self._count_in(worker)
+        else:
+            self.count_out(worker, state)
 
     def forget(self, worker: Worker) -> None:
         del self.workers[worker.name]

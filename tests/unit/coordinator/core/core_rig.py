@@ -16,9 +16,12 @@ from evopolicy_common.messages.episode import (
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import (
+    AuditEffect,
+    CompareAudit,
     Effect,
     Log,
     Persist,
+    PrepareAudit,
     ReadEvaluation,
     ReadFinished,
     ReadResults,
@@ -26,6 +29,7 @@ from evopolicy_coordinator.core.effects import (
 )
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import (
+    AuditRow,
     EvaluationRow,
     FinishedRow,
     OutcomeRow,
@@ -82,6 +86,8 @@ def key_of(row: Row) -> tuple[Any, ...]:
             return (EvaluationRow, row.evaluation)
         case WorkerRow():
             return (WorkerRow, row.worker)
+        case AuditRow():
+            return (AuditRow, row.audit)
         case _:
             return (type(row), row.run)
 
@@ -95,6 +101,8 @@ class Rig:
         self.now = 1000.0
         self.replies: dict[events.RequestId, Any] = {}
         self.logs: list[Log] = []
+        self.audits: list[AuditEffect] = []
+        """What the shell is to do for audits."""
         self.incarnation = 0
         self._requests = 0
         self.core = self.load()
@@ -119,6 +127,7 @@ class Rig:
             strikes=of(StrikeRow),
             evaluations=of(EvaluationRow),
             workers=of(WorkerRow),
+            audits=of(AuditRow),
         )
 
     # ---- driving ----
@@ -156,6 +165,8 @@ class Rig:
                 case Reply():
                     assert effect.request not in self.replies, "one answer each"
                     self.replies[effect.request] = effect.message
+                case PrepareAudit() | CompareAudit():
+                    self.audits.append(effect)
                 case ReadResults() | ReadEvaluation() | ReadFinished():
                     assert effect.request not in self.replies, "one answer each"
                     self.replies[effect.request] = effect
