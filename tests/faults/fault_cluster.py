@@ -1,6 +1,8 @@
 """A cluster of real processes that is kept up as an init system would, whole runs on it, and its processes by kind.
 
-This process is their subreaper: what any of them leaves behind becomes its child, so that nothing can hide.
+This process is their subreaper: what any of them leaves behind becomes its child, so that nothing can hide. It runs in
+mount and network namespaces of its own (`enter_namespaces`): the coordinator's state lies in a small file system, and a
+worker can be put on a host of its own behind a cable.
 """
 
 from __future__ import annotations
@@ -13,13 +15,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from host_faults import Cable, Clock
 from weak_link import WeakLink
 
-from evopolicy_common import credentials
+from evopolicy_common import codec, credentials, keys
+from evopolicy_common.messages import operator
+from evopolicy_common.requests import Requester
+from evopolicy_common.transport import connect
 from evopolicy_gateway import processes
 
 SUBMITS = 3
@@ -28,6 +35,10 @@ HIDDEN = 4
 TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
 """Episodes of a whole run: train, validation of each checkpoint, held-out and the random reference."""
 PATIENCE_S = 100.0
+DISK_BYTES = 48 << 20
+"""Of each file system: the coordinator's state is on one, the run directories on another."""
+Site = Literal["one host", "two hosts", "clock that jumps"]
+"""One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable."""
 
 AGENT = '''
 import json, os, pathlib, sys, time, urllib.error, urllib.request
@@ -56,7 +67,12 @@ def submit(ids, key):
             time.sleep(0.1)
 
 for number in range(%d):
-    pathlib.Path("system/policy.py").write_text(POLICY %% (0.1 + 0.4 * number))
+    while True:
+        try:
+            pathlib.Path("system/policy.py").write_text(POLICY %% (0.1 + 0.4 * number))
+            break
+        except OSError:
+            time.sleep(0.1)
     submit(list(range(number, number + %d)), f"submit-{number}")
 '''
 
@@ -64,9 +80,10 @@ for number in range(%d):
 class Kept:
     """A program that is started again whenever it dies."""
 
-    def __init__(self, program: list[str], log: Path) -> None:
+    def __init__(self, program: list[str], log: Path, environment: Mapping[str, str]) -> None:
         self._program = program
         self._log = log
+        self._environment = {**os.environ, **environment}
         self._ending = False
         self.starts = 0
         self._start()
@@ -75,7 +92,9 @@ class Kept:
 
     def _start(self) -> None:
         with self._log.open("ab") as log:
-            self.process = subprocess.Popen(self._program, stdout=log, stderr=log, start_new_session=True)
+            self.process = subprocess.Popen(
+                self._program, stdout=log, stderr=log, start_new_session=True, env=self._environment
+            )
         self.starts += 1
 
     def _keep(self) -> None:
@@ -99,68 +118,103 @@ class Kept:
 
 
 class FaultCluster:
-    """Coordinator and a worker with two slots, kept up, with a link between them that can be made weak."""
+    """Coordinator and a worker with two slots, kept up, at one of the `Site`s."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, site: Site = "one host") -> None:
         self.root = root
-        state = root / "state"
+        root.mkdir(exist_ok=True)
+        self.state = root / "state"
+        self.runs = root / "runs"
+        for folder in (self.state, self.runs):
+            folder.mkdir(mode=0o700)
+            subprocess.run(
+                ["mount", "-t", "tmpfs", "-o", f"mode=700,size={DISK_BYTES}", "none", folder], check=True
+            )
+        self.clock = Clock(root) if site == "clock that jumps" else None
+        self._environment = {} if self.clock is None else self.clock.environment
+        self.cable = Cable() if site == "two hosts" else None
         self._ready = root / "ready.json"
         launcher = Path(__file__).with_name("fixed_coordinator.py")
-        self.coordinator = Kept(
-            [sys.executable, str(launcher), str(state), str(self._ready)], root / "coordinator.log"
-        )
+        coordinator = [sys.executable, str(launcher), str(self.state), str(self._ready)]
+        if self.cable is not None:
+            coordinator.append(f"tcp/{Cable.NEAR}:0")
+        self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
         deadline = time.monotonic() + PATIENCE_S
         while not self._ready.exists():
             assert time.monotonic() < deadline, (root / "coordinator.log").read_text()
             time.sleep(0.02)
-        self.files: dict[str, str] = json.loads(self._ready.read_text())["credentials"]
+        ready = json.loads(self._ready.read_text())
+        self.files: dict[str, str] = ready["credentials"]
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
         worker += ["--env", "toy/line", "--slots", "2"]
         worker += ["--grace", "1", "--name", "w", "--credentials", self.files["worker"]]
-        self.link = WeakLink(root / "link.sock", state / "coordinator.sock")
-        worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
-        self.worker = Kept(worker, root / "worker.log")
+        self.link: WeakLink | None = None
+        if self.cable is None:
+            self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
+            worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
+        else:
+            worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
+        self.worker = Kept(worker, root / "worker.log", self._environment)
+        self.afterwards: list[operator.CancelRun] = []
+        """What the coordinator is to be told once a fault is over."""
         self._agent = root / "agent.py"
         self._agent.write_text(AGENT % (SUBMITS, EPISODES))
 
     @property
-    def operator(self) -> credentials.Credentials:
+    def operators(self) -> credentials.Credentials:
         return credentials.read(Path(self.files["operator"]))
 
     def command(self, name: str) -> subprocess.Popen[str]:
-        """A run that has been started."""
+        """A run that has been started, or after its command was killed: that is gone on with."""
         arguments = ["run", "--env", "toy/line", "--agent", f"command:{sys.executable} {self._agent}"]
-        arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(SUBMITS * EPISODES)]
-        arguments += [
-            "--validation",
-            str(HIDDEN),
-            "--heldout",
-            str(HIDDEN),
-            "--credentials",
-            self.files["operator"],
-        ]
-        return subprocess.Popen(
-            [sys.executable, "-m", "evopolicy_gateway.cli", *arguments, "--runs", str(self.root / "runs")],
+        arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(SUBMITS * EPISODES), "--resume"]
+        arguments += ["--validation", str(HIDDEN), "--heldout", str(HIDDEN), "--runs", str(self.runs)]
+        self.run = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "evopolicy_gateway.cli", *arguments),
+                *("--credentials", self.files["operator"]),
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
             cwd=self.root,
+            env={**os.environ, **self._environment},
         )
+        return self.run
+
+    async def tell_afterwards(self) -> None:
+        told, self.afterwards = self.afterwards, []
+        if told:
+            async with connect(self.operators) as link:
+                ask = Requester(
+                    link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
+                )
+                for message in told:
+                    await ask.until_answered("cancel", message, operator.Done)
 
     def folder(self, name: str) -> Path:
-        return self.root / "runs" / "tester" / "toy_line" / name
+        return self.runs / "tester" / "toy_line" / name
 
     def find(self, kind: str) -> list[int]:
         """Processes of that kind now, in order of their ids."""
         if kind in ("coordinator", "worker"):
             return [(self.coordinator if kind == "coordinator" else self.worker).process.pid]
-        wanted = {"slot": "evopolicy_worker.env_process", "zygote": "zygote.py", "gateway": "serve_cli"}[kind]
+        if kind == "run":
+            return [] if self.run.poll() is not None else [self.run.pid]
+        wanted = {
+            "slot": "evopolicy_worker.env_process",
+            "zygote": "zygote.py",
+            "gateway": "serve_cli",
+            "keeper": "harnesses.keeper",
+        }[kind]
         return [pid for pid in processes.descendants(os.getpid()) if wanted in command_line(pid)]
 
     def strays(self) -> list[str]:
         """What lives below this process beside the coordinator, the worker and what the worker's slots need."""
         here = os.getpid()
         kept = {self.coordinator.process.pid, self.worker.process.pid}
+        if self.cable is not None:
+            kept.add(self.cable.holder.pid)
         of_worker = set(processes.descendants(self.worker.process.pid))
         found = [pid for pid in processes.descendants(here) if pid not in kept | of_worker]
         slots = [pid for pid in of_worker if "evopolicy_worker.env_process" in command_line(pid)]
@@ -169,17 +223,20 @@ class FaultCluster:
 
     def close(self) -> None:
         self.worker.end()
-        self.link.close()
+        if self.link is not None:
+            self.link.close()
         self.coordinator.end()
+        if self.cable is not None:
+            self.cable.close()
 
 
 @contextlib.contextmanager
-def fault_cluster(root: Path) -> Iterator[FaultCluster]:
+def fault_cluster(root: Path, site: Site = "one host") -> Iterator[FaultCluster]:
     """The cluster inside the `with`; everything below this process is gone after it."""
     processes.become_subreaper()
     cluster: FaultCluster | None = None
     try:
-        cluster = FaultCluster(root)
+        cluster = FaultCluster(root, site)
         yield cluster
     finally:
         if cluster is not None:

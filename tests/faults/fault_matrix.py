@@ -1,7 +1,7 @@
 """Kills, freezes and starves real processes at seeded instants of whole runs: `python tests/faults/fault_matrix.py`.
 
-A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself, its
-directory be that of the undisturbed run up to the published list (`evopolicy_common.run_difference`), its budget spent
+A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when its
+command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the published list (`evopolicy_common.run_difference`), its budget spent
 to the episode, and no process be left over. Exit code 1 when one is not.
 """
 
@@ -21,13 +21,15 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, fault_cluster, record
+from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, Site, fault_cluster, record
+from host_faults import enter_namespaces, full_file_system
 
 from evopolicy_common import codec, keys
-from evopolicy_common.errors import TransportError
+from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator
 from evopolicy_common.requests import Requester
 from evopolicy_common.run_difference import differences
@@ -40,16 +42,29 @@ LONG_FREEZE_S = 4.0
 DISK_FULL_S = 1.5
 CUT_S = 1.5
 SLOW_S = 2.0
-TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway")
-FAULTS = (
+JUMP_S = 5 * 3600
+TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "keeper", "run")
+ONE_HOST = (
     *((target, "SIGKILL") for target in TARGETS),
     *((target, "SIGSTOP") for target in TARGETS),
     ("worker", "SIGSTOP past its leases"),
-    ("coordinator", "disk full"),
+    ("everything", "SIGKILL"),
+    ("coordinator", "no file may grow"),
+    ("coordinator", "file system full"),
+    ("run", "file system full"),
     ("link", "cut"),
     ("link", "stalled past its leases"),
     ("link", "slow"),
 )
+FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
+    "one host": ONE_HOST,
+    "two hosts": (("cable", "cut"), ("cable", "cut past its leases"), ("cable", "slow")),
+    "clock that jumps": (
+        ("clock", "5 h forward"),
+        ("clock", "5 h back"),
+        ("clock", "5 h back, all restarted"),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,7 @@ class Case:
     target: str
     fault: str
     seed: int
+    site: Site = "one host"
 
     @property
     def name(self) -> str:
@@ -66,8 +82,8 @@ class Case:
 
     @property
     def after(self) -> int:
-        """Episodes of the run that are done when it strikes; of a gateway's only as long as it has work."""
-        most = SUBMITS * EPISODES if self.target == "gateway" else TOTAL - 2
+        """Episodes of the run that are done when it strikes; of the agent's side only as long as that has work."""
+        most = SUBMITS * EPISODES if self.target in ("gateway", "keeper") else TOTAL - 2
         return random.Random(self.name).randrange(most)
 
     @property
@@ -86,27 +102,60 @@ class Row:
     struck: bool = False
     """Whether the fault met a process of the run; else the run had ended before."""
     phase: str = ""
+    again: bool = False
+    """Whether its command was given again."""
     took_s: float = 0.0
     wrong: list[str] = field(default_factory=list)
 
     @property
     def outcome(self) -> str:
-        return "; ".join(self.wrong) or (
-            "same run" if self.struck or not self.fault else "same run, ended before"
-        )
+        if self.wrong:
+            return "; ".join(self.wrong)
+        if not self.struck and self.target != "nothing":
+            return "same run, ended before"
+        return "same run, its command given again" if self.again else "same run"
 
 
 def cases(seeds: int, part: int = 0, parts: int = 1) -> list[Case]:
-    """All cases, or every `parts`-th from the `part`-th on."""
-    return [Case(target, fault, seed) for seed in range(seeds) for target, fault in FAULTS][part::parts]
+    """All cases by site, or one of `parts` parts of them: of the first site every so many, the others one by one."""
+    found = []
+    for number, (site, faults) in enumerate(FAULTS.items()):
+        of_site = [Case(target, fault, seed, site) for seed in range(seeds) for target, fault in faults]
+        if number == 0:
+            found += of_site[part::parts]
+        elif number % parts == part:
+            found += of_site
+    return found
 
 
-def strike(cluster: FaultCluster, case: Case) -> bool:
+def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
     """Carries the fault out; False when there is no such process now."""
     if case.target == "link":
+        assert cluster.link is not None
         how: Literal["cut", "stalled", "slow"] = case.fault.partition(" ")[0]  # type: ignore[assignment]
         with cluster.link.weak(how):
             time.sleep({"cut": CUT_S, "stalled": LONG_FREEZE_S, "slow": SLOW_S}[how])
+        return True
+    if case.target == "cable":
+        assert cluster.cable is not None
+        with cluster.cable.slow() if case.fault == "slow" else cluster.cable.cut():
+            time.sleep({"cut": CUT_S, "slow": SLOW_S}.get(case.fault, LONG_FREEZE_S))
+        return True
+    if case.target == "clock":
+        assert cluster.clock is not None
+        cluster.clock.jump(JUMP_S if case.fault == "5 h forward" else -JUMP_S)
+        if case.fault.endswith("restarted"):
+            for kind in ("coordinator", "worker", "gateway"):
+                kill(cluster.find(kind))
+        return True
+    if case.fault == "file system full":
+        with full_file_system(cluster.state if case.target == "coordinator" else cluster.runs):
+            if case.target == "coordinator":
+                row.wrong += asyncio.run(refusals(cluster, case.name))
+            time.sleep(DISK_FULL_S)
+        return True
+    if case.target == "everything":
+        kill([pid for kind in ("run", "coordinator", "worker") for pid in cluster.find(kind)])
         return True
     pids = cluster.find(case.target)
     if not pids:
@@ -118,7 +167,7 @@ def strike(cluster: FaultCluster, case: Case) -> bool:
         elif case.fault == "SIGSTOP":
             with stopped([pid]):
                 time.sleep(FREEZE_S)
-        elif case.fault == "disk full":
+        elif case.fault == "no file may grow":
             with full_disk(pid):
                 time.sleep(DISK_FULL_S)
         else:
@@ -128,6 +177,37 @@ def strike(cluster: FaultCluster, case: Case) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def kill(pids: list[int]) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+async def refusals(cluster: FaultCluster, name: str) -> list[str]:
+    """Asks a coordinator whose disk is full for runs until it refuses one; says what is wrong about that."""
+    settings = operator.RunSettings(env="toy/line", entry="probe", model="none", exp_id="probe", budget=1)
+    taken: list[str] = []
+    wrong = [f"with a full disk it took {PATIENCE_S:g} s of new runs"]
+    deadline = time.monotonic() + PATIENCE_S
+    async with connect(cluster.operators) as link:
+        ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
+        token = link.credentials.token
+        while time.monotonic() < deadline:
+            message = operator.CreateRun(token=token, key=f"{name} {len(taken)}", settings=settings)
+            try:
+                taken.append((await ask.once("create", message, operator.RunCreated)).run)
+            except TransportError:
+                await asyncio.sleep(0.02)
+            except RefusedError as error:
+                clear = error.status == "unavailable" and "cannot write its store" in error.message
+                wrong = [] if clear and "full" in error.message else [f"it refuses with: {error}"]
+                break
+        # These wait until there is room again: then the coordinator is as it was.
+        for run in taken:
+            cluster.afterwards.append(operator.CancelRun(token=token, run=run))
+    return wrong
 
 
 @contextlib.contextmanager
@@ -158,9 +238,8 @@ async def play_until(
     cluster: FaultCluster, name: str, wanted: int | None
 ) -> tuple[subprocess.Popen[str], str]:
     """Starts a run, and comes back once `wanted` episodes of it are done or it has ended, with its phase."""
-    async with connect(cluster.operator) as link:
-        cluster_name = link.credentials.cluster
-        ask = Requester(link, lambda verb: keys.operator_key(cluster_name, verb), codec.operator_replies)
+    async with connect(cluster.operators) as link:
+        ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
         message = operator.StatusRequest(token=link.credentials.token)
         before = (await ask.until_answered("status", message, operator.StatusReply)).episodes_done
         command = cluster.command(name)
@@ -176,13 +255,20 @@ async def play_until(
 def play(cluster: FaultCluster, name: str, case: Case | None = None) -> Row:
     """One whole run, with the fault if there is one."""
     row = Row("nothing", "", 0, 0) if case is None else Row(case.target, case.fault, case.seed, case.after)
+    if cluster.clock is not None:
+        cluster.clock.jump(0)
     started = time.monotonic()
     command, row.phase = asyncio.run(play_until(cluster, name, None if case is None else case.after))
     try:
         if case is not None:
             time.sleep(case.delay_s)
-            row.struck = command.poll() is None and strike(cluster, case)
+            row.struck = command.poll() is None and strike(cluster, case, row)
+            asyncio.run(cluster.tell_afterwards())
         said = command.communicate(timeout=PATIENCE_S)[1]
+        if command.returncode and case is not None and case.target in ("run", "everything"):
+            row.again = True
+            command = cluster.command(name)
+            said = command.communicate(timeout=PATIENCE_S)[1]
         if command.returncode:
             row.wrong.append(f"exit status {command.returncode}: {' | '.join(said.splitlines()[-3:])}")
     except subprocess.TimeoutExpired:
@@ -209,22 +295,33 @@ def check(cluster: FaultCluster, row: Row, folder: Path, undisturbed: Path) -> N
 
 
 def play_all(wanted: list[Case], on_row: Callable[[Row], None], root: Path) -> bool:
-    """Plays the undisturbed run, then every case; True when each came to the same run."""
+    """Plays at each site the undisturbed run, then every case; True when each came to the same run."""
     well = True
-    with fault_cluster(root) as cluster:
-        first = play(cluster, "undisturbed")
-        check(cluster, first, cluster.folder("undisturbed"), cluster.folder("undisturbed"))
-        on_row(first)
-        for number, case in enumerate(wanted):
-            name = f"run-{number}"
-            row = play(cluster, name, case)
-            check(cluster, row, cluster.folder(name), cluster.folder("undisturbed"))
-            well = well and not row.wrong
-            on_row(row)
+    for number, site in enumerate(FAULTS):
+        of_site = [case for case in wanted if case.site == site]
+        if of_site:
+            with fault_cluster(root / f"{number}", site) as cluster:
+                well = play_at(cluster, site, of_site, on_row) and well
     left = processes.descendants(os.getpid())
     if left:
         on_row(Row("cluster", "ended", 0, 0, wrong=[f"processes are left: {left}"]))
-    return well and not first.wrong and not left
+    return well and not left
+
+
+def play_at(cluster: FaultCluster, site: Site, wanted: list[Case], on_row: Callable[[Row], None]) -> bool:
+    first = play(cluster, "undisturbed")
+    first.fault = site
+    undisturbed = cluster.folder("undisturbed")
+    check(cluster, first, undisturbed, undisturbed)
+    on_row(first)
+    well = not first.wrong
+    for number, case in enumerate(wanted):
+        name = f"run-{number}"
+        row = play(cluster, name, case)
+        check(cluster, row, cluster.folder(name), undisturbed)
+        well = well and not row.wrong
+        on_row(row)
+    return well
 
 
 def main() -> None:
@@ -252,6 +349,7 @@ def main() -> None:
             when = f"after {row.after} episodes ({row.phase})" if row.phase else ""
             print(f"{row.target:<12}{row.fault:<25}{when:<34}{row.took_s:>6} s  {row.outcome}", flush=True)
 
+    enter_namespaces()
     # Ended from outside, it still takes everything down that it has started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with contextlib.ExitStack() as stack:

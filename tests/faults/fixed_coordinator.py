@@ -38,7 +38,7 @@ class FixedKeys:
         return bytes(itertools.islice(itertools.cycle(b"fault"), n))
 
 
-async def serve(state: Path, ready_file: Path) -> None:
+async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -47,10 +47,10 @@ async def serve(state: Path, ready_file: Path) -> None:
     def on_ready(ready: process.Ready) -> None:
         write_atomically(ready_file, msgspec.json.encode(ready), mode=0o600)
 
-    await process.run(process.Options(state=state, core=SETTINGS), stop, on_ready)
+    await process.run(process.Options(state=state, listen=listen, core=SETTINGS), stop, on_ready)
 
 
 if __name__ == "__main__":
     setup_logging("info")
     intake.secrets = FixedKeys  # type: ignore[attr-defined]
-    asyncio.run(serve(Path(sys.argv[1]), Path(sys.argv[2])))
+    asyncio.run(serve(Path(sys.argv[1]), Path(sys.argv[2]), tuple(sys.argv[3:])))

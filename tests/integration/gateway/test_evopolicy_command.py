@@ -285,10 +285,14 @@ open("again", "w").write(json.dumps(again))
     assert sorted(path.name for path in (workspace / "feedback").iterdir()) == ["submit_000", "submit_001"]
 
 
-def test_a_killed_keeper_leaves_no_agent_and_the_run_is_finalised(
+def test_a_killed_keeper_leaves_nothing_of_its_agent_which_is_begun_again(
     operator_file: Path, tmp_path: Path
 ) -> None:
     code = """
+if os.path.exists("child.pid"):
+    open("gone", "w").write(str(not os.path.exists("/proc/" + open("child.pid").read())))
+    submit([1])
+    sys.exit()
 submit([0])
 hide = "import os, time\\nos.setsid()\\nopen('child.pid', 'w').write(str(os.getpid()))\\ntime.sleep(1000)"
 subprocess.Popen([sys.executable, "-c", hide])
@@ -298,17 +302,65 @@ time.sleep(1000)
     arguments += ["--jail", "none"]
     with command(tmp_path, *arguments, "--credentials", str(operator_file)) as running:
         found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
+        wait_until(found.read_text)
         (keeper,) = [
             pid
             for pid in marked(running.mark)
             if b"evopolicy_gateway.harnesses.keeper" in Path(f"/proc/{pid}/cmdline").read_bytes()
         ]
         os.kill(keeper, signal.SIGKILL)
-        exit_code, _, err = running.finish()
+        exit_code, out, err = running.finish()
         assert exit_code == 0, err
         assert marked(running.mark) == []
-    assert not Path(f"/proc/{found.read_text()}").exists()
-    assert record_in(run_dir(tmp_path)).outcome.closed_reason == "agent_failed"
+    assert "keeper died; starting it again" in " ".join(out.split())
+    assert (found.parent / "gone").read_text() == "True"
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
+
+
+def test_an_agent_whose_keeper_dies_again_and_again_has_failed(operator_file: Path, tmp_path: Path) -> None:
+    code = "submit([0])\nos.kill(os.getppid(), 9)\ntime.sleep(1000)"
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("agent_failed", 5)
+
+
+def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_told(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+first = patient_submit([0, 1], "one")
+open("here", "w")
+if len(os.listdir("feedback")) < 2:
+    time.sleep(0 if os.path.exists("again") else 1000)
+patient_submit([2, 3], "two")
+"""
+    arguments = ["run", "--env", "toy/line", "--agent", agent(tmp_path, code), "--exp-id", "t", *SMALL]
+    arguments += ["--credentials", str(operator_file), "--resume"]
+    with command(tmp_path, *arguments) as running:
+        here = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])[0]
+        with command(tmp_path, *arguments) as second:
+            code_of_second, _, err = second.finish()
+        assert code_of_second == 2
+        assert "another command plays this run" in err
+        (here.parent / "again").touch()
+        running.process.kill()
+        with command(tmp_path, *arguments, "--validation", "3") as other:
+            code_of_other, _, err = other.finish()
+        assert code_of_other == 2
+        assert "other settings" in err
+        with command(tmp_path, *arguments) as again:
+            exit_code, out, err = again.finish()
+        assert exit_code == 0, err
+        wait_until(lambda: not marked(running.mark))
+    assert "goes on with run" in out
+    record = record_in(run_dir(tmp_path))
+    assert (record.outcome.budget_used, record.outcome.closed_reason) == (4, "agent_stopped")
+    before = (run_dir(tmp_path) / "run.json").read_bytes()
+    with command(tmp_path, *arguments) as finished:
+        assert finished.finish()[0] == 0
+    assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 
 def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(operator_file: Path, tmp_path: Path) -> None:
