@@ -166,6 +166,7 @@ def local(
     slots: options.Slots = 2,
     state: options.StateFolder = None,
     data: options.DataFolder = None,
+    audit: options.Audit = 0.0,
     as_json: options.Json = False,
 ) -> None:
     """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
@@ -189,7 +190,8 @@ def local(
         )
         held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
         plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, (overwrite, resume), held)
-        _play(plans, Cluster(local_slots=slots, state=state, data=data), parallel, as_json)
+        where = Cluster(local_slots=slots, state=state, data=data, audit=audit)
+        _play(plans, where, parallel, as_json)
 
 
 @app.command("try", epilog="Example: evopolicy try examples/policies/acrobot --env gym/acrobot --cases 0-3")

@@ -44,11 +44,13 @@ async def local_cluster(
     state: Path | None = None,
     data: Path | None = None,
     allow_packages: Sequence[str] = (),
+    audit: float = 0.0,
 ) -> AsyncIterator[tuple[Cluster, asyncio.Task[None]]]:
     """The cluster inside the `async with`; everything is taken down at its end, whatever happens.
 
     `state` None: a folder that is thrown away. The task ends only with an error: a process of the cluster cannot be kept
-    up. ConfigError when it does not come up.
+    up. ConfigError when it does not come up. `audit`: share of the episodes that a second worker, brought up beside the
+    first, plays again; the two divide the slots between them.
     """
     with contextlib.ExitStack() as folders:
         if state is None:
@@ -72,18 +74,24 @@ async def local_cluster(
             coordinator += ["--data", str(data)]
         for package in allow_packages:
             coordinator += ["--allow-package", package]
+        if audit:
+            coordinator += ["--audit", str(audit)]
         held: list[Child] = []
         keepers: list[asyncio.Task[None]] = []
         try:
             keepers.append(asyncio.create_task(_keep(coordinator, logs / "coordinator.log", held)))
             cluster = await _ready(ready_file, keepers[0])
-            worker = [*_module("evopolicy_worker.cli"), "--slots", str(slots), "--grace", "1"]
+            worker = [*_module("evopolicy_worker.cli"), "--grace", "1"]
             worker += ["--credentials", cluster.credentials["worker"]]
             for env_id in env_ids:
                 worker += ["--env", env_id]
             for package in allow_packages:
                 worker += ["--allow-package", package]
-            keepers.append(asyncio.create_task(_keep(worker, logs / "worker.log", held)))
+            second = max(1, slots // 2) if audit else 0
+            for name, n in (("worker", max(1, slots - second)), ("worker-2", second)):
+                if n:
+                    program = [*worker, "--slots", str(n)]
+                    keepers.append(asyncio.create_task(_keep(program, logs / f"{name}.log", held)))
             failed = asyncio.create_task(_first_error(keepers))
             keepers.append(failed)
             yield cluster, failed

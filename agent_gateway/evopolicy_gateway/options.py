@@ -78,6 +78,16 @@ StateFolder = Annotated[
     Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
 ]
 
+Audit = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="SHARE",
+        help="Share of the episodes that a second local worker plays again from their actions, compared bit for bit.",
+    ),
+]
+
 
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What `run` and `local` take for each run, as given."""

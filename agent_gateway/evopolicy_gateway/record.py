@@ -137,6 +137,7 @@ def run_record(
             agent_log="logs/agent.jsonl" if staged else None,
         ),
         versions=_versions(finished, staged),
+        audit=finished.audit,
     )
 
 

@@ -33,6 +33,8 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     local_slots: int | None = None
     state: Path | None = None
     data: Path | None = None
+    audit: float = 0.0
+    """Of a local one: share of the episodes that a second worker plays again."""
 
 
 class RunResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,7 +69,9 @@ async def connected(
         file = where.file
         if where.local_slots is not None:
             cluster, failed = await stack.enter_async_context(
-                local_cluster(env_ids, slots=where.local_slots, state=where.state, data=where.data)
+                local_cluster(
+                    env_ids, slots=where.local_slots, state=where.state, data=where.data, audit=where.audit
+                )
             )
             file = cluster.operator_file
         operator, gateway = find_credentials(where.connect, file)

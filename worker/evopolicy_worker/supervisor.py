@@ -121,10 +121,7 @@ class Supervisor:
         # The hand-in task outlives the others: what was played is handed in before the worker goes.
         hand_in = asyncio.create_task(self._hand_in_loop())
         try:
-            async with asyncio.TaskGroup() as group:
-                lease = group.create_task(self._lease_loop())
-                slots = [group.create_task(self._slot_loop(index)) for index in range(self._options.slots)]
-                group.create_task(self._stop_when_drained(lease, slots))
+            await self._work()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._outbox_emptied.wait(), self._options.grace_s)
         finally:
@@ -132,6 +129,21 @@ class Supervisor:
             hand_in.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await hand_in
+
+    async def _work(self) -> None:
+        """Leases and plays until drained; what runs here is worth nothing any more once the coordinator refuses us."""
+        refused: BaseException | None = None
+        try:
+            async with asyncio.TaskGroup() as group:
+                lease = group.create_task(self._lease_loop())
+                slots = [group.create_task(self._slot_loop(index)) for index in range(self._options.slots)]
+                group.create_task(self._stop_when_drained(lease, slots))
+        except* RefusedError as errors:
+            refused = errors
+        while isinstance(refused, BaseExceptionGroup):
+            refused = refused.exceptions[0]
+        if refused is not None:
+            raise refused
 
     def drain(self) -> None:
         """Asks for nothing more and ends `run` when what runs is done or the grace time is over."""
@@ -162,6 +174,8 @@ class Supervisor:
             log.info(
                 "registered", worker=options.name, cluster=self._link.credentials.cluster, slots=options.slots
             )
+            for run, why in reply.refused.items():
+                log.warning("gets no work of a run", run=run, why=why)
 
     async def _register_again(self, session: str) -> None:
         if session == self._session:

@@ -71,12 +71,17 @@ def suite(
         typer.Option(help="State of the --local coordinator; default: .cluster in the sweep's folder."),
     ] = None,
     data: options.DataFolder = None,
+    audit: options.Audit = 0.0,
     as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
     """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was."""
     with fail_on_our_errors():
         if local and (connect or credentials_file):
             raise ConfigError("--local brings up a cluster of its own; it does not go with --connect")
+        if audit and not local:
+            raise ConfigError(
+                "--audit goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --audit"
+            )
         if changed not in ("refuse", "keep", "rerun"):
             raise ConfigError(f"--changed {changed!r}: there are refuse, keep, rerun")
         wanted = suite_file.read(file)
@@ -87,7 +92,7 @@ def suite(
         root = (runs or Path("runs") / wanted.name).absolute()
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots, state=state or root / ".cluster", data=data)
+            where = Cluster(local_slots=slots, state=state or root / ".cluster", data=data, audit=audit)
         order = Order(
             suite=wanted,
             runs=tuple(expanded),
