@@ -1,4 +1,5 @@
-"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, and how agents were confined.
+"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, and
+results that an audit has put in question with any others.
 
 Budget, scope, observation form and jail must agree over all runs of a suite; splits (by hash), library fingerprint and
 environment version over the runs of one environment, since environments differ in them anyway.
@@ -40,6 +41,8 @@ class MixedRunsError(EvopolicyError):
         self.mixtures = tuple(mixtures)
 
 
+IN_QUESTION = "results in dispute, or of a forger,"
+
 _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "episode budget": lambda run: str(run.budget),
     "policy scope": lambda run: run.record.experiment_dimensions.policy_scope,
@@ -55,7 +58,8 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:
-    """Everything in which runs of one suite or environment differ; empty for a fair comparison."""
+    """Everything in which runs of one suite or environment differ, and runs that are in question; empty for a fair
+    comparison."""
     by_env: dict[str, list[Run]] = {}
     for run in runs:
         by_env.setdefault(run.env, []).append(run)
@@ -66,6 +70,7 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     for env in ordered_environments(by_env):
         out += _differences(_BY_ENVIRONMENT, env, by_env[env])
         out += _differences({"fingerprint": _fingerprint_beside(by_env[env])}, env, by_env[env])
+        out += _in_question(env, by_env[env])
     return out
 
 
@@ -83,6 +88,12 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
     return lambda run: " ".join(
         f"{k}={v}" for k, v in sorted(set(run.record.versions.fingerprint.items()) - common)
     )
+
+
+def _in_question(env: str, runs: list[Run]) -> list[Mixture]:
+    """Runs whose numbers may be forged, by the word of their own audits."""
+    names = [run.name for run in runs if run.record.audit is not None and run.record.audit.in_question]
+    return [Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(names, 1))] if names else []
 
 
 def _differences(checks: dict[str, Callable[[Run], str]], where: str, runs: list[Run]) -> list[Mixture]:

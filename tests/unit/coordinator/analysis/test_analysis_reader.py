@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 from run_dirs import Version, policy, write_run
 
-from evopolicy_coordinator.analysis.comparability import MixedRunsError, mixtures, refuse_mixtures
+from evopolicy_coordinator.analysis.comparability import (
+    IN_QUESTION,
+    MixedRunsError,
+    mixtures,
+    refuse_mixtures,
+)
 from evopolicy_coordinator.analysis.reader import count_changed_lines, find_run_dirs, load_runs, read_run
 from evopolicy_coordinator.analysis.records import rows
 
@@ -182,6 +187,24 @@ def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: di
     assert what in [mixture.what for mixture in mixtures(runs)]
     with pytest.raises(MixedRunsError, match=what):
         refuse_mixtures(runs)
+
+
+@pytest.mark.parametrize(
+    ("found", "refused"),
+    [
+        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4}, False),
+        ({"share": 0.05, "sampled": 4, "not_audited": {"one worker only": 4}}, False),
+        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4, "forgers": {"w": 0}}, False),
+        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 3, "disputed": 1}, True),
+        ({"share": 0.0, "forgers": {"w": 7}}, True),
+    ],
+)
+def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, found: dict, refused: bool) -> None:
+    run = write_run(tmp_path, VERSIONS)
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**record, "audit": found}))
+    runs = load_runs([tmp_path]).runs
+    assert [mixture.what for mixture in mixtures(runs)] == [IN_QUESTION] * refused
 
 
 def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path) -> None:
