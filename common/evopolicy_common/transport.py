@@ -15,6 +15,7 @@ import contextlib
 import json
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -36,11 +37,13 @@ _CLOSE_S = 3.0
 class IncomingQuery:
     """A request to be answered once, from any coroutine or thread."""
 
-    __slots__ = ("_query", "_server", "key", "payload")
+    __slots__ = ("_query", "_server", "arrived", "key", "payload")
 
     def __init__(self, server: Server, query: zenoh.Query) -> None:
         self._server = server
         self._query: zenoh.Query | None = query
+        self.arrived = time.monotonic()
+        """When it came in, however late the event loop gets to it."""
         self.key = str(query.key_expr)
         self.payload = bytes(query.payload) if query.payload is not None else b""
 

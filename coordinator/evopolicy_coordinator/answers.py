@@ -24,6 +24,7 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator import auditing
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
@@ -206,3 +207,20 @@ def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
         stdout=outcome.stdout,
         stderr=outcome.stderr,
     )
+
+
+def lane_of(asker: str) -> int:
+    """Answers to one asker go in order."""
+    return crc32(asker.encode())
+
+
+def answer_to(query: IncomingQuery, asker: str) -> Answer:
+    """Answers the query, or ends it without an answer."""
+
+    def answer(message: Message | None) -> None:
+        if message is None:
+            query.drop()
+        else:
+            query.reply(codec.encode(message), lane_of(asker))
+
+    return answer

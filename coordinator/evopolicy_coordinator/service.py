@@ -8,7 +8,8 @@ Rules that this module owns:
 - When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
   the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
   are asked again.
-- `now` is Unix time at the start, advanced by the monotonic clock: a wall clock that is set changes nothing.
+- `now` is Unix time at the start, and not before what is on disk, advanced by the monotonic clock: a wall clock that is
+  set changes nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import hmac
 import time
 from collections.abc import Callable, Coroutine
 from importlib import metadata
-from zlib import crc32
 
 import msgspec
 import structlog
@@ -29,11 +29,18 @@ from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
 from evopolicy_common.transport import IncomingQuery
-from evopolicy_coordinator.answers import Answer, Answers
+from evopolicy_coordinator.answers import Answers, answer_to, lane_of
 from evopolicy_coordinator.claims import Claims
 from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
-from evopolicy_coordinator.core.events import AnyEvent, AuditEvent, EvaluationRequested, LivenessLost
+from evopolicy_coordinator.core.events import (
+    AnyEvent,
+    AuditEvent,
+    EvaluationRequested,
+    LeaseRequested,
+    LivenessLost,
+)
 from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import latest_time
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.core.workers import Worker
 from evopolicy_coordinator.intake import Intake, Parsed
@@ -175,9 +182,9 @@ class Service:
         elif isinstance(message, operator.Claim):
             self._spawn(self._serve_claim(query, message))
         elif isinstance(message, operator.StatusRequest):
-            query.reply(codec.encode(self._status(core)), _lane(parsed.asker))
+            query.reply(codec.encode(self._status(core)), lane_of(parsed.asker))
         elif isinstance(message, operator.RecordedRequest):
-            self._answers.recorded(message, _answer_to(query, parsed.asker))
+            self._answers.recorded(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
             offering = [
                 each for each in core.fleet.workers.values() if message.env in each.profile.descriptions
@@ -195,6 +202,8 @@ class Service:
             except BaseException:
                 self._take(request)
                 raise
+            if isinstance(event, LeaseRequested):
+                event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
             self._handle(event)
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
@@ -279,7 +288,7 @@ class Service:
             run = core.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 raise RefusedError("closed", f"run {parsed.asker} is closed and takes no more bundles")
-        self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, _answer_to(query, parsed.asker))
+        self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, answer_to(query, parsed.asker))
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":
@@ -290,7 +299,7 @@ class Service:
                     f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
                 )
         run = parsed.asker if parsed.room == "gw" else None
-        self._answers.get(run, message, _answer_to(query, parsed.asker))
+        self._answers.get(run, message, answer_to(query, parsed.asker))
 
     def _status(self, core: Core) -> operator.StatusReply:
         part = core.status(self.now())
@@ -379,6 +388,8 @@ class Service:
     async def _load(self) -> None:
         snapshot = await self._writer.call(Store.load)
         self._incarnation = snapshot.incarnation
+        # A clock that was set back while no coordinator ran must not make anything end before it began.
+        self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self._core, effects = Core.load(self._settings, snapshot, self.now())
         self._outbox = Outbox(self._writer, self._carry_out, self._on_storage_failure)
         self._outbox.put(effects)
@@ -425,11 +436,11 @@ class Service:
             if pending is not None:
                 query = pending.query
                 self._turned_away.answered(query.key, query.payload, effect.message, self.now())
-                query.reply(codec.encode(effect.message), _lane(pending.asker))
+                query.reply(codec.encode(effect.message), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._take(effect.request)
             if pending is not None:
-                self._answers.page(effect, _answer_to(pending.query, pending.asker))
+                self._answers.page(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
             self._answers.audit(effect, self._told_of_audit(self._incarnation))
         elif isinstance(effect, Log):
@@ -480,18 +491,3 @@ def _check_session(core: Core, name: str, session: str) -> Worker:
     if worker is None or not hmac.compare_digest(worker.session.encode(), session.encode()):
         raise RefusedError("unknown_worker", f"worker {name[:64]!r} has no such session; register again")
     return worker
-
-
-def _lane(asker: str) -> int:
-    """Answers to one asker go in order."""
-    return crc32(asker.encode())
-
-
-def _answer_to(query: IncomingQuery, asker: str) -> Answer:
-    def answer(message: Message | None) -> None:
-        if message is None:
-            query.drop()
-        else:
-            query.reply(codec.encode(message), _lane(asker))
-
-    return answer

@@ -228,6 +228,8 @@ class FaultCluster:
         self.coordinator.end()
         if self.cable is not None:
             self.cable.close()
+        for folder in (self.state, self.runs):
+            subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @contextlib.contextmanager

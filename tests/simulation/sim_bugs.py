@@ -101,6 +101,13 @@ BUGS = (
     Bug("take submits of a closed run", runs, "submit", 'run.state.phase != "open"', "False"),
     Bug("accept the same key twice", runs, "submit", "known is not None", "False"),
     Bug("never preempt", Scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:"),
+    Bug(
+        "lease to a poll that was given up unread",
+        Scheduler,
+        "poll",
+        "event.waited_s > event.wait_s + core.settings.late_s",
+        "False",
+    ),
     Bug("let a lease expire under heartbeats", LeaseBook, "hear", "lease.renewed = now", "pass"),
     Bug(
         "take a liveliness hint for the truth",

@@ -398,9 +398,7 @@ class Checkers:
     def logged(self, log: Log) -> None:
         if log.event == "job_retried":
             self.retries += 1
-            # An answer to a poll that was given up while the loop stood still goes nowhere, and its leases with it.
-            stalled = self._simulation.faults.coordinator_stall > 0.0
-            self.unreasoned += not (stalled and log.fields["mishap"] == "unlisted")
+            self.unreasoned += 1
         elif log.event == "strike_not_counted":
             self.not_counted.add(log.fields["lease"])
 

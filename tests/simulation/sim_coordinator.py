@@ -98,11 +98,19 @@ class SimCoordinator:
     # ---- in ----
 
     def receive(
-        self, endpoint: str, kind: type[events.Event], fields: dict[str, Any], answer: Callable[[Any], None]
+        self,
+        endpoint: str,
+        kind: type[events.Event],
+        fields: dict[str, Any],
+        answer: Callable[[Any], None],
+        arrived: float | None = None,
     ) -> None:
-        """A request arrives; `answer` carries its reply back."""
-        if self._later(self.receive, endpoint, kind, fields, answer):
+        """A request arrives (or has at `arrived`, and is read now); `answer` carries its reply back."""
+        arrived = self.world.now if arrived is None else arrived
+        if self._later(self.receive, endpoint, kind, fields, answer, arrived):
             return
+        if kind is events.LeaseRequested:
+            fields = {**fields, "waited_s": self.world.now - arrived}
         if self.core is None:
             return
         self._handles += 1

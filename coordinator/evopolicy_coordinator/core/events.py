@@ -178,6 +178,8 @@ class LeaseRequested(Event, frozen=True, kw_only=True):
     session: str
     n: int
     wait_s: float
+    waited_s: float = 0.0
+    """How long it lay unread: the loop stood still."""
     warm_bundles: tuple[str, ...] = ()
     warm_environments: tuple[str, ...] = ()
 

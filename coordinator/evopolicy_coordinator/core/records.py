@@ -275,6 +275,17 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     audits: tuple[AuditRow, ...] = ()
 
 
+def latest_time(snapshot: Snapshot) -> float:
+    """The latest Unix time, seconds, that the snapshot's unfinished runs and evaluations tell of; 0.0 for none."""
+    times: list[float | None] = [row.created_at for row in snapshot.runs]
+    times += [row.created_at for row in snapshot.evaluations]
+    times += [row.closed_at for row in snapshot.states]
+    times += [
+        at for row in snapshot.submits for at in (row.accepted_at, row.first_leased_at, row.completed_at)
+    ]
+    return max((at for at in times if at is not None), default=0.0)
+
+
 def submit_done(row: SubmitRow) -> SubmitDone | None:
     """The end of a submit as its gateway is told; None while it is open."""
     if row.status is None or row.completed_at is None:

@@ -4,6 +4,7 @@ Rules that this module owns:
 - Work is pulled: a worker's poll says how many leases it can take and waits until there is some. Free slots are filled
   first. Ahead of them a worker gets only short episodes, worth about `batch_s` a slot, even more of them than it asked
   for, and never so many that another idle worker goes without.
+- A poll whose time is over gets no lease: while the loop stood still its worker has given it up, and would never see it.
 - New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
 - A suspect runs alone: on an idle worker, or on one that is emptied for it; nothing else goes there meanwhile.
 - A waiting train job stops hidden jobs: audits and early validation as often as it takes, others a bounded number of
@@ -66,13 +67,14 @@ class Scheduler:
         """A worker asks for leases; an older poll of it is answered with none."""
         core = self._core
         self.drop_poll(worker, turn)
-        if event.n < 1:
+        if event.n < 1 or event.waited_s > event.wait_s + core.settings.late_s:
             turn.reply(event.request, wire.Leases(leases=()))
             return
+        wait_s = min(max(event.wait_s - event.waited_s, 0.0), core.settings.max_wait_s)
         warm = frozenset(event.warm_bundles) | frozenset(event.warm_environments)
-        worker.poll = LeasePoll(event.request, max(1, min(event.n, 2 * worker.slots)), warm)
+        n = max(1, min(event.n, 2 * worker.slots))
+        worker.poll = LeasePoll(event.request, n, warm, until=turn.now + wait_s)
         if not self._serve(worker, turn):
-            wait_s = min(max(event.wait_s, 0.0), core.settings.max_wait_s)
             core.timers.arm(("lease", worker.name), turn.now + wait_s)
             self._park(worker, turn)
 
@@ -112,6 +114,8 @@ class Scheduler:
     def _fill(self, worker: Worker, turn: Turn) -> list[wire.Lease]:
         core, poll = self._core, worker.poll
         if poll is None or not core.fleet.available(worker, turn.now):
+            return []
+        if turn.now > poll.until + core.settings.late_s:
             return []
         if core.queue.suspects and (suspect := self._suspect(worker, turn)) is not None:
             return [suspect]

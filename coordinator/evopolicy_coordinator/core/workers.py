@@ -50,6 +50,8 @@ class LeasePoll:
     request: RequestId
     n: int
     warm: frozenset[str]
+    until: float
+    """When it is answered with what there is."""
 
 
 @dataclass(slots=True, eq=False)

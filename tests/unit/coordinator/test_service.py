@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ class Asked:
     def __init__(self, key: str, message: Message) -> None:
         self.key = key
         self.payload = codec.encode(message)
+        self.arrived = time.monotonic()
         self._loop = asyncio.get_running_loop()
         self.answer: asyncio.Future[bytes | None] = self._loop.create_future()
 
@@ -113,6 +115,25 @@ class World:
     def state(self, created: operator.RunCreated) -> Asked:
         message = gateway.StateRequest(run=created.run, token=created.capability)
         return Asked(keys.gateway_key("c", created.run, "state"), message)
+
+
+def register(world: World) -> Asked:
+    """A worker of one slot registers."""
+    description = EnvironmentDescription(
+        env="toy/line", env_version="1", obs_space={}, action_space={}, max_episode_steps=1, task_text=""
+    )
+    message = worker.Register(
+        worker="w",
+        token="join",
+        protocol=codec.WIRE_VERSION,
+        slots=1,
+        tiers=("bwrap",),
+        environments=(description,),
+        fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
+    )
+    asked = Asked(keys.worker_key("c", "register"), message)
+    world.ask(asked)
+    return asked
 
 
 def play(root: Path, scenario: Callable[[World], Awaitable[None]]) -> World:
@@ -244,20 +265,7 @@ def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -
 
 def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
-        description = EnvironmentDescription(
-            env="toy/line", env_version="1", obs_space={}, action_space={}, max_episode_steps=1, task_text=""
-        )
-        register = worker.Register(
-            worker="w",
-            token="join",
-            protocol=codec.WIRE_VERSION,
-            slots=1,
-            tiers=("bwrap",),
-            environments=(description,),
-            fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
-        )
-        registering = Asked(keys.worker_key("c", "register"), register)
-        world.ask(registering)
+        registering = register(world)
         session = (await registering.message()).session
         polling = Asked(
             keys.worker_key("c", "lease"),
@@ -265,5 +273,45 @@ def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
         )
         world.ask(polling)
         assert await polling.message() == worker.Leases(leases=())
+
+    play(tmp_path, scenario)
+
+
+def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began: list[float] = []
+
+    async def first(world: World) -> None:
+        await world.create()
+        began.append(world.service.now())
+
+    async def second(world: World) -> None:
+        assert world.service.now() >= began[0] - 60.0
+
+    true_time = time.time
+    play(tmp_path, first)
+    monkeypatch.setattr(time, "time", lambda: true_time() - 5 * 3600.0)
+    play(tmp_path, second)
+
+
+def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        session = (await register(world).message()).session
+        created = await world.create()
+        request = worker.LeaseRequest(worker="w", session=session, n=1, wait_s=10.0)
+        stale, fresh = (Asked(keys.worker_key("c", "lease"), request) for _ in range(2))
+        stale.arrived -= 12.0
+        submit = gateway.Submit(
+            run=created.run,
+            token=created.capability,
+            key="k",
+            env_instances=(0,),
+            bundle=world.blobs.put(b"a bundle"),
+            bundle_error=None,
+        )
+        world.ask(Asked(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
+        assert await stale.message() == worker.Leases(leases=())
+        assert len((await fresh.message()).leases) == 1
 
     play(tmp_path, scenario)

@@ -7,6 +7,7 @@ from collections import Counter
 from core_rig import BUNDLE, Rig, result, split_of
 
 from evopolicy_common.messages import operator
+from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core import events
 
 
@@ -285,3 +286,34 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     assert "r1/s0/train" in stall
     assert "a worker that offers toy/line" in stall
     assert rig.core.story("r1/s0/train")
+
+
+def test_a_poll_that_lay_unread_until_its_worker_gave_it_up_gets_no_lease() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    rig.submit(0, 1)
+    assert rig.poll(session, 1, wait_s=10.0, waited_s=12.0) == []
+    assert len(rig.poll(session, 1, wait_s=10.0, waited_s=9.0)) == 1
+
+
+def test_a_parked_poll_that_was_given_up_while_the_loop_stood_still_gets_no_lease() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    assert rig.poll(session, 1, wait_s=10.0) is None
+    request = rig._requests
+    rig.now += 14.0
+    rig.submit(0)
+    rig.pass_time(0.0)
+    assert rig.replies[request] == wire.Leases(leases=())
+    assert len(rig.poll(session, 1)) == 1
+
+
+def test_a_poll_that_was_read_late_is_answered_while_its_worker_still_waits() -> None:
+    rig = Rig()
+    session = rig.register()
+    assert rig.poll(session, 1, wait_s=10.0, waited_s=8.0) is None
+    request = rig._requests
+    rig.pass_time(2.5)
+    assert rig.replies[request] == wire.Leases(leases=())
