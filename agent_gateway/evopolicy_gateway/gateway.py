@@ -142,7 +142,7 @@ def _load(folder: RunFolder, connect: tuple[str, ...]) -> tuple[credentials.Cred
         )
     found = credentials.read(folder.credentials)
     run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
-    return (msgspec.structs.replace(found, endpoints=connect) if connect else found), run
+    return credentials.at(found, connect), run
 
 
 def folder_of(path: Path) -> RunFolder:

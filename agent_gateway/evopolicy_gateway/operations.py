@@ -151,7 +151,7 @@ class Operations:
 def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Credentials, Credentials]:
     """The operator's credentials, and the gateways' that lie beside them. ConfigError says where it looked."""
     operator = credentials.find("operator", connect, file)
-    beside = None if file is None else file.parent / "gateway.json"
+    beside = file if file is None or file.is_dir() else file.parent / "gateway.json"
     return operator, credentials.find("gateway", connect, beside)
 
 

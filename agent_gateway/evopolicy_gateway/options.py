@@ -22,13 +22,13 @@ from evopolicy_gateway.submit_request import Bounds, ids_in
 
 Connect = Annotated[
     list[str] | None,
-    typer.Option(help="Endpoint of the coordinator, such as tcp/10.0.0.5:7447; may be repeated."),
+    typer.Option(help="Endpoint of the coordinator, such as tls/10.0.0.5:7447; may be repeated."),
 ]
 CredentialsFile = Annotated[
     Path | None,
     typer.Option(
         "--credentials",
-        help="operator.json of the coordinator's STATE/credentials; gateway.json lies beside it.",
+        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]

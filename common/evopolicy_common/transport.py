@@ -5,6 +5,8 @@ Rules that this module keeps for everybody:
 - nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire everyone's leases;
 - every declaration is held by an object, since dropping it undeclares it;
 - scouting is off and the admin space closed; who may say what is `access_control` below;
+- between machines it is mutual TLS: a machine has a certificate, a user name and a password of its own, and its rights
+  only where the certificate's common name and the user name are both its identity;
 - never fork a process that has a session open.
 """
 
@@ -26,7 +28,7 @@ from typing import Any
 import zenoh
 
 from evopolicy_common import keys
-from evopolicy_common.credentials import Credentials, Role, TlsFiles
+from evopolicy_common.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
 from evopolicy_common.errors import TransportError
 
 MAX_MESSAGE_BYTES = 16 << 20
@@ -236,7 +238,8 @@ async def serve(
 
 
 def client_config(credentials: Credentials) -> zenoh.Config:
-    """The configuration of a worker's, gateway's or operator's session."""
+    """The configuration of a worker's, gateway's or operator's session; ConfigError as `check_endpoints` says."""
+    check_endpoints(credentials)
     return _config(
         {
             **_COMMON,
@@ -252,29 +255,30 @@ def client_config(credentials: Credentials) -> zenoh.Config:
 
 
 def server_config(
-    cluster: str,
-    listen: Iterable[str],
-    passwords: Path,
-    users: dict[Role, str],
-    tls: TlsFiles | None = None,
-    connect_to: Iterable[str] = (),
+    cluster: str, listen: Iterable[str], passwords: Path, users: dict[Role, str]
 ) -> zenoh.Config:
-    """The configuration of the coordinator's session: a router that lets in only who is in the file `passwords`.
+    """The configuration of the coordinator's session for its own machine: a router that lets in who is in `passwords`.
 
     `passwords` holds a line `user:password` each; `users` tells the user name of each role, and the role its rights.
     """
-    settings: dict[str, Any] = {
-        **_COMMON,
-        "mode": "router",
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect_to),
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "transport/auth/usrpwd/dictionary_file": str(passwords),
-        "access_control": access_control(cluster, users),
-        **_tls(tls, "listen"),
-    }
-    return _config(settings)
+    return _router_config(listen, passwords, access_control(cluster, users))
+
+
+def tls_server_config(
+    cluster: str,
+    listen: Iterable[str],
+    passwords: Path,
+    machines: Iterable[tuple[MachineRole, str]],
+    tls: TlsFiles,
+) -> zenoh.Config:
+    """The configuration of the coordinator's session for other machines, over mutual TLS.
+
+    `machines` are roles and identities, as they stand in certificates and, as user names, in the file `passwords`.
+    """
+    settings = _router_config(listen, passwords, machine_access_control(cluster, machines))
+    for key, value in _tls(tls, "listen").items():
+        settings.insert_json5(key, json.dumps(value))
+    return settings
 
 
 def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
@@ -282,6 +286,26 @@ def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
 
     `declare_queryable` goes out to clients only: were it let in, one gateway could answer another's queries.
     """
+    subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
+    return _access_control(cluster, subjects, [(role, role) for role in users])
+
+
+def machine_access_control(cluster: str, machines: Iterable[tuple[MachineRole, str]]) -> dict[str, Any]:
+    """`access_control` of a session over TLS: each machine with its own name, of certificate and user alike.
+
+    A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to hold them to these rules.
+    """
+    listed = list(machines)
+    subjects = [
+        {"id": name, "usernames": [name], "cert_common_names": [name], "link_protocols": ["tls"]}
+        for _, name in listed
+    ]
+    return _access_control(cluster, subjects, [(name, role) for role, name in listed])
+
+
+def _access_control(
+    cluster: str, subjects: list[dict[str, Any]], roles: list[tuple[str, MachineRole]]
+) -> dict[str, Any]:
     asks: dict[Role, str] = {
         "worker": keys.worker_expr(cluster),
         "gateway": keys.gateway_expr(cluster),
@@ -292,15 +316,28 @@ def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
         rules.append(_rule(f"{role}_asks", ["query"], "ingress", expression))
         rules.append(_rule(f"{role}_hears", ["reply", "declare_queryable"], "egress", expression))
     rules.append(_rule("worker_lives", ["liveliness_token"], "ingress", keys.liveliness_expr(cluster)))
-    granted = {role: [f"{role}_asks", f"{role}_hears"] for role in asks}
+    granted: dict[MachineRole, list[str]] = {role: [f"{role}_asks", f"{role}_hears"] for role in asks}
     granted["worker"].append("worker_lives")
+    granted["router"] = [str(rule["id"]) for rule in rules]
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": role, "usernames": [user]} for role, user in users.items()],
-        "policies": [{"subjects": [role], "rules": granted[role]} for role in users],
+        "subjects": subjects,
+        "policies": [{"subjects": [subject], "rules": granted[role]} for subject, role in roles],
     }
+
+
+def _router_config(listen: Iterable[str], passwords: Path, rights: dict[str, Any]) -> zenoh.Config:
+    return _config(
+        {
+            **_COMMON,
+            "mode": "router",
+            "listen/endpoints": list(listen),
+            "transport/auth/usrpwd/dictionary_file": str(passwords),
+            "access_control": rights,
+        }
+    )
 
 
 _COMMON: dict[str, Any] = {
@@ -332,6 +369,8 @@ def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:
         f"{prefix}/{side}_private_key": tls.private_key,
         f"{prefix}/enable_mtls": True,
         f"{prefix}/verify_name_on_connect": True,
+        # An open link ends with the certificate that it was opened with.
+        f"{prefix}/close_link_on_expiration": True,
     }
 
 

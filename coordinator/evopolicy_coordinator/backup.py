@@ -21,7 +21,14 @@ import msgspec
 from evopolicy_common.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_common.errors import ConfigError, StorageError
 
-KEPT_FILES = ("secret", "identity.json")
+KEPT_FILES = (
+    "secret",
+    "identity.json",
+    *(
+        f"certs/{name}"
+        for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
+    ),
+)
 """What makes the cluster itself, beside its database and blobs; everything else is made again at a start."""
 DATABASE = "coordinator.sqlite"
 
@@ -64,8 +71,12 @@ def back_up(state: Path, target: Path) -> Backup:
 
 def _copy(state: Path, folder: Path) -> Backup:
     for name in KEPT_FILES:
-        with contextlib.suppress(FileNotFoundError):  # splits from files need no secret
-            write_atomically(folder / name, (state / name).read_bytes(), mode=0o600)
+        with contextlib.suppress(
+            FileNotFoundError
+        ):  # splits from files need no secret, one machine no certificates
+            data = (state / name).read_bytes()
+            (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
+            write_atomically(folder / name, data, mode=0o600)
     database = folder / DATABASE
     _copy_database(state / DATABASE, database)
     source, blobs = BlobStore(state / "blobs"), BlobStore(folder / "blobs")

@@ -14,24 +14,26 @@ from evopolicy_common.blobs import write_atomically
 from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator import process
+from evopolicy_coordinator import certs_cli, process
 from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.process import Options, Ready
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app.add_typer(certs_cli.app, name="certs")
 
 
 @app.callback(
     invoke_without_command=True,
-    epilog="Example: evopolicy-coordinator --listen tcp/0.0.0.0:7447 --state /var/lib/evopolicy",
+    epilog="Example: evopolicy-coordinator --listen tls/0.0.0.0:7447 --state /var/lib/evopolicy",
 )
 def serve(
     context: typer.Context,
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint for other machines, such as tcp/0.0.0.0:7447 (port 0: a free one); may be repeated. "
+            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may be "
+            "repeated. "
             "A unix socket in the state folder is always listened on."
         ),
     ] = None,
@@ -47,6 +49,13 @@ def serve(
             help="Folder of split files (see `evopolicy data`); default: splits from a secret in the state."
         ),
     ] = None,
+    insecure_tcp: Annotated[
+        bool,
+        typer.Option(
+            "--insecure-tcp",
+            help="Allow tcp/ beyond this machine, where tokens and results can be read on the wire.",
+        ),
+    ] = False,
     cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
     allow_package: Annotated[
         list[str] | None,
@@ -82,6 +91,7 @@ def serve(
             state=state or default_state_dir(),
             data=data,
             listen=tuple(listen or ()),
+            insecure_tcp=insecure_tcp,
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
             core=CoreSettings(audit_share=audit),
@@ -130,11 +140,11 @@ async def _run(options: Options, ready_file: Path | None) -> None:
 
 
 def _ready_line(ready: Ready) -> str:
-    where = " ".join(f"--connect {endpoint}" for endpoint in ready.endpoints[-1:])
-    return (
-        f"ready: cluster {ready.cluster}, state {ready.state}; workers join with:"
-        f" evopolicy-worker --env core16 {where} --credentials {ready.credentials['worker']}"
-    )
+    said = f"ready: cluster {ready.cluster}, state {ready.state}; workers join with:"
+    endpoint = ready.endpoints[-1]
+    if endpoint.startswith("tls/"):
+        return f"{said} evopolicy-coordinator certs issue worker NAME --state {ready.state}"
+    return f"{said} evopolicy-worker --env core16 --connect {endpoint} --credentials {ready.credentials['worker']}"
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ import msgspec
 
 from evopolicy_common import catalogue, codec, keys
 from evopolicy_common.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
@@ -26,6 +27,7 @@ from evopolicy_common.messages.episode import BlobRef, ResourceLimits
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
+from evopolicy_coordinator.machines import Machines
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import Identity
 from evopolicy_coordinator.store import stored_blobs
@@ -78,12 +80,15 @@ class Intake:
         *,
         allowed_imports: tuple[str, ...],
         denied_imports: tuple[str, ...],
+        machines: Machines | None = None,
     ) -> None:
+        """`machines`: those that hold tokens of their own, beside the state folder's; None: no others."""
         self._identity = identity
         self._blobs = blobs
         self._source = source
         self._allowed_imports = allowed_imports
         self._denied_imports = denied_imports
+        self._machines = machines
         self._prefix = keys.worker_key(identity.cluster, "")[: -len("work/")]
 
     def parse(self, key: str, payload: bytes, rights: Rights) -> Parsed:
@@ -95,7 +100,7 @@ class Intake:
             return self._parse_gateway(tail, payload, rights)
         if room == "ops":
             message = codec.decode(codec.operator_requests, payload)
-            _check_token(self._identity.operator_token, message.token)
+            self._check_token("operator", self._identity.operator_token, message.token)
             return Parsed("ops", "operator", message)
         raise RefusedError("wrong_key", f"nothing is asked on {key}")
 
@@ -103,8 +108,10 @@ class Intake:
         message = codec.decode(codec.worker_requests, payload)
         _check_key(tail, _VERBS[type(message)])
         if isinstance(message, worker.Register):
-            _check_token(self._identity.worker_token, message.token)
+            self._check_token("worker", self._identity.worker_token, message.token)
             _check_registration(message)
+        else:
+            self._check_session(message.token if isinstance(message, BlobPut | BlobGet) else message.session)
         # Everyone else names a session, which the core knows or refuses.
         name = message.sender if isinstance(message, BlobPut | BlobGet) else message.worker
         return Parsed("work", name, message)
@@ -116,6 +123,18 @@ class Intake:
         capability = rights.capability(run)
         _check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
         return Parsed("gw", run, message)
+
+    def _check_token(self, role: Role, local: str, given: str) -> None:
+        """Whether it is this machine's token for the role, or an admitted other machine's."""
+        if self._machines is None or self._machines.holder(role, given) is None:
+            _check_token(local, given)
+
+    def _check_session(self, session: str) -> None:
+        if self._machines is not None and self._machines.is_shut_out(session):
+            raise RefusedError(
+                "revoked",
+                "this machine was revoked, or issued again; ask the cluster's operator for a new folder",
+            )
 
     def is_gateways(self, key: str) -> bool:
         """Whether gateways ask on this key: what is answered there, an agent may come to see."""
@@ -147,7 +166,9 @@ class Intake:
             stimulus_id=stimulus,
             request=request,
             worker=m.worker,
-            session=secrets.token_urlsafe(16),
+            session=secrets.token_urlsafe(16)
+            if self._machines is None
+            else self._machines.session_for(m.token),
             slots=m.slots,
             tiers=m.tiers,
             environments=m.environments,

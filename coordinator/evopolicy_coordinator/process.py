@@ -13,13 +13,15 @@ from pathlib import Path
 import msgspec
 import structlog
 
-from evopolicy_common import credentials, keys, transport
+from evopolicy_common import credentials, transport
 from evopolicy_common.blobs import BlobStore
 from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator.answers import Answers
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.intake import Intake
+from evopolicy_coordinator.machines import Machines
+from evopolicy_coordinator.remote_door import declare_all, remote_door
 from evopolicy_coordinator.service import Service
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret
 from evopolicy_coordinator.state import ROLES, StateFolder, reachable, resolve_listen
@@ -31,9 +33,6 @@ SIMULATORS = ("gymnasium", "gymnasium_robotics", "mujoco", "Box2D", "minigrid", 
 """What policies may not import: the workers' sandboxes do not show it to them."""
 
 
-_LOOPBACK = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:")
-
-
 class Options(msgspec.Struct, frozen=True, kw_only=True):
     """What a coordinator is started with."""
 
@@ -42,6 +41,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Folder of split files; None derives the splits from the state folder's secret."""
     listen: tuple[str, ...] = ()
     """Endpoints beside the unix socket in the state folder; port 0 takes a free one."""
+    insecure_tcp: bool = False
+    """Whether `tcp/` may be listened on beyond this machine, where tokens and results can be read on the wire."""
     cluster: str | None = None
     allowed_packages: tuple[str, ...] = ()
     """What workers let policies import beside numpy; told in `/info`."""
@@ -53,9 +54,9 @@ class Ready(msgspec.Struct, frozen=True, kw_only=True):
 
     cluster: str
     endpoints: tuple[str, ...]
-    """As processes of this machine dial them."""
+    """As processes of this machine dial them; those of `tls/`, which need certificates, come last."""
     credentials: dict[Role, str]
-    """Paths of the credentials files by role."""
+    """Paths of this machine's credentials files by role."""
     state: str
 
 
@@ -69,7 +70,8 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         state = StateFolder.open(options.state, options.cluster)
         opened.callback(state.close)
         source = SplitSource(data=options.data, secret=load_or_create_secret(state.root))
-        listen = _listen(state, options.listen)
+        machines = Machines(state.root)
+        listen, remote = _listen(state, options, machines)
         store = Store(state.database)
         opened.callback(store.close)
         blobs = BlobStore(state.root / "blobs")
@@ -80,11 +82,16 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
             source,
             allowed_imports=("numpy", *options.allowed_packages),
             denied_imports=SIMULATORS,
+            machines=machines,
         )
         service = Service(state.identity.cluster, store, Answers(state.database, blobs), intake, options.core)
         try:
             await service.start()
-            await _serve(state, listen, service, stop, on_ready)
+            door = remote_door(
+                state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
+            )
+            async with door:
+                await _serve(state, options, listen, reachable(remote), service, stop, on_ready)
         finally:
             await service.stop()
         log.info("stopped; everything is on disk", state=str(state.root))
@@ -92,25 +99,27 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
 
 async def _serve(
     state: StateFolder,
+    options: Options,
     listen: tuple[str, ...],
+    remote: tuple[str, ...],
     service: Service,
     stop: asyncio.Event,
     on_ready: Callable[[Ready], None],
 ) -> None:
+    """Serves this machine on `listen` until `stop`; other machines are served on `remote` meanwhile."""
     cluster = state.identity.cluster
     state.write_passwords()
     endpoints = reachable(listen)
-    files = state.write_credentials(endpoints)
+    files = state.write_credentials(endpoints, insecure_tcp=options.insecure_tcp)
     config = transport.server_config(cluster, listen, state.passwords, {role: role for role in ROLES})
     async with transport.serve(config, service.on_queries) as server:
-        server.declare((keys.worker_expr(cluster), keys.gateway_expr(cluster), keys.operator_expr(cluster)))
-        server.watch_liveliness(keys.liveliness_expr(cluster), service.on_liveliness)
+        declare_all(server, cluster, service.on_liveliness)
         credentials.publish(endpoints, state.credentials)
         try:
             on_ready(
                 Ready(
                     cluster=cluster,
-                    endpoints=endpoints,
+                    endpoints=(*endpoints, *remote),
                     credentials={role: str(path) for role, path in files.items()},
                     state=str(state.root),
                 )
@@ -119,22 +128,40 @@ async def _serve(
             log.info("stopping")
         finally:
             credentials.withdraw(endpoints)
-            # While the session is still open: what was handled is answered, everyone else is let go.
+            # While the sessions are still open: what was handled is answered, everyone else is let go.
             await service.stop()
 
 
-def _listen(state: StateFolder, wanted: tuple[str, ...]) -> tuple[str, ...]:
-    """The state folder's socket, always, and what was asked for."""
-    listen = resolve_listen(list(wanted))
-    for endpoint in listen:
-        if endpoint.startswith("tcp/") and not endpoint.startswith(_LOOPBACK):
-            log.warning(
-                "passwords and results travel in the clear; keep to a trusted network", endpoint=endpoint
-            )
+def _listen(
+    state: StateFolder, options: Options, machines: Machines
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Where to listen for this machine (the state folder's socket, always, and what was asked for), and for others."""
+    for endpoint in options.listen:
+        _check_listen(endpoint, options.insecure_tcp, machines)
+    wanted = resolve_listen(list(options.listen))
+    remote = tuple(endpoint for endpoint in wanted if endpoint.startswith("tls/"))
+    listen = tuple(endpoint for endpoint in wanted if endpoint not in remote)
     try:
-        return (state.socket_endpoint, *listen)
+        return (state.socket_endpoint, *listen), remote
     except ConfigError as error:
         if not listen:
             raise
         log.warning("not listening on a unix socket", why=str(error))
-        return listen
+        return listen, remote
+
+
+def _check_listen(endpoint: str, insecure_tcp: bool, machines: Machines) -> None:
+    if endpoint.startswith("tls/"):
+        if machines.tls is None:
+            raise ConfigError(
+                f"--listen {endpoint}: there are no certificates in {machines.folder}; make them first with"
+                f" evopolicy-coordinator certs init --state {machines.folder.parent}"
+            )
+    elif endpoint.startswith("tcp/") and not credentials.stays_on_machine(endpoint):
+        if not insecure_tcp:
+            raise ConfigError(
+                f"--listen {endpoint} would send tokens and results in the clear; run `evopolicy-coordinator certs init`"
+                f" once and listen on {endpoint.replace('tcp/', 'tls/', 1)} (or, on a network that you trust, add"
+                " --insecure-tcp)"
+            )
+        log.warning("tokens and results travel in the clear; keep to a trusted network", endpoint=endpoint)

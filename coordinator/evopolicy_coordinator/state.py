@@ -3,8 +3,9 @@
     STATE/                        mode 0700, one coordinator at a time (`lock`)
       secret                      the 256 bits that hidden splits are derived from
       identity.json               the cluster's name, and each role's password and token
+      certs/                      the certificates of other machines: see machines.py
       passwords                   the same passwords, for Zenoh's router
-      credentials/<role>.json     what workers, gateways and operators connect with
+      credentials/<role>.json     what workers, gateways and operators of this machine connect with
       coordinator.sqlite          everything that must be true
       blobs/, bundles/            trajectories and videos; policy bundles
       coordinator.sock            where processes of this machine connect
@@ -92,8 +93,13 @@ class StateFolder:
             )
         return f"unixsock-stream/{path}"
 
-    def write_credentials(self, endpoints: tuple[str, ...]) -> dict[Role, Path]:
-        """Writes the three roles' files for `endpoints` and returns their paths."""
+    def write_credentials(
+        self, endpoints: tuple[str, ...], *, insecure_tcp: bool = False
+    ) -> dict[Role, Path]:
+        """Writes the three roles' files for `endpoints` and returns their paths.
+
+        `insecure_tcp`: whether who holds them may speak plain `tcp/` beyond this machine.
+        """
         tokens = {"worker": self.identity.worker_token, "operator": self.identity.operator_token}
         paths: dict[Role, Path] = {}
         for role in ROLES:
@@ -106,6 +112,7 @@ class StateFolder:
                     user=role,
                     password=self.identity.passwords[role],
                     token=tokens.get(role, ""),
+                    insecure_tcp=insecure_tcp,
                 ),
                 paths[role],
             )
@@ -118,6 +125,17 @@ class StateFolder:
     def close(self) -> None:
         """Lets another coordinator have the folder."""
         os.close(self._lock_fd)
+
+
+def cluster_of(root: Path, cluster: str | None) -> str:
+    """The name of a state folder's cluster, also while its coordinator runs; a new folder is made, and named `cluster`.
+
+    ConfigError as `StateFolder.open` says.
+    """
+    if cluster is not None and not keys.valid_name(cluster):
+        raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
+    _make_private(root)
+    return _identity(root, cluster).cluster
 
 
 def _make_private(root: Path) -> None:
@@ -172,8 +190,8 @@ def resolve_listen(endpoints: list[str]) -> tuple[str, ...]:
     resolved = []
     for endpoint in endpoints:
         protocol, slash, address = endpoint.partition("/")
-        if not slash or protocol not in ("tcp", "tls", "quic", "unixsock-stream"):
-            raise ConfigError(f"--listen {endpoint!r}: say it as tcp/HOST:PORT")
+        if not slash or protocol not in ("tcp", "tls", "unixsock-stream"):
+            raise ConfigError(f"--listen {endpoint!r}: say it as tls/HOST:PORT, or tcp/HOST:PORT")
         if protocol == "unixsock-stream":
             resolved.append(endpoint)
             continue

@@ -47,7 +47,9 @@ async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
     def on_ready(ready: process.Ready) -> None:
         write_atomically(ready_file, msgspec.json.encode(ready), mode=0o600)
 
-    await process.run(process.Options(state=state, listen=listen, core=SETTINGS), stop, on_ready)
+    await process.run(
+        process.Options(state=state, listen=listen, insecure_tcp=True, core=SETTINGS), stop, on_ready
+    )
 
 
 if __name__ == "__main__":

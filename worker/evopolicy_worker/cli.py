@@ -49,7 +49,7 @@ def work(
     ] = None,
     connect: Annotated[
         list[str] | None,
-        typer.Option(help="Endpoint of the coordinator or a router before it, such as tcp/10.0.0.5:7447."),
+        typer.Option(help="Endpoint of the coordinator or a router before it, such as tls/10.0.0.5:7447."),
     ] = None,
     slots: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Episodes at once; default: one per core.")
@@ -59,7 +59,9 @@ def work(
     ] = None,
     credentials_file: Annotated[
         Path | None,
-        typer.Option("--credentials", help="STATE/credentials/worker.json of the coordinator, copied here."),
+        typer.Option(
+            "--credentials", help="Folder of `evopolicy-coordinator certs issue worker`, or the file in it."
+        ),
     ] = None,
     allow_package: Annotated[
         list[str] | None,
@@ -71,7 +73,7 @@ def work(
 ) -> None:
     """Leases episodes from a coordinator and plays them, each policy locked in a sandbox.
 
-    Example: evopolicy-worker --env core16 --connect tcp/10.0.0.5:7447
+    Example: evopolicy-worker --env core16 --connect tls/10.0.0.5:7447 --credentials gpu-7
 
     Waits for the coordinator when it is not up yet. SIGTERM or Ctrl-C: finishes what runs, gives the rest back, exits.
     """

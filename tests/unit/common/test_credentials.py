@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from evopolicy_common import credentials
-from evopolicy_common.credentials import Credentials
+from evopolicy_common.credentials import Credentials, TlsFiles, stays_on_machine
 from evopolicy_common.errors import ConfigError
 
 
@@ -57,7 +58,94 @@ def test_without_an_endpoint_the_default_state_folder_is_looked_at() -> None:
 def test_a_named_endpoint_replaces_the_files_own(tmp_path: Path) -> None:
     path = tmp_path / "worker.json"
     credentials.write(worker(), path)
+    assert credentials.find("worker", ("tcp/127.0.0.1:1",), path).endpoints == ("tcp/127.0.0.1:1",)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/10.0.0.5:1",
+        "tcp/127.0.0.1.lab:1",
+        "tcp/[2001:db8::1]:1",
+        "tcp/lab:1",
+        "udp/127.0.0.1:1",
+        "quic/lab:1",
+    ],
+)
+def test_tokens_leave_the_machine_inside_tls_only(tmp_path: Path, endpoint: str) -> None:
+    path = tmp_path / "worker.json"
+    credentials.write(worker(), path)
+    assert not stays_on_machine(endpoint)
+    with pytest.raises(ConfigError, match="in the clear; use tls/HOST:PORT"):
+        credentials.find("worker", (endpoint,), path)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/127.0.0.1:1",
+        "tcp/127.9.9.9:1",
+        "tcp/localhost:1",
+        "tcp/[::1]:1?prio=1#iface=lo",
+        "unixsock-stream/s",
+    ],
+)
+def test_a_loopback_address_and_a_unix_socket_need_no_tls(endpoint: str) -> None:
+    assert stays_on_machine(endpoint)
+
+
+def test_plain_tcp_goes_where_the_coordinator_was_told_to_speak_it(tmp_path: Path) -> None:
+    path = tmp_path / "worker.json"
+    credentials.write(msgspec.structs.replace(worker(), insecure_tcp=True), path)
     assert credentials.find("worker", ("tcp/10.0.0.5:1",), path).endpoints == ("tcp/10.0.0.5:1",)
+
+
+def test_tls_without_a_certificate_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "worker.json"
+    credentials.write(worker(), path)
+    with pytest.raises(ConfigError, match="certs issue worker NAME"):
+        credentials.find("worker", ("tls/10.0.0.5:1",), path)
+
+
+def machines_folder(folder: Path) -> Path:
+    files = TlsFiles(root_ca="ca.pem", certificate="cert.pem", private_key="key.pem")
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("PEM")
+        (folder / name).chmod(0o600)
+    made = msgspec.structs.replace(worker("tls/10.0.0.5:7447"), tls=files)
+    credentials.write(made, folder / "worker.json")
+    return folder
+
+
+def test_a_folder_may_be_copied_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = machines_folder(tmp_path / "made").rename(tmp_path / "copied")
+    monkeypatch.chdir(tmp_path)
+    for named in (folder, folder / "worker.json", Path("copied")):
+        found = credentials.find("worker", (), named)
+        assert found.tls == TlsFiles(
+            root_ca=f"{folder}/ca.pem", certificate=f"{folder}/cert.pem", private_key=f"{folder}/key.pem"
+        )
+
+
+def test_a_folder_without_the_role_says_what_it_holds(tmp_path: Path) -> None:
+    folder = machines_folder(tmp_path / "made")
+    with pytest.raises(ConfigError, match=r"no operator credentials \(roles there: worker\)"):
+        credentials.find("operator", (), folder)
+
+
+def test_a_private_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    folder = machines_folder(tmp_path / "made")
+    (folder / "key.pem").chmod(0o644)
+    with pytest.raises(ConfigError, match=r"key\.pem may be read by others"):
+        credentials.find("worker", (), folder)
+
+
+def test_a_certificate_that_was_not_copied_is_told(tmp_path: Path) -> None:
+    folder = machines_folder(tmp_path / "made")
+    (folder / "ca.pem").unlink()
+    with pytest.raises(ConfigError, match="copy the whole folder"):
+        credentials.find("worker", (), folder)
 
 
 def test_another_roles_credentials_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,192 @@
+"""X.509 for a cluster: its own authority, the coordinator's certificate, and one for each machine that joins.
+
+Rules:
+- Bytes in, bytes out: no file, no clock. `machines.py` keeps what is made here.
+- An identity is a certificate's common name: `coordinator`, or `ROLE/NAME` of a machine. Zenoh's access rules name it.
+- Only who listens may show its certificate as a server (the extended key usage), so that a worker's or a gateway's cannot
+  stand in for the coordinator's; a server is known by the names and addresses that its clients dial.
+- The authority signs leaves only. It is this cluster's and nobody else's: no name in it is looked up anywhere.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import re
+from collections.abc import Sequence
+
+import msgspec
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from evopolicy_common.errors import ConfigError
+
+COORDINATOR = "coordinator"
+"""The common name of the coordinator's own certificate."""
+AUTHORITY_DAYS = 3650
+CLOCK_SKEW = dt.timedelta(hours=1)
+"""Certificates are valid from before they are made: machines' clocks differ."""
+_HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)(\.(?!-)[A-Za-z0-9_-]{1,63}(?<!-))*")
+
+
+class Pair(msgspec.Struct, frozen=True):
+    """A certificate and its private key, both PEM."""
+
+    certificate: bytes
+    private_key: bytes
+
+
+class Described(msgspec.Struct, frozen=True, kw_only=True):
+    """What a certificate says."""
+
+    common_name: str
+    serial: str
+    """Hexadecimal."""
+    expires: dt.datetime
+    hosts: tuple[str, ...]
+    """DNS names and addresses that it may be dialled at, as given."""
+    serves: bool
+    """Whether it may be shown by the side that listens."""
+
+
+def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
+    """A new authority. Its name holds a random part, so that no two of one cluster's are taken for each other."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"evopolicy {cluster[:24]} {x509.random_serial_number():x}"[:64])
+    certificate = (
+        _builder(name, name, key.public_key(), now, days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(signs_certificates=True), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return _pair(certificate, key)
+
+
+def issue(
+    authority: Pair, common_name: str, now: dt.datetime, days: int, *, hosts: Sequence[str] = (), serves: bool
+) -> Pair:
+    """A certificate with a new key, signed by `authority`.
+
+    `hosts`: DNS names and IP addresses that others dial it at; needed when it `serves`. ConfigError for what is no such
+    name, or a life that outlasts the authority's.
+    """
+    parent = x509.load_pem_x509_certificate(authority.certificate)
+    if now + dt.timedelta(days=days) > parent.not_valid_after_utc:
+        raise ConfigError(
+            f"{days} days is longer than the authority itself lives (until {parent.not_valid_after_utc:%Y-%m-%d});"
+            " ask for fewer with --days, or make a new authority with `certs init --force`"
+        )
+    if serves and not hosts:
+        raise ConfigError(f"{common_name} needs a --host, the name or address that others dial it at")
+    signer = serialization.load_pem_private_key(authority.private_key, password=None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    key = ec.generate_private_key(ec.SECP256R1())
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if serves:
+        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    builder = (
+        _builder(_name(common_name), parent.subject, key.public_key(), now, days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
+    )
+    if hosts:
+        names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
+        builder = builder.add_extension(names, critical=False)
+    return _pair(builder.sign(signer, hashes.SHA256()), key)
+
+
+def describe(certificate: bytes) -> Described:
+    """What a PEM certificate says; ConfigError when it is none."""
+    try:
+        found = x509.load_pem_x509_certificate(certificate)
+        names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        common_name = str(names[0].value) if names else ""
+        return Described(
+            common_name=common_name,
+            serial=f"{found.serial_number:x}",
+            expires=found.not_valid_after_utc,
+            hosts=_hosts(found),
+            serves=_serves(found),
+        )
+    except ValueError as error:
+        raise ConfigError(f"not a certificate in PEM form: {error}") from error
+
+
+def check_hosts(hosts: Sequence[str]) -> None:
+    """ConfigError naming the first that is neither a DNS name nor an address."""
+    for host in hosts:
+        _general_name(host)
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
+    except ValueError:
+        pass
+    if not _HOST_NAME.fullmatch(host) or len(host) > 253 or re.fullmatch(r"[0-9.]+", host):
+        raise ConfigError(f"--host {host!r}: a DNS name or an IP address, without protocol or port")
+    return x509.DNSName(host)
+
+
+def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ()
+    return tuple(str(name.value) for name in names)
+
+
+def _serves(certificate: x509.Certificate) -> bool:
+    try:
+        usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except x509.ExtensionNotFound:
+        return False
+    return ExtendedKeyUsageOID.SERVER_AUTH in usages
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, now: dt.datetime, days: int
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - CLOCK_SKEW)
+        .not_valid_after(now + dt.timedelta(days=days))
+    )
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Pair:
+    return Pair(
+        certificate.public_bytes(serialization.Encoding.PEM),
+        key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        ),
+    )
