@@ -1,0 +1,75 @@
+"""A real worker process that cheats: `cheating_worker.py HOW OPTIONS…`, the options being the worker's own.
+
+HOW: `honest`; `rewards` adds to every reward that it hands in, returns and recordings in accord; `return` to the returns
+alone; `old-code` tells another code version; `old-protocol` speaks another wire version. All but the last two tell the
+same fingerprint, whatever is edited meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common import codec
+from evopolicy_common.blobs import digest_of
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
+from evopolicy_common.trajectory import Recorder, decode
+from evopolicy_worker import cli
+from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.slot import Slot
+
+BONUS = 3.0
+"""What a forger adds to a reward."""
+
+
+def forge_rewards(outcome: EpisodeOutcome) -> EpisodeOutcome:
+    """The episode as if each step had paid more."""
+    ref = outcome.trajectory
+    assert ref is not None
+    assert ref.inline is not None
+    played = decode(ref.inline)
+    recorder = Recorder(played.record, played.observations)
+    total = 0.0
+    for row in played.rows():
+        reward = row.reward + BONUS
+        recorder.append(row.obs, row.action, reward, row.terminated, row.truncated, row.info)
+        total += reward
+    data = recorder.finish()
+    forged = BlobRef(digest=digest_of(data), size=len(data), inline=data)
+    return msgspec.structs.replace(outcome, episode_return=total, trajectory=forged)
+
+
+def forge_return(outcome: EpisodeOutcome) -> EpisodeOutcome:
+    """The episode with a better return than its rewards add up to."""
+    return msgspec.structs.replace(outcome, episode_return=math.nextafter(outcome.episode_return, math.inf))
+
+
+FORGERIES: dict[str, Callable[[EpisodeOutcome], EpisodeOutcome]] = {
+    "rewards": forge_rewards,
+    "return": forge_return,
+}
+
+
+class CheatingSlot(Slot):
+    """Plays, and hands in something else."""
+
+    async def play(
+        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]:
+        forge = FORGERIES[HOW]
+        return tuple(forge(outcome) for outcome in await super().play(job, bundle, on_progress))
+
+
+if __name__ == "__main__":
+    HOW = sys.argv.pop(1)
+    told = msgspec.structs.replace(fingerprint(), code_version="old" if HOW == "old-code" else "cheats")
+    cli.fingerprint = lambda: told  # type: ignore[attr-defined]
+    if HOW in FORGERIES:
+        cli.Slot = CheatingSlot  # type: ignore[attr-defined]
+    if HOW == "old-protocol":
+        codec.WIRE_VERSION = 0
+    cli.main()
