@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import shutil
 import sys
-import tempfile
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.scratch import scratch_folder
 from evopolicy_gateway.children import Child
 
 START_PATIENCE_S = 60.0
@@ -53,12 +52,7 @@ async def local_cluster(
     first, plays again; the two divide the slots between them.
     """
     with contextlib.ExitStack() as folders:
-        if state is None:
-            # In the system's own temporary folder, as a unix socket's path must be short.
-            root = Path(tempfile.mkdtemp(prefix="evopolicy-"))
-            folders.callback(shutil.rmtree, root, ignore_errors=True)
-        else:
-            root = state
+        root = folders.enter_context(scratch_folder("local")) if state is None else state
         logs = root / "logs"
         ready_file = root / "ready.json"
         ready_file.unlink(missing_ok=True)

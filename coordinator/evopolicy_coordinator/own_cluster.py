@@ -8,15 +8,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import shutil
 import sys
-import tempfile
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.scratch import scratch_folder
 from evopolicy_coordinator.process import Ready
 
 START_PATIENCE_S = 60.0
@@ -55,9 +54,7 @@ async def own_cluster(*, state: Path | None = None, data: Path | None = None) ->
     """
     with contextlib.ExitStack() as folders:
         if state is None:
-            # In the system's own temporary folder, as a unix socket's path must be short.
-            root = Path(tempfile.mkdtemp(prefix="evopolicy-"))
-            folders.callback(shutil.rmtree, root, ignore_errors=True)
+            root = folders.enter_context(scratch_folder("verify"))
         elif state.is_dir():
             root = state
         else:

@@ -11,7 +11,6 @@ import secrets
 import signal
 import socket
 import sys
-import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +25,7 @@ from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_loggin
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.scratch import scratch_folder
 from evopolicy_worker import environments
 from evopolicy_worker.cores import Cores
 from evopolicy_worker.fingerprint import fingerprint
@@ -98,11 +98,9 @@ def work(
         tiers = available_tiers()
         if not tiers:
             raise ConfigError("no sandbox tier works here; run `evopolicy-worker doctor` to see why")
-        with tempfile.TemporaryDirectory(prefix="evopolicy-worker-") as scratch:
+        with scratch_folder("worker") as scratch:
             asyncio.run(
-                _run(
-                    found, worker_name, wanted, slots, tiers, Path(scratch), tuple(allow_package or ()), grace
-                )
+                _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
             )
 
 
