@@ -75,13 +75,14 @@ class GoldenCluster:
         self.leak = root / "leak"
         self.cases = _write_cases(root / "data" / "toy_line")
         self._log = (root / "log").open("wb")
+        self._processes: list[subprocess.Popen[bytes]] = []
         self.environment = {**os.environ, "XDG_STATE_HOME": str(root / "xdg")}
         ready = root / "ready.json"
-        self._coordinator = self._start(
+        self._start(
             *(str(TAPPED), str(self.tap), str(self.leak), "--state", str(root / "st")),
             *("--data", str(root / "data"), "--listen", "tcp/127.0.0.1:0", "--ready-file", str(ready)),
         )
-        self._wait_for(ready.exists)
+        self.wait_for(ready.exists)
         told = json.loads(ready.read_text())
         self.files: dict[str, str] = told["credentials"]
         (endpoint,) = [one for one in told["endpoints"] if one.startswith("tcp/")]
@@ -89,7 +90,7 @@ class GoldenCluster:
         self.address = (host, int(port))
         self.worker_tap = Wiretap(*self.address)
         through = self.through(self.worker_tap, "worker", root / "worker.json")
-        self._worker = self._start(
+        self._start(
             *("-m", "evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
             *("--credentials", str(through)),
         )
@@ -142,22 +143,24 @@ class GoldenCluster:
 
         return asyncio.run(asyncio.wait_for(main(), 2 * PATIENCE_S))
 
-    def wait_for(self, condition: Callable[[], object]) -> None:
-        self._wait_for(condition)
-
     def close(self) -> None:
-        for process in (self._worker, self._coordinator):
+        for process in self._processes[::-1]:
             process.terminate()
-            process.wait(timeout=PATIENCE_S)
+            try:
+                process.wait(timeout=PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         self.worker_tap.close()
         self._log.close()
 
-    def _start(self, *words: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, *words], env=self.environment, stdout=self._log, stderr=self._log
+    def _start(self, *words: str) -> None:
+        command = [sys.executable, *words]
+        self._processes.append(
+            subprocess.Popen(command, env=self.environment, stdout=self._log, stderr=self._log)
         )
 
-    def _wait_for(self, condition: Callable[[], object]) -> None:
+    def wait_for(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + 2 * PATIENCE_S
         while not condition():
             assert time.monotonic() < deadline, (self.root / "log").read_text()
