@@ -54,6 +54,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     budget_used: int = 0
     closed_reason: str = ""
     wall_s: float = 0.0
+    in_question: bool = False
+    """Audits found results of it disputed, or a forger among those who played it."""
     wrong_option: bool = False
     """It was never opened, for an option's sake."""
 
@@ -141,6 +143,9 @@ def report(results: Sequence[RunResult], console: Console) -> None:
     for result in results:
         if result.error:
             console.print(f"{result.env}: {result.error}", markup=False, highlight=False, soft_wrap=True)
+        if result.in_question:
+            text = f"{result.env}: audits put these results in question; see `audit` in run.json"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
         console.print(f"run directory: {result.run_directory}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -178,6 +183,7 @@ def _result(plan: Plan, record: RunRecord) -> RunResult:
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
         wall_s=record.timing.wall_s,
+        in_question=record.audit is not None and record.audit.in_question,
     )
 
 

@@ -38,7 +38,8 @@ def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPre
     error, at_fault = "", False
     try:
         recorded = _recording(_outcome(reader, effect.group, effect.index), blobs)
-        packed = action_log([row.action for row in recorded.rows()])
+        arrays = isinstance(recorded.actions, np.ndarray)
+        packed = action_log([np.asarray(action) if arrays else action for action in recorded.actions])
         actions = BlobRef(digest=blobs.put(packed), size=len(packed))
     except ProtocolError as caught:
         error, at_fault = f"its recording cannot be read: {caught}", True

@@ -72,6 +72,8 @@ def sample(
     if run is None or kind == "evaluation" or kind == "audit":
         return
     run.played[worker.name] = run.played.get(worker.name, 0) + len(outcomes)
+    if not run.row.audit_share:
+        return
     description = run.state.description
     for outcome in outcomes:
         if not drawn(run.row.secret, group.id, outcome.index, run.row.audit_share):
@@ -327,15 +329,15 @@ def _obstacle(core: Core, run: Run, row: AuditRow) -> str:
     """Why no worker that is known can play the audit's next replay; empty when one can, or the shell is at it."""
     if row.actions is None or len(row.replayed_by) > row.compared:
         return ""
-    had = {row.player, *row.replayed_by, *core.fleet.quarantined}
-    able = [
-        worker
-        for worker in core.fleet.workers.values()
-        if worker.name not in had and run.flow.env in worker.profile.descriptions
-    ]
-    if any(worker.numerics == row.numerics for worker in able):
-        return ""
-    return OTHERS_DIFFER if able else ONE_WORKER
+    reason = ONE_WORKER
+    for worker in core.fleet.workers.values():
+        had = worker.name == row.player or worker.name in row.replayed_by
+        if had or worker.name in core.fleet.quarantined or run.flow.env not in worker.profile.descriptions:
+            continue
+        if worker.numerics == row.numerics:
+            return ""
+        reason = OTHERS_DIFFER
+    return reason
 
 
 def cancel(core: Core, run: Run, turn: Turn) -> None:
