@@ -1,7 +1,8 @@
 """Real processes are killed, frozen and starved at seeded instants of whole runs, and every run comes to the same.
 
 All runs are played by `fault_matrix.py`, in a process of its own because it adopts whatever is left over; each test waits
-for its row. More instants: `pytest tests/faults --fault-seeds 10`; the table: `python tests/faults/fault_matrix.py`.
+for its row. All kinds of faults: `pytest tests/faults --fault-seeds 1`, more instants of each by a larger number; the table:
+`make faults`.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 def test_an_undisturbed_run_spends_its_budget_and_leaves_no_process(matrices: list[Matrix]) -> None:
     for matrix in matrices:
-        assert matrix.row("nothing", "", 0)["wrong"] == []
+        assert matrix.row("nothing", "one host", 0)["wrong"] == []
 
 
 def test_a_run_comes_to_the_same_through(case: Case, part: int, matrices: list[Matrix]) -> None:
