@@ -162,6 +162,7 @@ class Intake:
     # Workers.
 
     def registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
+        holder = None if self._machines is None else self._machines.holder("worker", m.token)
         return events.WorkerRegistered(
             stimulus_id=stimulus,
             request=request,
@@ -174,6 +175,7 @@ class Intake:
             environments=m.environments,
             fingerprint=m.fingerprint,
             host=m.host,
+            machine="" if holder is None else holder.name,
         )
 
     def lease_requested(self, m: worker.LeaseRequest, request: int, stimulus: str) -> AnyEvent:

@@ -142,7 +142,7 @@ BUGS = (
     Bug("forget to tell a worker to stop", LeaseBook, "hear", "stop.append(item.lease_id)", "pass"),
     Bug("leave a lost worker's leases with it", LeaseBook, "lose", "list(worker.leases.values())", "[]"),
     Bug("refuse a worker that comes back", Fleet, "of_session", 'if worker.state == "lost":', "if False:"),
-    Bug("let a worker audit itself", JobGroup, "bars", "worker in self.not_on or", ""),
+    Bug("let a worker audit itself", JobGroup, "bars", "worker.name in self.not_on or", ""),
     Bug("forget at a restart what is to be audited", audit, "resume", 'row.state != "open"', "True"),
     Bug("wait for audits that nobody can play", machine.Core, "_fire", 'kind == "audits"', 'kind == "no"'),
     Bug("draw episodes anew at a restart", audit, "sample", "run.row.audit_share", "0.5"),

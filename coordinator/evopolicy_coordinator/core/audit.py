@@ -6,6 +6,8 @@ Rules that this module owns:
   honestly come to other bits. Environments that do not repeat themselves are not audited.
 - Recorded actions are played, no policy: what a policy reads from a clock changes nothing. Who plays them again is told
   the actions alone, so it cannot echo what it should confirm.
+- Where machines have credentials of their own, player and auditors are of as many machines, and a forger's machine goes
+  with it: whoever brings several workers has one voice.
 - Two workers that disagree are in dispute; a third opinion decides. Who stands alone against two is named and gets no
   more leases. What is settled stays, once and for all; the run says that it is in question.
 - Audits come last in the queue and are stopped for any train job. A run that is otherwise done waits for them
@@ -42,6 +44,7 @@ FINDINGS_MAX = 100
 """Findings that a run's record keeps."""
 
 ONE_WORKER = "one worker only"
+ONE_MACHINE = "one machine only"
 OTHERS_DIFFER = "the other workers have other versions or processors"
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"
@@ -91,6 +94,7 @@ def sample(
             kind=kind,
             submit_index=group.submit_index,
             player=worker.name,
+            machines=(worker.machine,) if worker.machine else (),
             numerics=worker.numerics,
             state="not_audited" if reason else "open",
             reason=reason,
@@ -133,7 +137,8 @@ def replayed(core: Core, worker: Worker, group: JobGroup, turn: Turn) -> None:
     run, row = _open(core, group.run, group.id.rpartition(".")[0])
     core.close_group(group, turn, "played again")
     if run is not None and row is not None:
-        row = msgspec.structs.replace(row, replayed_by=(*row.replayed_by, worker.name))
+        machines = (*row.machines, worker.machine) if worker.machine else row.machines
+        row = msgspec.structs.replace(row, replayed_by=(*row.replayed_by, worker.name), machines=machines)
         turn.add(_compare(_put(run, row, turn), turn))
 
 
@@ -233,6 +238,7 @@ def _play(core: Core, run: Run, row: AuditRow, turn: Turn) -> None:
         priority=AUDIT,
         created_at=turn.now,
         not_on=frozenset((row.player, *row.replayed_by)),
+        not_of=frozenset(row.machines),
         numerics=row.numerics,
     )
     core.open_group(group, turn)
@@ -282,10 +288,16 @@ def _name(core: Core, name: str, row: AuditRow, turn: Turn) -> None:
     text = f"forged results: what it {said} as {row.group}, episode {row.index}, two other workers refute ({row.difference})"
     if name in core.fleet.quarantined:
         return
-    turn.persist(WorkerRow(worker=name, state="quarantined", reason=text))
-    turn.log("error", "forger_named", worker=name, why=text)
-    core.fleet.set_state(name, "quarantined", text)
-    core.book.take_away(name, turn)
+    workers = core.fleet.workers
+    machine = workers[name].machine if name in workers else ""
+    turn.log("error", "forger_named", worker=name, machine=machine, why=text)
+    beside = [
+        each.name for each in workers.values() if machine and each.machine == machine and each.name != name
+    ]
+    for each, why in (*((other, f"its machine's {name} {text}") for other in beside), (name, text)):
+        turn.persist(WorkerRow(worker=each, state="quarantined", reason=why, machine=machine))
+        core.fleet.set_state(each, "quarantined", why, machine)
+        core.book.take_away(each, turn)
     for run in list(core.runs.values()):
         for other in list(run.audits.values()):
             if other.state == "open" and other.player == name and other.difference:
@@ -329,14 +341,18 @@ def _obstacle(core: Core, run: Run, row: AuditRow) -> str:
     """Why no worker that is known can play the audit's next replay; empty when one can, or the shell is at it."""
     if row.actions is None or len(row.replayed_by) > row.compared:
         return ""
-    reason = ONE_WORKER
-    for worker in core.fleet.workers.values():
+    reason, fleet = ONE_WORKER, core.fleet
+    for worker in fleet.workers.values():
         had = worker.name == row.player or worker.name in row.replayed_by
-        if had or worker.name in core.fleet.quarantined or run.flow.env not in worker.profile.descriptions:
+        shut_out = worker.name in fleet.quarantined or worker.machine in fleet.quarantined_machines
+        if had or shut_out or run.flow.env not in worker.profile.descriptions:
             continue
-        if worker.numerics == row.numerics:
+        if worker.machine in row.machines:
+            reason = ONE_MACHINE if reason == ONE_WORKER else reason
+        elif worker.numerics == row.numerics:
             return ""
-        reason = OTHERS_DIFFER
+        else:
+            reason = OTHERS_DIFFER
     return reason
 
 

@@ -170,6 +170,8 @@ class WorkerRegistered(Event, frozen=True, kw_only=True):
     environments: tuple[EnvironmentDescription, ...]
     fingerprint: Fingerprint
     host: str = ""
+    machine: str = ""
+    """Whose credentials it joined with; empty for those that the state folder hands out."""
 
 
 class LeaseRequested(Event, frozen=True, kw_only=True):

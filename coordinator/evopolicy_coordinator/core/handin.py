@@ -40,7 +40,7 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         _closed(core, worker, lease, result, turn)
         return
     known = core.first_attempt >= result.attempt > 0
-    barred = job.group.bars(worker.name, worker.numerics)
+    barred = job.group.bars(worker)
     if barred or job.holders.get(result.attempt, worker.name if known else None) != worker.name:
         turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return

@@ -33,6 +33,7 @@ from .seeds import policy_seed
 if TYPE_CHECKING:
     from .leases import Lease
     from .queue import Flow
+    from .workers import Worker
 
 TRAIN, HELDOUT, EARLY_VALIDATION, AUDIT = 0, 1, 2, 3
 """Priorities, first served first. Validation of a closed run, the random reference and evaluations are `HELDOUT`'s."""
@@ -151,12 +152,16 @@ class JobGroup:
     closed: bool = False
     not_on: frozenset[str] = frozenset()
     """Workers that never get it."""
+    not_of: frozenset[str] = frozenset()
+    """Machines whose workers never get it."""
     numerics: str | None = None
     """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
 
-    def bars(self, worker: str, numerics: str) -> bool:
-        """Whether a worker whose numbers depend on `numerics` must not play it."""
-        return worker in self.not_on or self.numerics not in (None, numerics)
+    def bars(self, worker: Worker) -> bool:
+        """Whether a worker must not play it."""
+        if worker.name in self.not_on or worker.machine in self.not_of:
+            return True
+        return self.numerics not in (None, worker.numerics)
 
     @property
     def n(self) -> int:

@@ -168,7 +168,7 @@ class LeaseBook:
             or item.lease_id != lease_id(item.job_id, item.attempt)
             or not 0 < item.attempt <= core.first_attempt
             or item.attempt in job.holders
-            or job.group.bars(worker.name, worker.numerics)
+            or job.group.bars(worker)
         ):
             return None
         core.queue.withdraw(job)

@@ -33,7 +33,7 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
     for strike in snapshot.strikes:
         core.struck.setdefault(strike.group, []).append(strike.lease_id)
     for worker in snapshot.workers:
-        core.fleet.set_state(worker.worker, worker.state, worker.reason)
+        core.fleet.set_state(worker.worker, worker.state, worker.reason, worker.machine)
     states = {state.run: state for state in snapshot.states}
     submits: dict[str, list[SubmitRow]] = {}
     for submit in snapshot.submits:

@@ -4,6 +4,7 @@ Rules that this module owns:
 - A request under a session that is not the worker's present one is refused, upon which the worker registers again.
 - A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
 - A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
+- A name is its machine's as long as the worker is there.
 - Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it hands in
   from then on is not taken. An operator may take it back.
 - Draining and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
@@ -26,9 +27,14 @@ if TYPE_CHECKING:
 
 
 def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
-    if _refused_as_forger(core, event.worker, event.request, turn):
+    if _refused_as_forger(core, event.worker, event.machine, event.request, turn):
         return
     old = core.fleet.workers.get(event.worker)
+    if old is not None and old.state != "lost" and old.machine != event.machine:
+        # Else one machine could play under another's name, and have it blamed.
+        text = f"a worker of another machine is called {event.worker!r}; choose another --name"
+        turn.refuse(event.request, "name_taken", text)
+        return
     if old is not None:
         core.scheduler.drop_poll(old, turn)
         if old.beat is not None:
@@ -49,15 +55,20 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
             core.pin(flow, turn)
 
 
-def _refused_as_forger(core: Core, name: str, request: events.RequestId, turn: Turn) -> bool:
-    why = core.fleet.quarantined.get(name)
-    if why is not None:
-        turn.refuse(request, "quarantined", f"worker {name!r} gets no more work here: {why}")
-    return why is not None
+def _refused_as_forger(core: Core, name: str, machine: str, request: events.RequestId, turn: Turn) -> bool:
+    fleet = core.fleet
+    forger = name if name in fleet.quarantined else fleet.quarantined_machines.get(machine)
+    if forger is None:
+        return False
+    same = "" if forger == name else f" (as {forger!r} of the same machine)"
+    text = f"worker {name!r} gets no more work here: {fleet.quarantined[forger]}{same}"
+    turn.refuse(request, "quarantined", text)
+    return True
 
 
 def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
-    if _refused_as_forger(core, event.worker, event.request, turn):
+    known = core.fleet.workers.get(event.worker)
+    if _refused_as_forger(core, event.worker, known.machine if known else "", event.request, turn):
         return None
     worker = core.fleet.of_session(event.worker, event.session, turn.now)
     if worker is None:

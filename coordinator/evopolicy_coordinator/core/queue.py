@@ -28,6 +28,7 @@ from .jobs import N_PRIORITIES, JobState
 
 if TYPE_CHECKING:
     from .leases import Lease
+    from .workers import Worker
 
 LaneKey = tuple[str, Tier, str]
 """Environment, sandbox tier, fingerprint class."""
@@ -251,19 +252,17 @@ class Queue:
             if lane.n_ready[priority] == 0:
                 self._settle(lane)
 
-    def take(
-        self, profile: Profile, worker: str, numerics: str, warm: Collection[str], now: float
-    ) -> JobState | None:
+    def take(self, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
         """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
         for priority in range(N_PRIORITIES):
             passed: list[Flow] = []
             job: JobState | None = None
             while job is None and len(passed) < PASSES_MAX:
-                flow = self._best(profile, priority, warm)
+                flow = self._best(worker.profile, priority, warm)
                 if flow is None or flow.lane is None:
                     break
                 lane = flow.lane
-                job = self._first(flow, priority, worker, numerics, now, sole=lane.workers() <= 1)
+                job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
                 if job is None:
                     heapq.heappop(lane.heaps[priority])
                     flow.in_heap[priority] = False
@@ -310,9 +309,7 @@ class Queue:
         return best
 
     @staticmethod
-    def _first(
-        flow: Flow, priority: int, worker: str, numerics: str, now: float, *, sole: bool
-    ) -> JobState | None:
+    def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool) -> JobState | None:
         """The flow's first job that may go to `worker` and does not avoid it; void entries on the way are dropped."""
         ready = flow.ready[priority]
         skipped: list[tuple[int, JobState]] = []
@@ -321,9 +318,7 @@ class Queue:
             ticket, job = ready[0]
             if job.ticket != ticket:
                 ready.popleft()
-            elif (job.avoid == worker and now < job.avoid_until and not sole) or job.group.bars(
-                worker, numerics
-            ):
+            elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.bars(worker):
                 skipped.append(ready.popleft())
             else:
                 found = job

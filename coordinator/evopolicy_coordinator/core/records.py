@@ -180,6 +180,8 @@ class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
     state: Literal["active", "draining", "quarantined"]
     reason: str = ""
     """Why it is quarantined."""
+    machine: str = ""
+    """Whose workers are quarantined with it; empty for its own name alone."""
 
 
 class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
@@ -195,6 +197,8 @@ class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
     """Of the group."""
     submit_index: int
     player: str
+    machines: tuple[str, ...] = ()
+    """Those of the player and of who has played it again, where they have credentials of their own."""
     numerics: str
     """What the player's numbers depend on; its auditors' must be the same."""
     state: Literal["open", "agreed", "disputed", "not_audited"] = "open"

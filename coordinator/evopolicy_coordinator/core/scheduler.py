@@ -125,7 +125,7 @@ class Scheduler:
         leases: list[wire.Lease] = []
         limit = self._limit(worker, poll.n, free)
         while len(leases) < limit:
-            job = core.queue.take(worker.profile, worker.name, worker.numerics, poll.warm, turn.now)
+            job = core.queue.take(worker, poll.warm, turn.now)
             if job is None:
                 break
             leases.append(core.book.grant(job, worker, turn))
@@ -174,7 +174,7 @@ class Scheduler:
                 continue
             if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
                 continue
-            if job.group.bars(worker.name, worker.numerics):
+            if job.group.bars(worker):
                 continue
             if idle:
                 return self._alone(job, worker, turn)

@@ -62,6 +62,8 @@ class Worker:
     host: str
     profile: Profile
     last_seen: float
+    machine: str = ""
+    """Whose credentials it joined with; empty for those that the state folder hands out."""
     numerics: str = ""
     """What its numbers depend on: equal for workers that come to the same bits, the processor's features included."""
     state: Literal["active", "draining", "lost", "quarantined"] = "active"
@@ -102,6 +104,8 @@ class Fleet:
         """Names that an operator drained; kept over restarts."""
         self.quarantined: dict[str, str] = {}
         """Names that an audit found to forge, and why; until an operator takes them back."""
+        self.quarantined_machines: dict[str, str] = {}
+        """Machines of those names, to the name."""
         self.sessions: dict[str, str] = {}
         """Present sessions to the workers whose they are."""
 
@@ -127,6 +131,7 @@ class Fleet:
             host=event.host,
             profile=profile,
             last_seen=turn.now,
+            machine=event.machine,
             numerics=fingerprint_class(event.fingerprint, cpu=True),
             state="lost",
         )
@@ -178,15 +183,23 @@ class Fleet:
             worker.reserved = None
 
     def set_state(
-        self, name: str, state: Literal["active", "draining", "quarantined"], reason: str = ""
+        self,
+        name: str,
+        state: Literal["active", "draining", "quarantined"],
+        reason: str = "",
+        machine: str = "",
     ) -> None:
         """An operator's word, or an audit's; holds for a worker that is not there yet, too."""
         self.draining.pop(name, None)
-        self.quarantined.pop(name, None)
+        if self.quarantined.pop(name, None) is not None:
+            machines = self.quarantined_machines
+            self.quarantined_machines = {each: of for each, of in machines.items() if of != name}
         if state == "draining":
             self.draining[name] = None
         elif state == "quarantined":
             self.quarantined[name] = reason
+            if machine:
+                self.quarantined_machines[machine] = name
         worker = self.workers.get(name)
         if worker is None or worker.state in ("lost", state):
             return

@@ -11,6 +11,7 @@ from core_rig import BUNDLE, ENV, Rig, describe, fingerprint, outcome_of, result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import BlobRef
@@ -33,7 +34,15 @@ class Fleet:
         for name in adds:
             self.join(name)
 
-    def join(self, name: str, *, cpu: str = "x", deterministic: bool = True, slots: int = 2) -> None:
+    def join(
+        self,
+        name: str,
+        *,
+        cpu: str = "x",
+        deterministic: bool = True,
+        slots: int = 2,
+        machine: str = "",
+    ) -> None:
         self.adds.setdefault(name, 0.0)
         session = f"{name}-s{self.rig.request()}"
         reply = self.rig.tell(
@@ -45,9 +54,11 @@ class Fleet:
                 tiers=("bwrap",),
                 environments=(msgspec.structs.replace(describe(ENV), deterministic=deterministic),),
                 fingerprint=msgspec.structs.replace(fingerprint(), cpu=cpu),
+                machine=machine,
             )
         )
-        assert isinstance(reply, wire.Registered)
+        if not isinstance(reply, wire.Registered):
+            raise RefusedError(reply.status, reply.message)
         self.sessions[name] = session
 
     def hand_in(self, name: str, lease: wire.Lease) -> Any:
@@ -280,6 +291,39 @@ def test_a_run_whose_episodes_a_forger_played_is_in_question_though_another_run_
     assert found.sampled == 0
     assert found.forgers["w2"] > 0
     assert found.in_question
+
+
+def test_workers_of_one_machine_have_one_voice() -> None:
+    fleet = Fleet()
+    for name, machine in (("f1", "bad"), ("f2", "bad"), ("w1", "good"), ("w2", "better")):
+        fleet.join(name, machine=machine)
+    fleet.adds |= {"f1": 5.0, "f2": 5.0}
+    found = told(fleet.whole_run())
+    assert set(found.forgers) == {"f1", "f2"}
+    assert set(fleet.rig.core.fleet.quarantined) == {"f1", "f2"}
+    assert all({player[0], auditor[0]} != {"f"} for auditor, player in fleet.audits)
+    with pytest.raises(RefusedError, match="of the same machine"):
+        fleet.join("f3", machine="bad")
+    fleet.rig.load()
+    with pytest.raises(RefusedError, match="forged"):
+        fleet.join("f3", machine="bad")
+    fleet.join("w1", machine="good")
+
+
+def test_two_workers_of_one_machine_audit_nothing() -> None:
+    fleet = Fleet()
+    fleet.join("f1", machine="bad")
+    fleet.join("f2", machine="bad")
+    found = told(fleet.whole_run(0, 1))
+    assert found.not_audited == {audit.ONE_MACHINE: found.sampled}
+
+
+def test_a_machine_cannot_play_under_the_name_of_anothers_worker() -> None:
+    fleet = Fleet()
+    fleet.join("w1", machine="good")
+    with pytest.raises(RefusedError, match="another machine"):
+        fleet.join("w1", machine="bad")
+    fleet.join("w1", machine="good")
 
 
 # ---- who plays what again ----
