@@ -106,7 +106,11 @@ class Machines:
         """The admitted machine of this role whose token it is; compared in constant time."""
         found = None
         for machine in self.admitted():
-            if machine.role == role and hmac.compare_digest(machine.token.encode(), token.encode()):
+            if (
+                machine.role == role
+                and machine.token
+                and hmac.compare_digest(machine.token.encode(), token.encode())
+            ):
                 found = machine
         return found
 
@@ -191,30 +195,15 @@ def issue(
                 raise ConfigError(
                     f"{old.identity} was issued already ({how}); --renew makes it a new folder and voids the old one"
                 )
+        made = [_make(authority, one, name, hosts, now, days) for one in roles]
         _make_folder(out, again)
-        made = []
-        for one in roles:
-            serves = one == "router"
-            common_name = f"{one}/{name}"
-            if len(common_name) > 64:
-                raise ConfigError(f"NAME {name!r} is too long: {common_name!r} has over 64 characters")
-            pair = certs.issue(authority, common_name, now, days, hosts=hosts, serves=serves)
-            told = certs.describe(pair.certificate)
-            machine = Machine(
-                role=one,
-                name=name,
-                password=secrets.token_urlsafe(24),
-                token=secrets.token_urlsafe(32) if one in ("worker", "operator") else "",
-                serial=told.serial,
-                issued=now,
-                expires=told.expires,
-            )
+        for machine, pair in made:
             listed[machine.identity] = machine
-            made.append(machine)
-            _write_folder(out, machine, pair, "" if one == role else f"{one}-", cluster, endpoints)
+            prefix = "" if machine.role == role else f"{machine.role}-"
+            _write_folder(out, machine, pair, prefix, cluster, endpoints)
         _write(out / "ca.pem", authority.certificate)
         _write_machines(folder, listed)
-    return tuple(made)
+    return tuple(machine for machine, _ in made)
 
 
 def revoke(state: Path, name: str, now: dt.datetime) -> tuple[Machine, ...]:
@@ -238,6 +227,26 @@ def coordinators_certificate(state: Path) -> certs.Described | None:
         return certs.describe((state / "certs" / "coordinator.pem").read_bytes())
     except FileNotFoundError:
         return None
+
+
+def _make(
+    authority: certs.Pair, role: MachineRole, name: str, hosts: tuple[str, ...], now: dt.datetime, days: int
+) -> tuple[Machine, certs.Pair]:
+    common_name = f"{role}/{name}"
+    if len(common_name) > 64:
+        raise ConfigError(f"NAME {name!r} is too long: {common_name!r} has over 64 characters")
+    pair = certs.issue(authority, common_name, now, days, hosts=hosts, serves=role == "router")
+    told = certs.describe(pair.certificate)
+    machine = Machine(
+        role=role,
+        name=name,
+        password=secrets.token_urlsafe(24),
+        token=secrets.token_urlsafe(32) if role in ("worker", "operator") else "",
+        serial=told.serial,
+        issued=now,
+        expires=told.expires,
+    )
+    return machine, pair
 
 
 def _write_folder(

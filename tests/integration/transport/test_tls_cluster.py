@@ -1,0 +1,221 @@
+"""A coordinator's process and machines that reach it over TLS: a run through it, and a machine revoked in its midst."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Awaitable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from coordinator_harness import (
+    PATIENCE_S,
+    Coordinator,
+    GatewayClient,
+    InstantWorker,
+    OperatorClient,
+    bundle_of,
+    comparable,
+    operator_of,
+)
+from own_certs import OwnCerts, of
+
+from evopolicy_common import credentials
+from evopolicy_common.errors import RefusedError, TransportError
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.transport import connect
+
+IDS = tuple(range(8))
+
+
+@pytest.fixture
+def certs(tmp_path: Path) -> OwnCerts:
+    return OwnCerts(tmp_path)
+
+
+@pytest.fixture
+def coordinator(certs: OwnCerts) -> Iterator[Coordinator]:
+    coordinator = Coordinator(certs.state, "--listen", certs.endpoint)
+    yield coordinator
+    coordinator.kill()
+
+
+@contextlib.asynccontextmanager
+async def operators(folder: Path) -> AsyncIterator[OperatorClient]:
+    async with connect(of(folder, "operator"), timeout_s=PATIENCE_S) as link:
+        yield OperatorClient(link)
+
+
+@contextlib.asynccontextmanager
+async def joined(folder: Path, name: str, slots: int = 4) -> AsyncIterator[InstantWorker]:
+    """A worker on the machine of that folder, which has registered."""
+    async with connect(of(folder), timeout_s=PATIENCE_S) as link:
+        worker = InstantWorker(link, name, slots)
+        await worker.register()
+        yield worker
+
+
+@contextlib.asynccontextmanager
+async def at_work(worker: InstantWorker) -> AsyncIterator[None]:
+    task = asyncio.create_task(worker.work())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError, TransportError):
+            await task
+
+
+async def play_run(operator: OperatorClient, gateway_folder: Path) -> RunFinished:
+    created = await operator.create()
+    async with connect(of(gateway_folder, "gateway"), timeout_s=PATIENCE_S) as link:
+        gateway = GatewayClient(link, created.run, created.capability)
+        submit = await gateway.submit(bundle_of("policy"), IDS, "first")
+        episodes, _ = await gateway.results(submit.submit_index)
+        assert len(episodes) == len(IDS)
+        await gateway.close()
+    return await operator.finished(created.run)
+
+
+async def refusal(answer: Awaitable[object]) -> str:
+    """Why the coordinator does not do it."""
+    with pytest.raises(RefusedError) as refused:
+        await answer
+    return refused.value.status
+
+
+def test_a_run_is_played_by_machines_that_have_certificates(
+    certs: OwnCerts, coordinator: Coordinator
+) -> None:
+    async def scenario() -> None:
+        boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
+        async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
+            finished = await play_run(operator, boss)
+            assert finished.status == "completed"
+            assert worker.jobs
+
+    asyncio.run(asyncio.wait_for(scenario(), 120))
+    assert coordinator.stop() == 0
+
+
+@pytest.mark.slow  # until the leases have run out
+def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
+    certs: OwnCerts, coordinator: Coordinator
+) -> None:
+    async def scenario() -> None:
+        boss = certs.issue("operator", "boss")
+        honest, cheat = certs.issue("worker", "honest"), certs.issue("worker", "cheat")
+        async with operators(boss) as operator, joined(cheat, "cheat", slots=2) as revoked:
+            playing = asyncio.create_task(play_run(operator, boss))
+            leases = await revoked.lease(2, 30.0)
+            assert leases
+            certs.revoke("cheat")
+            # Its results count no more, on whatever way they would come: here over this machine's own socket.
+            async with connect(coordinator.credentials("worker")) as link:
+                way_round = InstantWorker(link, "cheat")
+                way_round.session = revoked.session
+                assert await refusal(way_round.lease(1, 0.0)) == "revoked"
+                assert await refusal(way_round.register(of(cheat).token)) == "bad_token"
+                results = tuple(way_round.result(lease) for lease in leases)
+                assert await refusal(way_round.hand_in(results)) == "revoked"
+                upload = way_round.ask.upload("cheat", revoked.session, "0" * 64, b"blob")
+                assert await refusal(upload) == "revoked"
+            async with joined(honest, "honest") as worker, at_work(worker):
+                finished = await playing
+            assert finished.status == "completed"
+            stolen = {lease.job.job_id for lease in leases}
+            assert stolen <= {job.job_id for job in worker.jobs}
+        with pytest.raises(TransportError):
+            async with connect(of(cheat), timeout_s=0.5):
+                pass
+
+    asyncio.run(asyncio.wait_for(scenario(), 150))
+
+
+def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        boss = certs.issue("operator", "boss")
+        async with operators(boss) as operator:
+            await operator.status()
+        async with connect(
+            msgspec.structs.replace(coordinator.credentials("operator"), token=of(boss, "operator").token)
+        ) as link:
+            await OperatorClient(link).status()
+            certs.revoke("operator/boss")
+            with pytest.raises(RefusedError, match="bad_token"):
+                await OperatorClient(link).status()
+        async with operator_of(coordinator) as own:
+            await own.status()
+
+    asyncio.run(asyncio.wait_for(scenario(), 120))
+
+
+def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_restarts(
+    certs: OwnCerts,
+) -> None:
+    async def scenario() -> None:
+        boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
+        first = Coordinator(certs.state, "--listen", certs.endpoint)
+        try:
+            async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
+                one = await play_run(operator, boss)
+                certs.issue("worker", "late")
+                first.kill()
+                second = Coordinator(certs.state, "--listen", certs.endpoint)
+                try:
+                    created = await operator.create("again")
+                    async with connect(of(boss, "gateway"), timeout_s=PATIENCE_S) as link:
+                        gateway = GatewayClient(link, created.run, created.capability)
+                        await gateway.submit(bundle_of("policy"), IDS, "first")
+                        certs.issue("worker", "later")
+                        await gateway.results(0)
+                        await gateway.close()
+                    two = await operator.finished(created.run)
+                finally:
+                    assert second.stop() == 0
+            assert comparable(one)["submits"] == comparable(two)["submits"]
+        finally:
+            first.kill()
+
+    asyncio.run(asyncio.wait_for(scenario(), 150))
+
+
+def refused(*args: object) -> str:
+    ended = subprocess.run(
+        [sys.executable, "-m", "evopolicy_coordinator.cli", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env=os.environ,
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    return ended.stderr
+
+
+def test_plain_tcp_beyond_this_machine_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    said = refused("--state", tmp_path / "state", "--listen", "tcp/0.0.0.0:7447")
+    assert "certs init" in said
+    assert "tls/0.0.0.0:7447" in said
+    assert "--insecure-tcp" in said
+
+
+def test_tls_without_certificates_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    assert f"certs init --state {tmp_path}/state" in refused(
+        "--state", tmp_path / "state", "--listen", "tls/0.0.0.0:7447"
+    )
+
+
+def test_insecure_tcp_has_to_be_asked_for_and_is_told_to_this_clusters_machines(tmp_path: Path) -> None:
+    coordinator = Coordinator(tmp_path / "state", "--listen", "tcp/0.0.0.0:0", "--insecure-tcp")
+    try:
+        found = coordinator.credentials("worker")
+        assert found.insecure_tcp
+        assert credentials.at(found, ("tcp/10.0.0.5:7447",)).endpoints == ("tcp/10.0.0.5:7447",)
+        assert "in the clear" in coordinator.log.read_text()
+    finally:
+        coordinator.kill()

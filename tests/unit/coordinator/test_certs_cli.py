@@ -1,0 +1,171 @@
+"""`evopolicy-coordinator certs`, as an operator meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from own_certs import of
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator import certs_cli
+from evopolicy_coordinator.machines import Machines
+from evopolicy_coordinator.state import StateFolder
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with an authority, made as the README says."""
+    monkeypatch.chdir(tmp_path)
+    certs_cli.init(state=tmp_path / "state", host=["lab.example", "10.0.0.5"])
+    return tmp_path / "state"
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_init_tells_the_next_two_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = tmp_path / "state"
+    certs_cli.init(state=state, host=["lab.example", "10.0.0.5"])
+    told = capsys.readouterr().out
+    assert f"evopolicy-coordinator --listen tls/0.0.0.0:7447 --state {state}" in told
+    assert f"certs issue worker NAME --state {state}" in told
+    assert "lab.example, 10.0.0.5, localhost, 127.0.0.1, ::1" in told
+
+
+def test_init_overwrites_nothing_and_says_what_is_there(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path.name: path.read_bytes() for path in (state / "certs").iterdir()}
+    with pytest.raises(SystemExit) as ended:
+        certs_cli.init(state=state)
+    assert ended.value.code == 2
+    told = said(capsys)
+    for part in ("lab.example", "until", "--renew", "--force"):
+        assert part in told
+    assert {path.name: path.read_bytes() for path in (state / "certs").iterdir()} == before
+
+
+def test_renewed_without_hosts_it_keeps_those_that_it_had(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    authority = (state / "certs" / "ca.pem").read_bytes()
+    certs_cli.init(state=state, renew=True)
+    assert "lab.example, 10.0.0.5, localhost" in capsys.readouterr().out
+    assert (state / "certs" / "ca.pem").read_bytes() == authority
+    certs_cli.init(state=state, force=True)
+    assert "issue every machine again" in capsys.readouterr().out
+    assert (state / "certs" / "ca.pem").read_bytes() != authority
+
+
+def test_without_hosts_it_names_this_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    certs_cli.init(state=tmp_path / "state")
+    assert "127.0.0.1" in capsys.readouterr().out
+
+
+def test_issue_writes_a_folder_that_leads_to_the_coordinator(state: Path, tmp_path: Path) -> None:
+    certs_cli.issue("worker", "gpu-7", state=state)
+    found = of(tmp_path / "worker-gpu-7")
+    assert found.endpoints == ("tls/lab.example:7447",)
+    with StateFolderOf(state) as opened:
+        assert found.cluster == opened.identity.cluster
+
+
+def test_issue_takes_other_endpoints_and_another_folder(state: Path, tmp_path: Path) -> None:
+    certs_cli.issue("gateway", "g", state=state, out=tmp_path / "mine", connect=["tls/site:7448"])
+    assert of(tmp_path / "mine", "gateway").endpoints == ("tls/site:7448",)
+
+
+def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    certs_cli.issue("worker", "gpu-7", state=state)
+    certs_cli.issue("operator", "boss", state=state)
+    certs_cli.revoke("gpu-7", state=state)
+    capsys.readouterr()
+    certs_cli.list_(state=state, as_json=True)
+    text = capsys.readouterr().out
+    told = json.loads(text)
+    assert told["coordinator"]["hosts"][0] == "lab.example"
+    assert [(one["identity"], one["revoked"] is not None) for one in told["machines"]] == [
+        ("gateway/boss", False),
+        ("operator/boss", False),
+        ("worker/gpu-7", True),
+    ]
+    assert all(one["expires"] for one in told["machines"])
+    for machine in Machines(state).all():
+        assert machine.password not in text
+        assert not machine.token or machine.token not in text
+    certs_cli.list_(state=state)
+    table = capsys.readouterr().out
+    assert "revoked" in table
+    assert "days left" in table
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda state: certs_cli.issue("king", "k", state=state),
+            "there are worker, gateway, operator, router",
+        ),
+        (lambda state: certs_cli.issue("router", "r", state=state), "needs a --host"),
+        (lambda state: certs_cli.issue("worker", "a b", state=state), "NAME 'a b'"),
+        (lambda state: certs_cli.issue("worker", "w", state=state / "new"), "certs init"),
+        (lambda state: certs_cli.revoke("nobody", state=state), "no machine 'nobody'"),
+        (lambda state: certs_cli.list_(state=state / "new"), "certs init"),
+        (lambda state: certs_cli.init(state=state, renew=True, host=["a b"]), "--host 'a b'"),
+        (lambda state: certs_cli.init(state=state, renew=True, cluster="other"), "is of cluster 'local'"),
+        (lambda state: certs_cli.init(state=state, renew=True, cluster="a b"), "--cluster 'a b'"),
+    ],
+)
+def test_what_is_wrong_is_told_in_a_line(
+    state: Path, capsys: pytest.CaptureFixture[str], call: object, message: str
+) -> None:
+    assert callable(call)
+    with pytest.raises(SystemExit) as ended:
+        call(state)
+    assert ended.value.code == 2
+    assert message in said(capsys)
+
+
+def test_a_wrong_host_leaves_the_old_certificate(state: Path) -> None:
+    before = (state / "certs" / "coordinator.pem").read_bytes()
+    with pytest.raises(SystemExit):
+        certs_cli.init(state=state, renew=True, host=["a b"])
+    assert (state / "certs" / "coordinator.pem").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["init", "issue", "revoke", "list"])
+def test_every_command_has_an_example(name: str) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-m", "evopolicy_coordinator.cli", "certs", name, "--help"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert f"Example: evopolicy-coordinator certs {name}" in ended.stdout
+
+
+class StateFolderOf:
+    """A state folder, opened as a coordinator opens it: the certificates in it are no hindrance."""
+
+    def __init__(self, root: Path) -> None:
+        self._opened = StateFolder.open(root)
+
+    def __enter__(self) -> StateFolder:
+        return self._opened
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+
+def test_the_name_of_a_cluster_is_checked_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises((SystemExit, ConfigError)):
+        certs_cli.init(state=tmp_path / "state", cluster="a b")
+    assert not (tmp_path / "state").exists()
