@@ -34,6 +34,8 @@ from evopolicy_common.errors import TransportError
 MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8
 _CLOSE_S = 3.0
+STUCK_S = 2.0
+"""How much later than it should a session may end a query, before it is taken to be stuck."""
 
 
 class IncomingQuery:
@@ -172,7 +174,7 @@ class Link:
             await loop.run_in_executor(self._sender, send)
             # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck. Not `wait_for`,
             # which in Python 3.11 swallows a cancellation that comes together with the answer.
-            async with asyncio.timeout(timeout_s + 2.0):
+            async with asyncio.timeout(timeout_s + STUCK_S):
                 answer = await future
         except (zenoh.ZError, TimeoutError, RuntimeError) as error:
             raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
@@ -290,17 +292,61 @@ def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
     return _access_control(cluster, subjects, [(role, role) for role in users])
 
 
-def machine_access_control(cluster: str, machines: Iterable[tuple[MachineRole, str]]) -> dict[str, Any]:
+def machine_access_control(
+    cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
+) -> dict[str, Any]:
     """`access_control` of a session over TLS: each machine with its own name, of certificate and user alike.
 
     A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to hold them to these rules.
+    `uplink`: the common name of what such a router itself connects to, where questions go and answers come from.
     """
     listed = list(machines)
     subjects = [
         {"id": name, "usernames": [name], "cert_common_names": [name], "link_protocols": ["tls"]}
         for _, name in listed
     ]
-    return _access_control(cluster, subjects, [(name, role) for role, name in listed])
+    rights = _access_control(cluster, subjects, [(name, role) for role, name in listed])
+    if uplink is not None:
+        opposite = {"ingress": "egress", "egress": "ingress"}
+        mirrored = [
+            {**rule, "id": f"{rule['id']}_above", "flows": [opposite[flow] for flow in rule["flows"]]}
+            for rule in rights["rules"]
+        ]
+        # Who is connected to names no user: it is known by its certificate alone.
+        above = {"id": "uplink", "cert_common_names": [uplink], "link_protocols": ["tls"]}
+        rights["subjects"].append(above)
+        rights["policies"].append({"subjects": ["uplink"], "rules": [rule["id"] for rule in mirrored]})
+        rights["rules"] += mirrored
+    return rights
+
+
+def site_router_settings(
+    cluster: str,
+    listen: Iterable[str],
+    passwords: Path,
+    machines: Iterable[tuple[MachineRole, str]],
+    tls: TlsFiles,
+    connect_to: Iterable[str],
+    uplink: str,
+    user: str,
+    password: str,
+) -> dict[str, Any]:
+    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, one way up to `uplink`.
+
+    `user` and `password` are its own; `passwords` and the files of `tls` are paths on its host.
+    """
+    return {
+        **_COMMON,
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect_to),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "transport/auth/usrpwd": {"user": user, "password": password, "dictionary_file": str(passwords)},
+        **_tls(tls, "listen"),
+        **_tls(tls, "connect"),
+        "access_control": machine_access_control(cluster, machines, uplink),
+    }
 
 
 def _access_control(

@@ -39,6 +39,9 @@ from evopolicy_coordinator.core.records import (
 
 T = TypeVar("T")
 
+BUSY_TIMEOUT_S = 10.0
+"""How long another's transaction on the database is waited for: `evopolicy gc` runs beside a coordinator."""
+
 _MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE meta (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
@@ -277,7 +280,7 @@ def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
         db = sqlite3.connect(
             f"{path.absolute().as_uri()}?mode={'ro' if read_only else 'rwc'}",
             uri=True,
-            timeout=10.0,
+            timeout=BUSY_TIMEOUT_S,
             isolation_level=None,
             # A connection is used by one thread at a time, but may be opened by another.
             check_same_thread=False,

@@ -41,6 +41,7 @@ Bounds = tuple[str, str]
 
 DATABASE = "coordinator.sqlite"
 UNNAMED_S = 24 * 3600.0
+BUSY_TIMEOUT_S = 30.0
 GUESS_BYTES = 1 << 20
 """Taken for an episode of an environment of which nothing is stored, when nothing at all is."""
 
@@ -190,7 +191,7 @@ def _database(state: Path) -> Iterator[sqlite3.Connection]:
         raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
     try:
         uri = f"{path.absolute().as_uri()}?mode=rw"
-        with contextlib.closing(sqlite3.connect(uri, uri=True, timeout=30.0, isolation_level=None)) as db:
+        with contextlib.closing(sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as db:
             yield db
     except sqlite3.Error as error:
         raise StorageError(f"{path}: {error}") from error

@@ -28,6 +28,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 START_TIMEOUT_S = 120.0
 CANCEL_TIMEOUT_S = 20.0
+LAST_WORDS_S = 5.0
 """A cancelled job that has not stopped by then takes its processes with it."""
 MAX_ANSWER_BYTES = 1 << 31
 
@@ -180,7 +181,7 @@ class Slot:
         status = "?"
         if process is not None:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(5.0):
+                async with asyncio.timeout(LAST_WORDS_S):
                     status = str(await process.wait())
         await asyncio.sleep(0)
         return f"the slot's process ended with status {status}; {' | '.join(self._said) or 'it said nothing'}"

@@ -55,6 +55,9 @@ MAX_OUTBOX = 256
 """Results waiting to be handed in before the slots stop taking jobs: a coordinator that is away must not fill memory."""
 RESTART_PAUSE_S = 1.0
 LONGEST_RESTART_PAUSE_S = 30.0
+CANCEL_PATIENCE_S = 2.0
+"""What a slot gets to stop its job, before the worker goes without it."""
+WITHDRAW_PATIENCE_S = 1.0
 
 
 class SlotLike(Protocol):
@@ -443,7 +446,7 @@ class Supervisor:
             log.warning("giving running episodes back", slots=len(late))
             for lease_id in list(self._running):
                 self._cancel(lease_id)
-            _, stuck = await asyncio.wait(late, timeout=2.0)
+            _, stuck = await asyncio.wait(late, timeout=CANCEL_PATIENCE_S)
             for task in stuck:
                 task.cancel()
 
@@ -452,7 +455,7 @@ class Supervisor:
         request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
         with contextlib.suppress(EvopolicyError):
             await self._ask.once("lease", request, Leases)
-        await asyncio.wait({lease}, timeout=1.0)
+        await asyncio.wait({lease}, timeout=WITHDRAW_PATIENCE_S)
         lease.cancel()
 
 

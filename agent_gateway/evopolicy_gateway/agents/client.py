@@ -50,6 +50,8 @@ class Client:
     info_url: str
     task_url: str
     submit_url: str
+    answer_s: float = 60.0
+    """A gateway that says nothing for so long is asked again."""
     patience_s: float = 300.0
     """How long a gateway may be unreachable before giving up, seconds."""
     poll_s: float = 0.25
@@ -129,7 +131,7 @@ class Client:
         while True:
             try:
                 request = urllib.request.Request(url, data=body, headers=headers or {})
-                with _OPENER.open(request, timeout=60) as response:
+                with _OPENER.open(request, timeout=self.answer_s) as response:
                     return response.status, response.read()
             except urllib.error.HTTPError as error:
                 with error:

@@ -17,6 +17,7 @@ from evopolicy_gateway.harnesses import prompts
 from evopolicy_gateway.harnesses.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
 
+_PIPE_PATIENCE_S = 1.0
 _STOP_PATIENCE_S = 10.0
 """How long a program that has said stop may take to exit by itself."""
 
@@ -38,7 +39,7 @@ class CommandHarness(Harness):
             await asyncio.wait([talk, ended], return_when=asyncio.FIRST_COMPLETED)
             if ended.done():
                 # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
-                await asyncio.wait([talk], timeout=1.0)
+                await asyncio.wait([talk], timeout=_PIPE_PATIENCE_S)
             turns, stopped = talk.result() if talk.done() else (0, False)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(asyncio.shield(ended), _STOP_PATIENCE_S if stopped else None)

@@ -39,6 +39,7 @@ from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 _ASK_AGAIN_S = 5.0
+_LOOK_S = 1.0
 ATTEMPTS = ".attempts"
 
 
@@ -86,7 +87,7 @@ class Sweep:
                     self._view.say(f"{len(todo)} runs are not begun: {self._used_up()}")
                     return
                 if waiting:
-                    await asyncio.wait(waiting, timeout=1.0, return_when=asyncio.FIRST_COMPLETED)
+                    await asyncio.wait(waiting, timeout=_LOOK_S, return_when=asyncio.FIRST_COMPLETED)
                 elif todo:
                     await asyncio.sleep(1.0)
                 for name, task in list(self._active.items()):

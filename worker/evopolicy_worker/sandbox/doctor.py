@@ -29,6 +29,7 @@ _NAMESPACES = {
     "uts": 0x04000000,
 }
 _CLONE_NEWUSER = 0x10000000
+_PATIENCE_S = 10.0
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,9 +75,12 @@ def _bubblewrap() -> Check:
     path = shutil.which("bwrap")
     if path is None:
         return Check(name="bubblewrap", verdict="missing", found="not on the PATH", advice=jail.INSTALL_BWRAP)
-    said = subprocess.run(
-        [path, "--version"], capture_output=True, text=True, timeout=10, check=False
-    ).stdout.strip()
+    try:
+        said = subprocess.run(
+            [path, "--version"], capture_output=True, text=True, timeout=_PATIENCE_S, check=False
+        ).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Check(name="bubblewrap", verdict="missing", found=str(error), advice=jail.INSTALL_BWRAP)
     return Check(name="bubblewrap", verdict="ok", found=f"{said} ({path})")
 
 

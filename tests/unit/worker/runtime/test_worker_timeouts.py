@@ -1,0 +1,184 @@
+"""Every timeout of the worker's fires: what it waits for never comes, and it says so or takes it down."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from slots import HONEST, QUICK, Slots, make_job
+
+from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
+from evopolicy_worker import environments, policy_process, recording, slot
+from evopolicy_worker.monitor import Monitor
+from evopolicy_worker.policy_process import BundleFiles, PolicyProcess
+from evopolicy_worker.sandbox import doctor, jail, zygote
+from evopolicy_worker.sandbox.zygote import Child, Zygote
+
+SOON_S = 0.2
+
+
+@contextlib.contextmanager
+def a_zygote(folder: Path) -> Iterator[Zygote]:
+    """One without a sandbox, as tier `none` has it."""
+    with contextlib.ExitStack() as stack:
+        found = Zygote(jail.plan("none", folder, ("numpy",)), folder)
+        stack.callback(found.close)
+        yield found
+
+
+def test_a_zygote_that_does_not_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zygote, "START_TIMEOUT_S", SOON_S)
+    mute = jail.Jail(command=("sleep", "1000"), config={}, home=None, user=None)
+    with pytest.raises(SandboxError, match="does not start: timed out"):
+        Zygote(mute, tmp_path)
+
+
+def test_a_zygote_that_stands_still_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zygote, "ANSWER_TIMEOUT_S", SOON_S)
+    with a_zygote(tmp_path) as found:
+        os.kill(found._process.pid, signal.SIGSTOP)
+        with pytest.raises(SlotDiedError, match="timed out"):
+            found.spawn()
+
+
+def test_a_policys_process_that_survives_being_killed_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zygote, "DEATH_TIMEOUT_S", SOON_S)
+    with a_zygote(tmp_path) as found:
+        child = found.spawn()
+        monkeypatch.setattr(Child, "kill", lambda self: None)
+        found.bury_later(child)
+        with pytest.raises(SandboxError, match="does not end"):
+            found.bury()
+        monkeypatch.undo()
+        child.kill()
+
+
+def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy_process, "_SEAL_S", SOON_S)
+    commands, never_written = os.pipe()
+    monitor = Monitor(commands, lambda: None, lambda: None)
+    monitor.start()
+    with a_zygote(tmp_path) as found:
+        child = found.spawn()
+        os.kill(child.host_pid, signal.SIGSTOP)
+        none = jail.plan("none", tmp_path, ("numpy",))
+        policy = PolicyProcess(found, child, monitor, none, QUICK, str(tmp_path))
+        description = environments.describe("toy/line")
+        meta = {"obs_space": description.obs_space, "action_space": description.action_space}
+        with pytest.raises(SandboxError, match="could not seal itself"):
+            policy.init(BundleFiles([], b""), bytes(16), meta, "arrays", cpu_s=5.0)
+        assert policy.dead
+        policy.end()
+    os.close(never_written)
+
+
+@pytest.mark.parametrize("options", [{}, {"policy_scope": "submit", "first": 0, "n": 2}])
+def test_a_policy_that_does_not_let_go_of_its_output_is_not_waited_for(
+    slots: Slots, options: dict[str, Any]
+) -> None:
+    source = """
+        import sys, time
+
+        class Held:
+            def write(self, text): pass
+            def flush(self): time.sleep(1000)
+
+        class Policy:
+            def __init__(self, obs_space, action_space, env_meta): pass
+            def reset(self, episode_index): sys.stdout = Held()
+            def act(self, obs): return [0.0]
+    """
+    outcomes = slots.play_all(source, **options)
+    assert outcomes[0].failure is None
+    assert slots.play(HONEST).failure is None
+
+
+def test_a_slot_that_does_not_start_is_ended(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slot, "START_TIMEOUT_S", 0.001)
+    new = slots.new()
+    with pytest.raises(WorkerError, match="did not start"):
+        slots.run(new.start())
+    assert new._process is None
+
+
+def test_a_slot_that_does_not_heed_a_cancel_is_ended(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slot, "CANCEL_TIMEOUT_S", SOON_S)
+    own = slots.new("none")
+    slots.run(own.start())
+    assert own._process is not None
+    os.kill(own._process.pid, signal.SIGSTOP)
+
+    async def cancelled() -> None:
+        playing = asyncio.create_task(
+            own.play(make_job(bundle=None, tier="none"), None, lambda episodes, steps: None)
+        )
+        while own._idle.is_set():
+            await asyncio.sleep(0)
+        await own.cancel()
+        with pytest.raises(SlotDiedError):
+            await playing
+        await own.close()
+
+    slots.run(cancelled())
+
+
+def test_a_slots_process_that_hangs_up_and_stays_is_told_without_its_status(
+    slots: Slots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slot, "LAST_WORDS_S", SOON_S)
+    own = slots.new("none")
+
+    async def told() -> str:
+        own._process = await asyncio.create_subprocess_exec("sleep", "1000", start_new_session=True)
+        try:
+            return await own._last_words()
+        finally:
+            await own.close()
+
+    assert "ended with status ?" in slots.run(told())
+
+
+@pytest.mark.parametrize(("bound", "frames"), [("start_s", 0), ("frame_s", 1), ("MAX_S", 1)])
+def test_a_video_that_takes_too_long_is_done_without(
+    bound: str, frames: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    allowed: dict[str, Any] = {"start_s": 0.0, "frame_s": 0.0} if bound != "MAX_S" else {}
+    if bound == "MAX_S":
+        monkeypatch.setattr(recording, "MAX_S", 0.0)
+    recorder = recording.VideoRecorder(**allowed)
+    run = subprocess.Popen
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda words, **more: run([sys.executable, "-c", "input()"], **more)
+    )
+    description = environments.describe("toy/maze")
+    assert description.renders
+    case = make_job().episodes[0].case
+    assert recorder.record(description, case, b"", frames, never) is None
+    assert "it took too long" in capfd.readouterr().err
+    recorder.close()
+
+
+def never() -> bool:
+    return False
+
+
+def test_a_bubblewrap_that_does_not_answer_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "_PATIENCE_S", SOON_S)
+    program = tmp_path / "bwrap"
+    program.write_text("#!/bin/sh\nexec sleep 1000\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    check = doctor._bubblewrap()
+    assert (check.verdict, "timed out" in check.found) == ("missing", True)
