@@ -62,7 +62,7 @@ Parallel = Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")]
 WALL_S = 12 * 3600.0
 
 
-@app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --connect tcp/10.0.0.5:7447")
+@app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
 def run(
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
     agent: options.AgentName,
