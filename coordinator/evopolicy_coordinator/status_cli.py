@@ -102,7 +102,7 @@ def _asking(connect: list[str] | None, file: Path | None, work: Callable[[Operat
 
 
 @status_app.callback(
-    invoke_without_command=True, epilog="Example: evopolicy status --watch --connect tcp/10.0.0.5:7447"
+    invoke_without_command=True, epilog="Example: evopolicy status --watch --credentials operator-me"
 )
 def status(
     connect: Connect = None,
