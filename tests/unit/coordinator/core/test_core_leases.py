@@ -9,6 +9,7 @@ from core_rig import Rig, done, outcome_of, result
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.leases import FORGET_S
 from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
 
 GROUP = "r1/s0/train"
@@ -316,3 +317,25 @@ def test_a_job_that_is_played_for_ever_is_taken_away() -> None:
     keep(rig, 900.0, (first, (lease,)), (second, ()))
     assert lease.lease_id in rig.beat(first, lease).cancelled
     assert len(rig.poll(second)) == 1
+
+
+def test_a_lost_worker_is_forgotten_in_the_end() -> None:
+    rig = Rig()
+    rig.register()
+    rig.pass_time(rig.settings.lease_ttl_s + 1.0)
+    assert [worker.state for worker in rig.core.status(rig.now).workers] == ["lost"]
+    rig.pass_time(FORGET_S)
+    assert rig.core.status(rig.now).workers == ()
+
+
+def test_no_poll_waits_longer_than_the_longest_wait() -> None:
+    rig = Rig(max_wait_s=5.0)
+    session = rig.register()
+    rig.create()
+    assert rig.poll(session, 1, wait_s=1000.0) is None
+    lease = rig._requests
+    assert rig.tell(events.RunWaited(request="wait", run="r1", wait_s=1000.0)) is None
+    assert rig.beat(session, wait_s=1000.0) is None
+    beat = rig._requests
+    rig.pass_time(5.0)
+    assert {lease, beat, "wait"} <= rig.replies.keys()
