@@ -117,7 +117,7 @@ def issue(
             cluster_of(root, None),
             kind,
             name,
-            tuple(connect or ()) or (_first_endpoint(root),),
+            tuple(connect or ()) or (first_endpoint(root),),
             folder,
             _now(),
             days,
@@ -142,6 +142,8 @@ def issue(
         }.get(role)
         if start is not None and kind != "gateway":
             print(f"there: {start} --credentials {folder.name}")
+        if kind == "router":
+            print(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs revoke gpu-7")
@@ -212,7 +214,8 @@ def _role(text: str) -> MachineRole:
     raise ConfigError(f"ROLE {text!r}: there are {', '.join(get_args(MachineRole))}")
 
 
-def _first_endpoint(root: Path) -> str:
+def first_endpoint(root: Path) -> str:
+    """Where the coordinator is taken to listen; ConfigError before `certs init`."""
     own = machines.coordinators_certificate(root)
     if own is None:
         raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")

@@ -14,13 +14,18 @@ from evopolicy_common.blobs import write_atomically
 from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator import certs_cli, process
+from evopolicy_coordinator import certs_cli, process, router_config
 from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.process import Options, Ready
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.add_typer(certs_cli.app, name="certs")
+app.command(
+    "router-config",
+    epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"
+    " --installed-at /etc/evopolicy/router",
+)(router_config.router_config)
 
 
 @app.callback(

@@ -1,0 +1,251 @@
+"""A site's router, opened from the file that `evopolicy-coordinator router-config` writes, between real sessions over TLS."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+from own_certs import CLUSTER, OwnCerts, free_port
+from typer.testing import CliRunner
+
+from evopolicy_common import credentials, keys, transport
+from evopolicy_common.credentials import Role
+from evopolicy_common.errors import ConfigError, TransportError
+from evopolicy_common.transport import IncomingQuery, Link
+from evopolicy_coordinator.cli import app
+from evopolicy_coordinator.machines import Machines
+from evopolicy_coordinator.router_config import write_router_config
+
+OWN_KEY = {
+    "worker": keys.worker_key(CLUSTER, "lease"),
+    "gateway": keys.gateway_key(CLUSTER, "run1", "state"),
+    "operator": keys.operator_key(CLUSTER, "status"),
+}
+
+
+class Site:
+    """A coordinator's certificates, and a router of a site where a worker and an operator belong, and one worker does not."""
+
+    def __init__(self, root: Path) -> None:
+        self.certs = OwnCerts(root)
+        self.folder = self.certs.issue("router", "site")
+        self.endpoint = f"tls/127.0.0.1:{free_port()}"
+        self.folders = {
+            "worker": self.certs.issue("worker", "here"),
+            "gateway": self.certs.issue("operator", "desk"),
+            "operator": self.certs.root / "operator-desk",
+        }
+        self.elsewhere = self.certs.issue("worker", "elsewhere")
+        write_router_config(
+            self.certs.state,
+            "site",
+            self.folder,
+            listen=(self.endpoint,),
+            connect=(self.certs.endpoint,),
+            admit=("worker/here", "gateway/desk", "operator/desk"),
+        )
+
+    @contextlib.asynccontextmanager
+    async def up(self, alive: list[tuple[str, bool]] | None = None) -> AsyncIterator[list[str]]:
+        """Coordinator and router; yields the keys that the coordinator is asked."""
+        asked: list[str] = []
+
+        def answer(queries: list[IncomingQuery]) -> None:
+            for query in queries:
+                asked.append(query.key)
+                query.reply(b"coordinator")
+
+        machines = Machines(self.certs.state)
+        machines.write_passwords()
+        assert machines.tls is not None
+        listed = [(machine.role, machine.identity) for machine in machines.admitted()]
+        config = transport.tls_server_config(
+            CLUSTER, [self.certs.endpoint], machines.passwords, listed, machines.tls
+        )
+        async with transport.serve(config, answer) as server, self.router():
+            server.declare(
+                [keys.worker_expr(CLUSTER), keys.gateway_expr(CLUSTER), keys.operator_expr(CLUSTER)]
+            )
+            if alive is not None:
+                server.watch_liveliness(
+                    keys.liveliness_expr(CLUSTER), lambda key, up: alive.append((key, up))
+                )
+            yield asked
+
+    @contextlib.asynccontextmanager
+    async def router(self) -> AsyncIterator[None]:
+        """What zenohd is: a session in router mode of the file."""
+        session = await asyncio.to_thread(
+            zenoh.open, zenoh.Config.from_file(str(self.folder / "zenohd.json"))
+        )
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(session.close)
+
+    def link(self, role: Role, folder: Path | None = None) -> contextlib.AbstractAsyncContextManager[Link]:
+        """A session of a machine of the site, which knows the site's router only."""
+        found = credentials.find(role, (self.endpoint,), folder or self.folders[role])
+        return transport.connect(found, timeout_s=30.0)
+
+
+async def answered(link: Link, key: str, attempts: int = 1) -> bool:
+    """Whether the coordinator answers; more attempts where the router may not have reached it yet."""
+    for attempt in range(attempts):
+        if attempt:
+            await asyncio.sleep(0.1)
+        with contextlib.suppress(TransportError):
+            return await link.ask(key, b"?", 5.0) == b"coordinator"
+    return False
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+@pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
+def test_a_role_is_answered_through_the_sites_router_on_its_own_keys_only(site: Site, role: Role) -> None:
+    async def scenario() -> None:
+        async with site.up() as asked, site.link(role) as link:
+            assert await answered(link, OWN_KEY[role], attempts=300)
+            for owner, key in OWN_KEY.items():
+                assert await answered(link, key) == (owner == role), key
+            assert set(asked) == {OWN_KEY[role]}
+
+    asyncio.run(scenario())
+
+
+def test_a_machine_of_another_site_is_not_let_in(site: Site) -> None:
+    async def scenario() -> None:
+        async with site.up() as asked:
+            found = credentials.find("worker", (site.endpoint,), site.elsewhere)
+            with pytest.raises(TransportError, match="credentials"):
+                async with transport.connect(found, timeout_s=1.0):
+                    pass
+            assert asked == []
+
+    asyncio.run(scenario())
+
+
+def test_no_machine_answers_or_overhears_another_behind_the_same_router(site: Site) -> None:
+    async def scenario() -> None:
+        overheard: list[str] = []
+
+        def overhear(query: zenoh.Query) -> None:
+            overheard.append(str(query.key_expr))
+            with query:
+                query.reply(query.key_expr, b"impostor")
+
+        async with site.up(), site.link("gateway") as honest:
+            found = credentials.find("gateway", (site.endpoint,), site.folders["gateway"])
+            impostor = await asyncio.to_thread(zenoh.open, transport.client_config(found))
+            held = [
+                impostor.declare_queryable("**", overhear, complete=True),
+                impostor.declare_queryable(keys.gateway_expr(CLUSTER), overhear, complete=True),
+                impostor.declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr))),
+            ]
+            assert await answered(honest, OWN_KEY["gateway"], attempts=300)
+            for _ in range(20):
+                assert await answered(honest, OWN_KEY["gateway"])
+            assert overheard == []
+            del held
+            await asyncio.to_thread(impostor.close)
+
+    asyncio.run(scenario())
+
+
+def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(site: Site) -> None:
+    async def scenario() -> None:
+        alive: list[tuple[str, bool]] = []
+        true, false = (keys.liveliness_key(CLUSTER, name) for name in ("here", "desk"))
+        async with site.up(alive):
+            async with site.link("gateway") as pretender, site.link("worker") as worker:
+                assert await answered(pretender, OWN_KEY["gateway"], attempts=300)
+                pretender.declare_alive(false)
+                worker.declare_alive(true)
+                await until(lambda: alive == [(true, True)])
+            await until(lambda: alive == [(true, True), (true, False)])
+
+    asyncio.run(scenario())
+
+
+def test_a_restarted_router_carries_on(site: Site) -> None:
+    async def scenario() -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            machines = Machines(site.certs.state)
+            machines.write_passwords()
+            link = None
+            async with site.up():
+                link = await stack.enter_async_context(site.link("worker"))
+                assert await answered(link, OWN_KEY["worker"], attempts=300)
+            assert not await answered(link, OWN_KEY["worker"])
+            async with site.up():
+                assert await answered(link, OWN_KEY["worker"], attempts=300)
+
+    asyncio.run(scenario())
+
+
+def test_the_file_holds_the_coordinators_own_rules(site: Site) -> None:
+    told = json.loads((site.folder / "zenohd.json").read_text())
+    admitted = [
+        (machine.role, machine.identity)
+        for machine in Machines(site.certs.state).admitted()
+        if machine.name in ("here", "desk")
+    ]
+    own = transport.machine_access_control(CLUSTER, admitted)
+    rights = told["access_control"]
+    for part in ("rules", "subjects", "policies"):
+        assert rights[part][: len(own[part])] == own[part]
+    assert rights["default_permission"] == "deny"
+    assert told["adminspace"] == {"enabled": False}
+    assert told["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    # What is added: towards the coordinator the same, the other way round, and no one else has it.
+    added = rights["rules"][len(own["rules"]) :]
+    for rule, above in zip(own["rules"], added, strict=True):
+        assert {**above, "id": rule["id"], "flows": rule["flows"]} == rule
+        assert {*rule["flows"], *above["flows"]} == {"ingress", "egress"}
+    assert rights["subjects"][len(own["subjects"]) :] == [
+        {"id": "uplink", "cert_common_names": ["coordinator"], "link_protocols": ["tls"]}
+    ]
+
+
+def test_the_router_is_given_the_passwords_of_its_own_site_only(site: Site) -> None:
+    users = {line.partition(":")[0] for line in (site.folder / "passwords").read_text().splitlines()}
+    assert users == {"worker/here", "gateway/desk", "operator/desk", "nobody"}
+    for name in ("passwords", "zenohd.json"):
+        assert (site.folder / name).stat().st_mode & 0o077 == 0
+
+
+def test_the_command_writes_a_file_for_the_folders_place_on_the_routers_host(site: Site) -> None:
+    arguments = ["router-config", "site", "--folder", str(site.folder), "--state", str(site.certs.state)]
+    done = CliRunner().invoke(app, [*arguments, "--installed-at", "/etc/evopolicy/router"])
+    assert done.exit_code == 0, done.output
+    assert "zenohd --config /etc/evopolicy/router/zenohd.json" in done.output
+    assert "worker/elsewhere" in done.output
+    told = json.loads((site.folder / "zenohd.json").read_text())
+    assert told["transport"]["auth"]["usrpwd"]["dictionary_file"] == "/etc/evopolicy/router/passwords"
+    assert told["transport"]["link"]["tls"]["listen_private_key"] == "/etc/evopolicy/router/key.pem"
+    assert told["listen"] == {"endpoints": ["tls/0.0.0.0:7447"]}
+    assert str(site.certs.state) not in msgspec.json.encode(told).decode()
+
+
+def test_a_revoked_router_gets_no_file(site: Site) -> None:
+    site.certs.revoke("router/site")
+    with pytest.raises(ConfigError, match="not admitted"):
+        write_router_config(site.certs.state, "site", site.folder, listen=(), connect=())
+
+
+async def until(condition: object, attempts: int = 1200) -> None:
+    assert callable(condition)
+    for _ in range(attempts):
+        if condition():
+            return
+        await asyncio.sleep(0.025)
+    raise AssertionError("did not happen")
