@@ -44,14 +44,19 @@ class Gateway:
         self,
         folder: RunFolder,
         connect: tuple[str, ...] = (),
+        credentials_file: Path | None = None,
         *,
         on_ready: Callable[[Urls, Desk], None],
         on_change: Callable[[Desk], None],
         close_when_spent: bool,
     ) -> None:
-        """`connect` replaces the endpoints of the credentials file. `close_when_spent`: nobody else watches the agent."""
+        """`connect` and `credentials_file` (its folder) replace those of the run; its capability stays.
+
+        `close_when_spent`: nobody else watches the agent.
+        """
         self._folder = folder
         self._connect = connect
+        self._credentials_file = credentials_file
         self._on_ready = on_ready
         self._on_change = on_change
         self._close_when_spent = close_when_spent
@@ -65,7 +70,7 @@ class Gateway:
 
     async def run(self) -> bool:
         """Serves until told to end; whether the run was closed. Raises what makes it impossible to go on."""
-        found, run = _load(self._folder, self._connect)
+        found, run = _load(self._folder, self._connect, self._credentials_file)
         sock, address = await bind(self._folder)
         journal = Journal(self._folder.journal)
         try:
@@ -134,7 +139,9 @@ class Gateway:
         return None
 
 
-def _load(folder: RunFolder, connect: tuple[str, ...]) -> tuple[credentials.Credentials, str]:
+def _load(
+    folder: RunFolder, connect: tuple[str, ...], file: Path | None
+) -> tuple[credentials.Credentials, str]:
     if not folder.opened.exists():
         raise ConfigError(
             f"{folder.root} holds no open run ({folder.state.name}/{folder.opened.name} is missing);"
@@ -142,6 +149,8 @@ def _load(folder: RunFolder, connect: tuple[str, ...]) -> tuple[credentials.Cred
         )
     found = credentials.read(folder.credentials)
     run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+    if file is not None:
+        found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
     return credentials.at(found, connect), run
 
 

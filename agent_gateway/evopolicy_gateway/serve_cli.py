@@ -38,6 +38,13 @@ def serve(
     connect: Annotated[
         list[str] | None, typer.Option(help="Endpoint of the coordinator, in place of the one in the folder.")
     ] = None,
+    credentials_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--credentials",
+            help="Folder of `evopolicy-coordinator certs issue gateway`, in place of the credentials in the folder.",
+        ),
+    ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print the URLs as one JSON object.")] = False,
     controlled: Annotated[
         bool,
@@ -54,7 +61,7 @@ def serve(
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():
         folder = folder_of(run_directory)
-        closed = asyncio.run(_serve(folder, tuple(connect or ()), json_output, controlled))
+        closed = asyncio.run(_serve(folder, tuple(connect or ()), credentials_file, json_output, controlled))
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
     os._exit(0 if closed or not controlled else 3)
@@ -73,7 +80,13 @@ def _failures_in_the_log() -> Iterator[None]:
         raise SystemExit(FAILURE) from error
 
 
-async def _serve(folder: RunFolder, connect: tuple[str, ...], json_output: bool, controlled: bool) -> bool:
+async def _serve(
+    folder: RunFolder,
+    connect: tuple[str, ...],
+    credentials_file: Path | None,
+    json_output: bool,
+    controlled: bool,
+) -> bool:
     def ready(urls: Urls, desk: Desk) -> None:
         if controlled:
             opened = desk.run
@@ -96,7 +109,14 @@ async def _serve(folder: RunFolder, connect: tuple[str, ...], json_output: bool,
         if controlled:
             control.emit(progress_of(desk))
 
-    gateway = Gateway(folder, connect, on_ready=ready, on_change=changed, close_when_spent=not controlled)
+    gateway = Gateway(
+        folder,
+        connect,
+        credentials_file,
+        on_ready=ready,
+        on_change=changed,
+        close_when_spent=not controlled,
+    )
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, gateway.tell, None)
