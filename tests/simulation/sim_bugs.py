@@ -145,5 +145,15 @@ BUGS = (
     Bug("let a worker audit itself", JobGroup, "bars", "worker.name in self.not_on or", ""),
     Bug("forget at a restart what is to be audited", audit, "resume", 'row.state != "open"', "True"),
     Bug("wait for audits that nobody can play", machine.Core, "_fire", 'kind == "audits"', 'kind == "no"'),
+    Bug(
+        "call a forger who one other contradicts", audit, "compared", "elif event.replay == 1:", "elif False:"
+    ),
+    Bug(
+        "forget at a restart who is quarantined",
+        Fleet,
+        "set_state",
+        "self.quarantined[name] = reason",
+        "pass",
+    ),
     Bug("draw episodes anew at a restart", audit, "sample", "run.row.audit_share", "0.5"),
 )

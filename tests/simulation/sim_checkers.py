@@ -24,6 +24,7 @@ from evopolicy_coordinator.core.records import (
     RunStateRow,
     StrikeRow,
     SubmitRow,
+    WorkerRow,
     train_group,
 )
 
@@ -73,6 +74,8 @@ class Checkers:
         self.unreasoned = 0
         """Retries that no fault accounts for, in scenarios whose faults must cost none."""
         self.finished_runs: set[str] = set()
+        self.named: set[str] = set()
+        """Workers that were quarantined."""
 
     # ---- rows ----
 
@@ -88,6 +91,9 @@ class Checkers:
                 self._submit(row, rows)
             elif isinstance(row, AuditRow):
                 self._audit(row)
+            elif isinstance(row, WorkerRow) and row.state == "quarantined":
+                want(row.worker == self._simulation.slanderer, "no honest worker is quarantined", row)
+                self.named.add(row.worker)
             elif isinstance(row, StrikeRow):
                 self._strikes[row.group] = self._strikes.get(row.group, 0) + 1
                 known = self._disk.strikes.get((row.group, row.lease_id))
@@ -101,8 +107,10 @@ class Checkers:
                 want(pinned, "a run keeps its fingerprint class", old, row)
 
     def _audit(self, row: AuditRow) -> None:
-        """All workers here are honest."""
-        want(row.state != "disputed" and not row.difference, "honest workers agree", row)
+        """All players here are honest, and all auditors but one."""
+        slandered = self._simulation.slanderer in row.replayed_by
+        want(slandered or (row.state != "disputed" and not row.difference), "honest workers agree", row)
+        want(not row.forger, "no honest player is called a forger", row)
         old = self._disk.audits.get(row.audit)
         want(old is None or old.state == "open", "an audit is settled once", old, row)
         want(row.player not in row.replayed_by, "nobody audits himself", row)
@@ -247,6 +255,7 @@ class Checkers:
     def _leased(self, worker: str, lease: wire.Lease) -> None:
         core, disk, job = self._core, self._disk, lease.job
         group = job.job_id.rpartition("/")[0]
+        want(worker not in self.named, "a quarantined worker gets no work", worker, lease)
         known = self._granted.get(lease.lease_id)
         want(known is None, "an attempt is leased once", lease, known)
         highest = self._attempts.get(job.job_id, 0)
@@ -343,8 +352,9 @@ class Checkers:
         want((audit is None) == (share == 0.0), "audits are told where there are any", plan.name, audit)
         if audit is None:
             return
-        counted = audit.agreed + sum(audit.not_audited.values())
-        want(counted == audit.sampled and not audit.forgers, "honest workers are not accused", audit)
+        counted = audit.agreed + audit.disputed + sum(audit.not_audited.values())
+        want(counted == audit.sampled, "what was drawn is accounted for", audit)
+        want(set(audit.forgers) <= {self._simulation.slanderer}, "honest workers are not accused", audit)
         played = sum(
             len(rows)
             for group, rows in self._disk.outcomes.items()

@@ -196,6 +196,7 @@ class SimCoordinator:
                 audit=effect.audit,
                 replay=len(replays),
                 with_player=None if replays[-1] == played.episode_return else "another return",
+                with_first=None if replays[-1] == replays[0] else "another return",
             )
         self._take(self.core.handle(event, self.world.now))
         self.checkers.stepped(self.core)

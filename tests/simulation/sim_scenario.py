@@ -66,6 +66,8 @@ class Simulation:
         self.gateways: list[SimGateway] = []
         # In one seed of four, so that the others show what holds without audits.
         self.audit_share = (0.3, 1.0)[seed // 4 % 2] if seed % 4 == 0 else 0.0
+        self.slanderer = "w1" if seed % 8 == 4 else None
+        """The worker that lies about what it plays again; players are honest, so all runs come to what they must."""
         settings = CoreSettings(audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S)
         self.coordinator = SimCoordinator(self.world, self.disk, self.checkers, settings)
         for index in range(chance.randint(1, size.workers)):

@@ -1,4 +1,5 @@
 """A worker as simulated: registers, polls, beats, plays, hands in; it can die, stand still, be slow, and be in trouble.
+One may slander: what it plays again as an auditor it says to have gone otherwise.
 
 What it plays depends on the job alone, as with the real one; only its faults come from chance.
 """
@@ -144,6 +145,9 @@ class SimWorker(Asker):
         }
 
         def registered(message: Any) -> None:
+            if isinstance(message, wire.Refused):
+                self.life += 1  # quarantined: it ends
+                return
             self.session = message.session
             if first:
                 self._beat()
@@ -284,14 +288,16 @@ class SimWorker(Asker):
         elif self.simulation.dies(job):
             self._put(lease, "slot_died")
         else:
-            self._put(lease, "done", tuple(_outcome(job, spec, frozen_s) for spec in job.episodes))
+            lies = self.name == self.simulation.slanderer
+            episodes = tuple(_outcome(job, spec, frozen_s, lies=lies) for spec in job.episodes)
+            self._put(lease, "done", episodes)
         self._start()
         self._poll()
 
 
-def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float) -> EpisodeOutcome:
+def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float, *, lies: bool) -> EpisodeOutcome:
     if spec.replay is not None:
-        return _episode(spec.index, float(spec.replay.digest), None)
+        return _episode(spec.index, float(spec.replay.digest) + lies, None)
     category = failure_of(job.bundle, spec.index)
     failure = None if category is None else PolicyFailure(category=category, step_index=0, message="")
     value = return_of(spec.case.seed, job.bundle, spec.policy_seed, spec.episode_index, job.env_meta)

@@ -42,6 +42,10 @@ def test_the_same_seed_is_the_same_story() -> None:
     assert story(5) == story(5)
 
 
+def test_a_slandering_auditor_is_named_by_some_seeds() -> None:
+    assert any(play(seed).checkers.named for seed in range(4, 200, 8))
+
+
 def test_every_fault_is_drawn_by_some_seed() -> None:
     drawn = [Simulation(seed).faults for seed in range(100)]
     for name in RATES:
