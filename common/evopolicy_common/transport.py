@@ -437,9 +437,12 @@ async def _open_client(credentials: Credentials, timeout_s: float | None) -> zen
             return await asyncio.to_thread(zenoh.open, config)
         except zenoh.ZError as error:
             if deadline is not None and loop.time() > deadline:
+                doubt = f"are these the {credentials.role} credentials of its state folder?"
+                if credentials.tls is not None:
+                    doubt = f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
                 raise TransportError(
                     f"no connection to {', '.join(credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
-                    f" there, and are these the {credentials.role} credentials of its state folder?"
+                    f" there, and {doubt}"
                 ) from error
         await asyncio.sleep(pause)
         pause = min(0.5, pause * 1.5)

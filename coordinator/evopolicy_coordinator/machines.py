@@ -254,8 +254,7 @@ def _write_folder(
 ) -> None:
     _write(out / f"{prefix}cert.pem", pair.certificate)
     _write(out / f"{prefix}key.pem", pair.private_key)
-    if machine.role == "router":
-        _write(out / "password", f"{machine.identity}:{machine.password}\n".encode())
+    if machine.role == "router":  # its password goes into its zenohd's configuration: `router_config.py`
         return
     credentials.write(
         Credentials(

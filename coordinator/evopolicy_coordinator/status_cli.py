@@ -57,7 +57,11 @@ Connect = Annotated[
     typer.Option(help="Endpoint of the coordinator; default: the one of this machine's state folder."),
 ]
 CredentialsFile = Annotated[
-    Path | None, typer.Option("--credentials", help="STATE/credentials/operator.json of the coordinator.")
+    Path | None,
+    typer.Option(
+        "--credentials",
+        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
+    ),
 ]
 
 

@@ -75,7 +75,11 @@ def verify(
         typer.Option(help="Endpoint of the coordinator; default: the one of this machine's state folder."),
     ] = None,
     file: Annotated[
-        Path | None, typer.Option("--credentials", help="STATE/credentials/operator.json of the coordinator.")
+        Path | None,
+        typer.Option(
+            "--credentials",
+            help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
+        ),
     ] = None,
     local: Annotated[
         bool, typer.Option("--local", help="Bring up a coordinator and a worker for this command.")

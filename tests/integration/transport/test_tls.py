@@ -7,12 +7,13 @@ import contextlib
 import datetime as dt
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import pytest
 import zenoh
-from own_certs import CLUSTER, OwnCerts, now, of
+from own_certs import CLUSTER, DAYS, OwnCerts, now, of
 
 from evopolicy_common import keys, transport
 from evopolicy_common.credentials import Credentials, Role
@@ -56,6 +57,10 @@ async def gets_in(credentials: Credentials, patience_s: float = 0.5) -> bool:
             return True
     except TransportError:
         return False
+
+
+async def stops_being_answered(link: Link) -> bool:
+    return not await answered(link, KEYS["worker"])
 
 
 async def until(condition: Callable[[], Awaitable[bool]], attempts: int = 200) -> None:
@@ -251,9 +256,6 @@ def test_a_machine_is_admitted_and_revoked_while_the_coordinator_listens(tmp_pat
                 assert not await answered(stolen, KEYS["worker"])
             assert await answered(link, KEYS["worker"])
 
-    async def stops_being_answered(link: Link) -> bool:
-        return not await answered(link, KEYS["worker"])
-
     asyncio.run(scenario())
 
 
@@ -292,6 +294,28 @@ def test_a_folder_that_was_issued_again_voids_the_one_before(tmp_path: Path) -> 
             assert not await gets_in(msgspec.structs.replace(before, tls=old_tls))
             async with transport.connect(after) as link:
                 assert await answered(link, KEYS["worker"])
+
+    asyncio.run(scenario())
+
+
+def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        certs = OwnCerts(tmp_path / "c")
+        honest = of(certs.issue("worker", "honest"))
+        async with coordinator(certs), transport.connect(honest, timeout_s=30) as link:
+            for life_s in (4, 16, 64):  # a slow machine may not come in before the shorter ones are over
+                made = now() - dt.timedelta(days=DAYS) + dt.timedelta(seconds=life_s)
+                brief = of(certs.issue("worker", f"brief-{life_s}", made))
+                with contextlib.suppress(TransportError):
+                    async with transport.connect(brief, timeout_s=life_s) as ending:
+                        while now() < made + dt.timedelta(days=DAYS):
+                            if await answered(ending, KEYS["worker"]):
+                                await until(partial(stops_being_answered, ending), 4000)
+                                assert now() >= made + dt.timedelta(days=DAYS)
+                                assert await answered(link, KEYS["worker"])
+                                return
+                            await asyncio.sleep(0.05)
+        raise AssertionError("no certificate lived long enough to come in")
 
     asyncio.run(scenario())
 
