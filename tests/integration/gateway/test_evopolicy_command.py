@@ -363,6 +363,21 @@ patient_submit([2, 3], "two")
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 
+def test_an_agent_that_stays_when_its_budget_is_spent_is_ended_even_if_it_ignores_being_asked(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+import signal
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+submit([0, 1, 2, 3, 4, 5])
+time.sleep(1000)
+"""
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("budget_spent", 6)
+
+
 def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(operator_file: Path, tmp_path: Path) -> None:
     exit_code, _, err = run_on(
         operator_file, tmp_path, agent(tmp_path, "submit([0, 1])\ntime.sleep(1000)"), "--agent-wall-s", "2"

@@ -30,6 +30,7 @@ from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.transport import connect
+from evopolicy_worker import supervisor
 from evopolicy_worker.supervisor import Options, Supervisor
 
 
@@ -91,6 +92,7 @@ async def supervising(
     *,
     name: str = "w-1",
     slots: int = 2,
+    grace_s: float = 5.0,
 ) -> AsyncIterator[Supervisor]:
     """A supervisor that works in the background and is drained at the end."""
     options = Options(
@@ -101,19 +103,19 @@ async def supervising(
         fingerprint=FINGERPRINT,
         host="test",
         scratch=scratch / name,
-        grace_s=5.0,
+        grace_s=grace_s,
     )
 
     def make_slot(index: int, tier: Tier) -> ScriptedSlot:
         return ScriptedSlot(script)
 
     async with connect(coordinator.credentials("worker")) as link:
-        supervisor = Supervisor(link, options, make_slot)
-        task = asyncio.create_task(supervisor.run())
+        found = Supervisor(link, options, make_slot)
+        task = asyncio.create_task(found.run())
         try:
-            yield supervisor
+            yield found
         finally:
-            supervisor.drain()
+            found.drain()
             await asyncio.wait_for(task, 30)
 
 
@@ -142,14 +144,14 @@ def run(scenario: Callable[[], Awaitable[None]]) -> None:
 
 def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with supervising(coordinator, tmp_path) as supervisor:
+        async with supervising(coordinator, tmp_path) as worker:
             finished = await whole_run(coordinator)
             assert finished["status"] == "completed"
             assert len(finished["heldout_returns"]) == 4
             assert finished["nondeterministic_results"] == 0
             # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
             # played by the time it heard of it.
-            assert 30 <= supervisor.jobs_done <= 33
+            assert 30 <= worker.jobs_done <= 33
 
     run(scenario)
 
@@ -226,6 +228,50 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
             leaver.drain()
         async with supervising(coordinator, tmp_path, name="stayer"):
             assert (await run_task)["status"] == "completed"
+
+    run(scenario)
+
+
+def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "CANCEL_PATIENCE_S", 0.2)
+    reached = asyncio.Event()
+
+    async def deaf(slot: ScriptedSlot, job: Job) -> None:
+        reached.set()
+        await asyncio.sleep(1000)
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, deaf, name="leaver", grace_s=0.2) as leaver:
+            run_task = asyncio.create_task(whole_run(coordinator))
+            await reached.wait()
+            leaver.drain()
+        async with supervising(coordinator, tmp_path, name="stayer"):
+            assert (await run_task)["status"] == "completed"
+
+    run(scenario)
+
+
+def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "WITHDRAW_PATIENCE_S", 0.2)
+    played, come_back = asyncio.Event(), asyncio.Event()
+
+    async def until_it_is_away(slot: ScriptedSlot, job: Job) -> None:
+        played.set()
+        await come_back.wait()
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, until_it_is_away, grace_s=0.2) as leaver:
+            run_task = asyncio.create_task(whole_run(coordinator))
+            await played.wait()
+            coordinator.kill()
+            come_back.set()
+            leaver.drain()
+        run_task.cancel()
+        await asyncio.gather(run_task, return_exceptions=True)
 
     run(scenario)
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from typing import Any
 
 import pytest
 
+from evopolicy_gateway.jail import doors
 from evopolicy_gateway.jail.doors import Doors
 from evopolicy_gateway.jail.settings import Host
 
 
 async def ask(request: bytes, hosts: frozenset[Host] = frozenset(), *, then: bytes = b"") -> bytes:
     """What the proxy answers, its listening socket handed over as a jail does it."""
-    doors = Doors({}, hosts)
+    opened = Doors({}, hosts)
     here, there = socket.socketpair()
     listening = socket.create_server(("127.0.0.1", 0))
     socket.send_fds(there, [b"."], [listening.fileno()])
-    await doors.serve(here)
+    await opened.serve(here)
     reader, writer = await asyncio.open_connection(*listening.getsockname())
     try:
         writer.write(request + then)
@@ -25,7 +27,7 @@ async def ask(request: bytes, hosts: frozenset[Host] = frozenset(), *, then: byt
         return await asyncio.wait_for(reader.read(), 30)
     finally:
         writer.close()
-        await doors.close()
+        await opened.close()
         for sock in (here, there, listening):
             sock.close()
 
@@ -82,11 +84,47 @@ def test_a_head_without_end_is_cut() -> None:
 
 def test_a_program_that_ended_before_it_handed_out_its_sockets_opens_no_door() -> None:
     async def main() -> None:
-        doors = Doors({}, frozenset())
+        opened = Doors({}, frozenset())
         here, there = socket.socketpair()
         there.close()
-        await asyncio.wait_for(doors.serve(here), 30)
-        await doors.close()
+        await asyncio.wait_for(opened.serve(here), 30)
+        await opened.close()
         here.close()
 
     asyncio.run(main())
+
+
+def test_a_jailed_program_that_asks_for_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "_HEAD_PATIENCE_S", 0.2)
+
+    async def main() -> bytes:
+        found = Doors({}, frozenset())
+        here, there = socket.socketpair()
+        listening = socket.create_server(("127.0.0.1", 0))
+        socket.send_fds(there, [b"."], [listening.fileno()])
+        await found.serve(here)
+        reader, writer = await asyncio.open_connection(*listening.getsockname())
+        try:
+            return await asyncio.wait_for(reader.read(), 30)
+        finally:
+            writer.close()
+            await found.close()
+            for sock in (here, there, listening):
+                sock.close()
+
+    assert asyncio.run(main()) == b""
+
+
+def test_a_named_host_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "_CONNECT_PATIENCE_S", 0.2)
+    connect = asyncio.open_connection
+
+    async def to_nowhere(host: str, port: int, *more: Any) -> Any:
+        if host == "example.org":
+            await asyncio.sleep(1000)
+        return await connect(host, port, *more)
+
+    monkeypatch.setattr(asyncio, "open_connection", to_nowhere)
+    request = b"CONNECT example.org:443 HTTP/1.1\r\n\r\n"
+    answer = asyncio.run(ask(request, frozenset({("example.org", 443)})))
+    assert answer.split()[1] == b"502"

@@ -1,0 +1,315 @@
+"""Timeouts of the agent's side fire: what it waits for never comes, and it goes on, gives up or ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cli_stage
+import pytest
+import test_harnesses
+from cli_stage import settings
+from gateway_double import served
+from starlette.responses import PlainTextResponse
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_gateway import http, local_cluster, play, server
+from evopolicy_gateway.agents.client import Client, ProtocolError
+from evopolicy_gateway.children import Child
+from evopolicy_gateway.harnesses import agent_process, base, cli_agent, command, turn
+from evopolicy_gateway.jail import settings as jail_settings
+from evopolicy_gateway.play import RunPlay
+
+SOON_S = 0.2
+STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+
+
+@contextlib.contextmanager
+def mute_server() -> Iterator[str]:
+    """Where connections are taken and nothing is ever said."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+
+
+# The agents' own side.
+
+
+def test_an_agent_gives_up_on_a_gateway_that_says_nothing() -> None:
+    with mute_server() as url:
+        client = Client(info_url=url, task_url=url, submit_url=url, answer_s=SOON_S, patience_s=SOON_S)
+        with pytest.raises(ProtocolError, match="did not answer"):
+            client.info()
+
+
+def test_info_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "_INFO_TIMEOUT_S", SOON_S)
+    with mute_server() as url, pytest.raises(OSError, match="timed out"):
+        base._get_json(url)
+
+
+def test_a_program_that_has_said_stop_and_stays_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "_STOP_PATIENCE_S", SOON_S)
+    code = """
+import json, os, sys, time
+open("pid", "w").write(str(os.getpid()))
+turn = json.loads(sys.stdin.readline())["turn"]
+print(json.dumps({"turn": turn, "text": "", "stop": True}), flush=True)
+time.sleep(1000)
+"""
+    try:
+        ending, _, turns = test_harnesses.play(tmp_path, code)
+        assert (ending.reason, turns) == ("agent_stopped", [(1, "")])
+    finally:
+        os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+
+
+def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "_PIPE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(agent_process, "_LAST_WORDS_S", SOON_S)
+    test_harnesses.test_a_child_that_holds_the_pipes_does_not_hold_up_the_end(tmp_path)
+
+
+# Coding agents' CLIs.
+
+
+def test_a_cli_that_does_not_tell_its_version_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_agent, "_PROBE_PATIENCE_S", SOON_S)
+    mute = tmp_path / "bin" / "claude"
+    mute.parent.mkdir()
+    mute.write_text("#!/bin/sh\nexec sleep 1000\n")
+    mute.chmod(0o755)
+    path = f"{mute.parent}:{os.environ['PATH']}"
+    with pytest.raises(base.AgentError, match=r"does not answer --version.*timed out"):
+        cli_stage.play(tmp_path, settings("claude-code"), "work", PATH=path)
+
+
+@pytest.mark.parametrize("scenario", ["lingers", "lingers_stubborn"])
+def test_a_cli_that_is_done_and_does_not_exit_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: str
+) -> None:
+    """Also one that ignores SIGTERM."""
+    monkeypatch.setattr(turn, "DONE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(turn, "_KILL_GRACE_S", SOON_S)
+    played = cli_stage.play(tmp_path, settings("claude-code"), scenario, budget=2)
+    assert played.ending is not None
+    assert (played.ending.reason, played.ending.turns, played.ending.retries) == ("agent_stopped", 1, 0)
+
+
+def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turn, "_PIPE_PATIENCE_S", SOON_S)
+    try:
+        played = cli_stage.play(tmp_path, settings("claude-code"), "leaves_child", budget=2)
+        assert played.ending is not None
+        assert (played.ending.reason, played.ending.turns) == ("agent_stopped", 1)
+    finally:
+        os.kill(int((tmp_path / "fake" / "child").read_text()), signal.SIGKILL)
+
+
+KEEPER = """
+import asyncio, sys
+from evopolicy_gateway.control import StartAgent, StopAgent
+from evopolicy_gateway.harnesses import keeper
+from evopolicy_gateway.harnesses.base import Harness
+
+class Deaf(Harness):
+    name, command = "deaf", []
+    async def play(self, stage):
+        await asyncio.sleep(1000)
+
+class Orders:
+    async def next(self):
+        return StopAgent()
+
+keeper.make = lambda *given: Deaf()
+keeper.LAST_WORDS_S = 0.2
+order = StartAgent(agent="deaf", workspace=".", agent_log="agent.jsonl", urls={}, started_in=".", wall_limit_s=1000.0)
+print(asyncio.run(keeper.keep(order, Orders())).reason)
+"""
+
+
+def test_a_harness_that_does_not_end_with_its_programs_is_cut_off(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KEEPER], capture_output=True, text=True, timeout=60, cwd=tmp_path, check=False
+    )
+    assert done.stdout.splitlines()[-1:] == ["told"], done.stderr
+
+
+# The jail.
+
+
+def test_a_bubblewrap_that_hangs_builds_no_jail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jail_settings, "_PATIENCE_S", SOON_S)
+    program = tmp_path / "bwrap"
+    program.write_text("#!/bin/sh\nexec sleep 1000\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(ConfigError, match="timed out"):
+        jail_settings.check_bubblewrap()
+
+
+# The gateway's service.
+
+
+async def _sent(url: str, text: str) -> bytes:
+    """What the service says to a client that sends this and then nothing more."""
+    host, _, rest = url.removeprefix("http://").partition("/")
+    reader, writer = await asyncio.open_connection(*host.split(":"))
+    writer.write(text.replace("PATH", f"/{rest}").encode())
+    try:
+        return await asyncio.wait_for(reader.read(), 30)
+    finally:
+        writer.close()
+
+
+def test_a_body_that_does_not_come_is_refused_and_its_rest_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "BODY_WAIT_S", SOON_S)
+    monkeypatch.setattr(http, "_LINGER_S", SOON_S)
+
+    async def main() -> bytes:
+        async with served(tmp_path) as s:
+            head = "POST PATH HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 100\r\n\r\n{"
+            return await _sent(s.urls.submit, head)
+
+    answer = asyncio.run(main())
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert b"did not arrive" in answer
+
+
+def test_a_submit_that_is_not_waited_for_is_answered_before_it_is_decided(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "DECIDED_WAIT_S", SOON_S)
+
+    async def main() -> None:
+        async with served(tmp_path) as s:
+            s.double.up = False
+            answer = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
+            assert answer.status_code == 202
+            s.double.up = True
+            await s.desk.idle()
+
+    asyncio.run(main())
+
+
+def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "KEEP_ALIVE_S", 1)
+
+    async def main() -> bytes:
+        async with served(tmp_path) as s:
+            return await _sent(s.urls.info, "GET PATH HTTP/1.1\r\nhost: x\r\n\r\n")
+
+    assert asyncio.run(main()).startswith(b"HTTP/1.1 200")
+
+
+def test_a_request_that_does_not_end_does_not_hold_up_the_services_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(server, "CLOSE_GRACE_S", 1)
+
+    async def main() -> None:
+        asked = asyncio.Event()
+
+        async def never(scope: Any, receive: Any, send: Any) -> None:
+            asked.set()
+            await asyncio.sleep(1000)
+            await PlainTextResponse("late")(scope, receive, send)
+
+        sock = socket.socket()
+        sock.bind(("127.0.0.1", 0))
+        async with asyncio.timeout(60), server.serving(never, sock):
+            _, writer = await asyncio.open_connection(*sock.getsockname())
+            writer.write(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
+            await asked.wait()
+        writer.close()
+
+    asyncio.run(main())
+
+
+# The operator's side.
+
+
+def test_a_local_coordinator_that_does_not_start_is_told_and_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_cluster, "START_PATIENCE_S", 2.0)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    monkeypatch.setattr(local_cluster, "_module", lambda name: [sys.executable, "-c", STUBBORN])
+    started: list[Child] = []
+    start = Child.start
+
+    async def noted(program: Any, log: Path, **more: Any) -> Child:
+        started.append(await start(program, log, **more))
+        return started[-1]
+
+    monkeypatch.setattr(Child, "start", noted)
+
+    async def main() -> None:
+        with pytest.raises(ConfigError, match="did not start"):
+            async with local_cluster.local_cluster(["toy/line"], slots=1, state=tmp_path / "s"):
+                pass
+
+    asyncio.run(main())
+    assert [child.exit_code for child in started] == [-signal.SIGKILL]
+
+
+def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
+    async def main() -> int | None:
+        child = await Child.start([sys.executable, "-c", STUBBORN], tmp_path / "log", talks=True)
+        assert child._process.stdout is not None
+        await child._process.stdout.readline()
+        await child.end(SOON_S)
+        return child.exit_code
+
+    assert asyncio.run(main()) == -signal.SIGKILL
+
+
+def test_giving_up_a_run_ends_although_nobody_hears_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play, "GIVE_UP_PATIENCE_S", SOON_S)
+
+    class Deaf:
+        async def cancel(self, run: str) -> None:
+            await asyncio.sleep(1000)
+
+    async def main() -> None:
+        plan: Any = SimpleNamespace(folder=None, settings=SimpleNamespace(env="toy/line"))
+        running = RunPlay(plan, Deaf(), None, None)  # type: ignore[arg-type]
+        async with asyncio.timeout(60):
+            await running._give_up("r", None)
+
+    asyncio.run(main())
+
+
+UNKILLABLE = """
+import subprocess, sys
+from evopolicy_gateway import processes
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
+processes.KILL_PATIENCE_S = 0.2
+signal_all, processes._signal_all = processes._signal_all, lambda pids, number: None
+print(processes.end_descendants(0.0) == [child.pid])
+child.kill()
+child.wait()
+"""
+
+
+def test_what_survives_killing_is_told() -> None:
+    done = subprocess.run([sys.executable, "-c", UNKILLABLE], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
