@@ -2,7 +2,7 @@
 
 A host is its holder, a process that only sleeps: what runs on the host is started by `nsenter` into the holder's
 namespaces, and when the holder is gone and nothing runs there any more, the kernel takes namespaces, devices and routes
-away. The holder dies with the thread that made it, so nothing is left of a test that was killed.
+away. Holders, and what was started on hosts, are ended with the thread that made them: a test that is killed leaves nothing.
 
 Root makes the namespaces as it is; other users make them inside a user namespace, where the kernel lets them. `refusal`
 says why not. Call from the main thread.
@@ -67,10 +67,13 @@ class Host:
     def start(
         self, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
     ) -> subprocess.Popen[bytes]:
-        """Starts a program here, in a session of its own, what it says appended to `log`; ended with the network."""
+        """Starts a program here, in a session of its own, what it says appended to `log`.
+
+        It is sent SIGTERM with the end of the network, or of the thread that started it.
+        """
         with log.open("ab") as said:
             process = subprocess.Popen(
-                [*self.enter, *command],
+                [*self.enter, "setpriv", "--pdeathsig", "TERM", *command],
                 stdin=subprocess.DEVNULL,
                 stdout=said,
                 stderr=said,
@@ -125,10 +128,11 @@ class Cable:
         host.run("ip", "link", "set", device, "up")
 
 
-class Wire:
+class Wire(Cable):
     """A pair of TUN devices and the program that carries packets between them, late and not all of them."""
 
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+    def __init__(self, ends: Sequence[tuple[Host, str]], process: subprocess.Popen[bytes]) -> None:
+        super().__init__(ends)
         self._process = process
 
     def weather(self, delay_s: float, loss: float) -> None:
@@ -188,7 +192,7 @@ class Network:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
-        wire = Wire(process)
+        wire = Wire(ends, process)
         self._wires.append(wire)
         assert process.stdout is not None
         with process.stdout:
