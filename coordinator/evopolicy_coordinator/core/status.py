@@ -12,7 +12,7 @@ from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 
 from . import audit
 from .finalisation import progress
-from .jobs import JobGroup
+from .jobs import AUDIT, JobGroup
 from .queue import Flow, Lane, Profile
 from .runs import Run
 
@@ -160,7 +160,7 @@ def _run(core: Core, run: Run) -> RunStatus:
         budget=run.row.budget,
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
-        queued=sum(run.flow.n_ready),
+        queued=sum(run.flow.n_ready[:AUDIT]),
         running=run.flow.n_leased,
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=waiting[0] if waiting else "",
