@@ -47,7 +47,10 @@ import pathlib, sys, time
 import hosts
 with hosts.network() as network:
     host = network.host("a")
-    program = host.start(["sleep", "1000"], pathlib.Path(sys.argv[1]))
+    log = pathlib.Path(sys.argv[1])
+    program = host.start(["sh", "-c", "echo up; exec sleep 1000"], log)
+    while not log.read_text():
+        time.sleep(0.01)
     print(host.pid, program.pid, flush=True)
     time.sleep(1000)
 """
