@@ -215,6 +215,42 @@ def test_two_workers_of_which_one_forges_are_both_in_dispute(tmp_path: Path) -> 
         asyncio.run(scenario(coordinator, workers))
 
 
+def test_audits_go_on_after_the_coordinator_was_killed(tmp_path: Path) -> None:
+    async def before(coordinator: Coordinator, workers: Workers) -> operator.RunCreated:
+        async with operator_of(coordinator) as client:
+            run = await created(client, "killed")
+            async with gateway_of(coordinator, run) as gateway:
+                workers.start("honest-1")
+                await gateway.submit(bundle_of(CLOCK_POLICY), tuple(range(EPISODES)), "key")
+                await gateway.results(0)
+
+            async def drawn() -> bool:
+                return (await client.status()).audits.get("open", 0) >= EPISODES
+
+            await until(drawn, "the episodes are drawn")
+        return run
+
+    async def after(coordinator: Coordinator, workers: Workers, run: operator.RunCreated) -> None:
+        async with operator_of(coordinator) as client, gateway_of(coordinator, run) as gateway:
+            workers.start("honest-2")
+            await registered(client, "honest-1", "honest-2")
+            await gateway.close()
+            found = (await client.finished(run.run)).audit
+        assert found is not None
+        assert found.agreed == found.sampled == EPISODES + 3 * HIDDEN
+
+    with cluster(tmp_path, "--audit", "1") as (coordinator, workers):
+        run = asyncio.run(before(coordinator, workers))
+        coordinator.kill()
+        # The share is the run's own: a coordinator that asks for none goes on with it.
+        second = Coordinator(coordinator.state)
+        try:
+            asyncio.run(after(second, workers, run))
+        finally:
+            workers.stop()
+            second.stop()
+
+
 def test_audits_of_a_local_run_are_in_its_run_json(tmp_path: Path) -> None:
     command = ["local", "--env", "toy/line", "--agent", "random", "--entry", "tester", "--exp-id", "audited"]
     command += ["--budget", "2", "--validation", "1", "--heldout", "1", "--audit", "1"]
