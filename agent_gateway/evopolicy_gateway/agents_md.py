@@ -16,6 +16,8 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
     info: str
     task: str
     submit: str
+    bearer: bool = False
+    """Every request needs the bearer token in `EVOPOLICYGYM_TOKEN`."""
 
     def environment(self) -> dict[str, str]:
         """As the variables that an agent's process is started with."""
@@ -28,9 +30,32 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
 
 def urls_at(host: str, port: int, token: str) -> Urls:
     """The URLs of a service on that address."""
-    root = f"http://{f'[{host}]' if ':' in host else host}:{port}/{token}"
-    return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit")
+    return urls_below(f"http://{f'[{host}]' if ':' in host else host}:{port}", token)
 
+
+def urls_below(base: str, token: str, *, bearer: bool = False) -> Urls:
+    """The URLs of a service below `base`, such as `http://127.0.0.1:4711`."""
+    root = f"{base}/{token}"
+    return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit", bearer=bearer)
+
+
+_ASK = 'SUBMIT_URL + "/" + answer["submit_id"]'
+_WITHOUT_BEARER = {
+    "auth": "",
+    "addresses": "service's addresses are also in `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.",
+    "os": "",
+    "headers": "",
+    "more_headers": "",
+    "question": _ASK,
+}
+_WITH_BEARER = {
+    "auth": '-H "Authorization: Bearer $EVOPOLICYGYM_TOKEN" ',
+    "addresses": "service wants a token with every request, which is in `EVOPOLICYGYM_TOKEN`.",
+    "os": "os, ",
+    "headers": 'AUTH = {"Authorization": "Bearer " + os.environ["EVOPOLICYGYM_TOKEN"]}\n',
+    "more_headers": ", **AUTH",
+    "question": f"urllib.request.Request({_ASK}, headers=AUTH)",
+}
 
 NO_URLS = Urls(info="INFO_URL", task="TASK_URL", submit="SUBMIT_URL")
 """What stands for the URLs where only the rules count: for the hash in `run.json`."""
@@ -57,20 +82,20 @@ result, its mean return on further hidden cases your score. So what counts is ho
 | `AGENTS.md` | this file; do not change it |
 
 Anything else you put here is your own scratch space and is never played. Your working directory is this folder. The
-service's addresses are also in `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.
+$addresses
 
 ## Ask
 
 The task, in markdown:
 
 ```bash
-curl -sS $task_url
+curl -sS $auth$task_url
 ```
 
 Budget left, spaces, limits and allowed imports, as JSON:
 
 ```bash
-curl -sS $info_url
+curl -sS $auth$info_url
 ```
 
 ## Submit
@@ -79,28 +104,28 @@ curl -sS $info_url
 to $most episodes. **Every episode asked for is charged**, also when the policy crashes. One submit at a time.
 
 ```bash
-curl -sS -X POST -H 'Content-Type: application/json' -d '{"env_instances": $example}' '$submit_url'
+curl -sS ${auth}-X POST -H 'Content-Type: application/json' -d '{"env_instances": $example}' '$submit_url'
 ```
 
 It answers when all episodes are played. If your tools give up on slow commands, do not wait: `?wait=false` answers at once
 with a `submit_id`, which you can ask about until its `status` is no longer `running`. From Python:
 
 ```python
-import json, time, urllib.request, uuid
+import json, ${os}time, urllib.request, uuid
 
 SUBMIT_URL = "$submit_url"
-
+$headers
 def submit(env_instances):
     request = urllib.request.Request(
         SUBMIT_URL + "?wait=false",
         data=json.dumps({"env_instances": env_instances}).encode(),
         # The key makes it safe to send the same request again: it is charged once.
-        headers={"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())},
+        headers={"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())$more_headers},
     )
     answer = json.load(urllib.request.urlopen(request))
     while answer["status"] == "running":
         time.sleep(1)
-        answer = json.load(urllib.request.urlopen(SUBMIT_URL + "/" + answer["submit_id"]))
+        answer = json.load(urllib.request.urlopen($question))
     return answer
 
 answer = submit($example)
@@ -167,6 +192,7 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         else "One `Policy` plays all episodes of a submit one after another; `reset` is called before each."
     )
     return _TEXT.substitute(
+        _WITH_BEARER if urls.bearer else _WITHOUT_BEARER,
         env=run.env.env,
         budget=run.episode_budget,
         least=run.min_episodes_per_submit,

@@ -19,7 +19,9 @@ from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_difference import differences
-from evopolicy_gateway import harnesses, options, processes, trials
+from evopolicy_gateway import door, harnesses, options, processes, trials
+from evopolicy_gateway.door import Door
+from evopolicy_gateway.gateway import folder_of
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.options import RunOptions
 from evopolicy_gateway.play import Plan
@@ -92,6 +94,8 @@ def run(
     jail_bind_rw: options.JailBindWritable = None,
     jail_env: options.JailVariable = None,
     allow_host: options.AllowHost = None,
+    http: options.Http = None,
+    http_url: options.HttpUrl = None,
     runs: Runs = Path("runs"),
     overwrite: Overwrite = False,
     resume: Resume = False,
@@ -121,8 +125,13 @@ def run(
             video=video,
             limits=limit or (),
         )
-        held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        plans = _plans(given, [options.one_environment(env)], runs, agent_wall_s, (overwrite, resume), held)
+        served = options.door_from(http, http_url)
+        if agent == door.AGENT:
+            held = options.no_jail_of_ours(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
+        else:
+            held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
+        env_ids = [options.one_environment(env)]
+        plans = _plans(given, env_ids, runs, agent_wall_s, (overwrite, resume), held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
             where = Cluster(local_slots=slots)
@@ -270,6 +279,17 @@ def diff_runs(
     raise typer.Exit(1 if found else 0)
 
 
+@app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")
+def finish(
+    run_directory: Annotated[
+        Path, typer.Argument(help="Folder of an open run with --agent remote.", show_default=False)
+    ],
+) -> None:
+    """Says that a remote agent is done: its run takes no more submits, is scored, and its `evopolicy run` ends."""
+    with fail_on_our_errors():
+        door.finish(folder_of(run_directory))
+
+
 app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_suite)
 
 
@@ -280,6 +300,7 @@ def _plans(
     wall_limit_s: float,
     replaced: tuple[bool, bool],
     jail: JailSettings,
+    served: Door | None = None,
 ) -> list[Plan]:
     """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started.
 
@@ -301,6 +322,7 @@ def _plans(
             overwrite=overwrite,
             resume=resume,
             jail=jail,
+            door=served,
         )
         for env_id in env_ids
     ]

@@ -1,6 +1,7 @@
 """The agent's HTTP service: `/info`, `/task`, `/submit`, all below a secret path token.
 
-Rules: the token is compared in constant time and everything else is the same 404; nothing of a request is ever a path of
+Rules: the token is compared in constant time and everything else is the same 404; where the service is open to other hosts
+a bearer token comes before that, and without it everything is the same 401; nothing of a request is ever a path of
 the file system; a body is read only as far as a submit may be long; an error says what the agent can act on and nothing
 of this machine; no answer depends on whether the one who asked still listens.
 """
@@ -35,14 +36,16 @@ BODY_WAIT_S = 30.0
 DECIDED_WAIT_S = 5.0
 """How long `?wait=false` waits for the coordinator's word before it answers 202 all the same."""
 MAX_KEY_CHARS = 200
-_LINGER_BYTES = 256 << 20
-_LINGER_S = 10.0
+LINGER = (256 << 20, 120.0)
+"""Bytes and seconds for which the rest of a refused body is read before the connection is closed."""
+STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
+"""The same for one without the bearer token."""
 
 Handler = Callable[[Request], Awaitable[Response]]
 
 
-def make_app(desk: Desk, token: str) -> ASGIApp:
-    """The service of one run."""
+def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
+    """The service of one run; `bearer` empty: none is asked for."""
     task = task_markdown(desk.run).encode()
 
     async def info(request: Request) -> Response:
@@ -94,7 +97,7 @@ def make_app(desk: Desk, token: str) -> ASGIApp:
         },
     )
     app.router.redirect_slashes = False
-    return _TokenGate(app, token)
+    return _TokenGate(app, token, bearer)
 
 
 def _of_ticket(ticket: Ticket) -> Response:
@@ -137,6 +140,14 @@ def _json(status: int, document: dict[str, Any]) -> Response:
     return Response(orjson.dumps(document), status_code=status, media_type="application/json")
 
 
+_STRANGER = Response(
+    orjson.dumps({"error": {"message": "this service wants a bearer token"}}),
+    status_code=401,
+    media_type="application/json",
+    headers={"WWW-Authenticate": "Bearer"},
+)
+
+
 async def _request_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
@@ -166,20 +177,32 @@ async def _our_error(request: Request, error: Exception) -> Response:
 class _TokenGate:
     """Lets through what knows the token, without it; lets a client that is still sending hear a refusal."""
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
+    def __init__(self, app: ASGIApp, token: str, bearer: str) -> None:
         self._app = app
         self._token = token.encode()
+        self._bearer = bearer.encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
+            return
+        if self._bearer and not self._bears(scope):
+            stranger = _Exchange(scope, receive, send, STRANGER_LINGER)
+            await _STRANGER(scope, stranger.receive, stranger.send)
             return
         _, _, rest = scope["path"].partition("/")
         token, slash, path = rest.partition("/")
         if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
             path = slash = ""
         inner = dict(scope) | {"path": slash + path, "raw_path": None, "root_path": ""}
-        exchange = _Exchange(scope, receive, send)
+        exchange = _Exchange(scope, receive, send, LINGER)
         await self._app(inner, exchange.receive, exchange.send)
+
+    def _bears(self, scope: Scope) -> bool:
+        """Whether the request carries the bearer token, once."""
+        given = [value for name, value in scope["headers"] if name == b"authorization"]
+        kind, _, word = b"".join(given[:1]).partition(b" ")
+        alike = hmac.compare_digest(word.strip(), self._bearer)
+        return alike and len(given) == 1 and kind.lower() == b"bearer"
 
 
 class _Exchange:
@@ -188,7 +211,8 @@ class _Exchange:
     A server that closes while the client still sends resets the connection, and the client never reads the refusal.
     """
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    def __init__(self, scope: Scope, receive: Receive, send: Send, linger: tuple[int, float]) -> None:
+        self._left, self._linger_s = linger
         self._receive = receive
         self._send = send
         self._refused = False
@@ -210,13 +234,12 @@ class _Exchange:
             return
         await self._send({**message, "more_body": True})
         try:
-            async with asyncio.timeout(_LINGER_S):
+            async with asyncio.timeout(self._linger_s):
                 await self._discard()
         except TimeoutError:
             pass
         await self._send({"type": "http.response.body", "body": b"", "more_body": False})
 
     async def _discard(self) -> None:
-        left = _LINGER_BYTES
-        while self._unread and left > 0:
-            left -= len((await self.receive()).get("body", b""))
+        while self._unread and self._left > 0:
+            self._left -= len((await self.receive()).get("body", b""))

@@ -68,6 +68,21 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "service.json"
 
     @property
+    def door(self) -> Path:
+        """Where a remote agent is served: `Door`. Not there for an agent that is started here."""
+        return self.state / "door.json"
+
+    @property
+    def bearer(self) -> Path:
+        """A remote agent's bearer token, as text."""
+        return self.state / "bearer"
+
+    @property
+    def finish(self) -> Path:
+        """Made when the operator says that a remote agent is done."""
+        return self.state / "finish"
+
+    @property
     def journal(self) -> Path:
         return self.state / "journal.jsonl"
 

@@ -17,6 +17,7 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.operator import RunSettings
+from evopolicy_gateway.door import Door, door_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
@@ -36,7 +37,7 @@ Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of t
 AgentName = Annotated[
     str,
     typer.Option(
-        help="evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, file:AGENT.toml",
+        help="evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, file:AGENT.toml, remote",
         show_default=False,
     ),
 ]
@@ -73,6 +74,17 @@ JailVariable = Annotated[
 AllowHost = Annotated[
     list[str] | None,
     typer.Option(help="HOST or HOST:PORT that it reaches besides its harness's own; may be repeated."),
+]
+Http = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="With --agent remote: the address of this machine on which the agent is served; every request needs the token.",
+    ),
+]
+HttpUrl = Annotated[
+    str | None,
+    typer.Option(help="How the agent reaches it where that is another URL, such as that of a TLS front."),
 ]
 StateFolder = Annotated[
     Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
@@ -147,6 +159,20 @@ def jail_of(
     )
     settings.check()
     return settings
+
+
+def no_jail_of_ours(mode: str, *widened: Sequence[str] | None) -> JailSettings:
+    """The jail of an agent that somebody else starts: none of ours. ConfigError when one is asked for."""
+    if mode == "open-network" or any(widened):
+        raise ConfigError("--agent remote is not started here, so --jail and its options do not go with it")
+    return JailSettings(mode="none")
+
+
+def door_from(http: str | None, url: str | None) -> Door | None:
+    """Where a remote agent is served. ConfigError naming the option that is wrong."""
+    if http is None and url is not None:
+        raise ConfigError("--http-url tells how --http HOST:PORT is reached; it needs that")
+    return None if http is None else door_of(http, url)
 
 
 def console(*, stderr: bool) -> Console:

@@ -39,6 +39,7 @@ from evopolicy_gateway.control import (
     RunClosed,
     StartAgent,
 )
+from evopolicy_gateway.door import TOKEN_VARIABLE, Door, check_agent
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
@@ -49,6 +50,8 @@ from evopolicy_gateway.watch import Watch
 LAST_WORDS_S = 10.0
 """What an agent gets to end by itself once its budget is spent."""
 END_GRACE_S = 15.0
+GIVE_UP_PATIENCE_S = 10.0
+"""For telling the coordinator that a run is given up, which may be why it is."""
 _QUICK_DEATH_S = 5.0
 _MAX_QUICK_DEATHS = 5
 _MAX_KEEPER_DEATHS = 5
@@ -71,6 +74,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
     jail: JailSettings = JailSettings()
+    door: Door | None = None
+    """Where a remote agent is served; None for an agent that is started here."""
 
     @property
     def folder(self) -> RunFolder:
@@ -78,6 +83,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """ConfigError when the agent's jail or the run's folder cannot be had: there is one that may not be overwritten."""
+        check_agent(self.agent, self.door)
         self.jail.check()
         folder = self.folder
         if not folder.root.exists():
@@ -159,6 +165,8 @@ class RunPlay:
         plan.claim()
         self._folder.state.mkdir(mode=0o700)
         save(self._folder.intended, IntendedRun(key=self._key, settings=plan.settings))
+        if plan.door is not None:
+            save(self._folder.door, plan.door)
         try:
             run = await self._open(self._key)
         except BaseException:
@@ -296,6 +304,7 @@ class RunPlay:
             if not self._ready.done():
                 for text in event.notes:
                     self._watch.note(self._name, text)
+                self._tell_where(event)
                 self._ready.set_result(event)
             if self._order is not None and self._gateway is not None:
                 await self._gateway.tell(self._order)
@@ -306,6 +315,18 @@ class RunPlay:
                 self._spent.set()
         elif isinstance(event, RunClosed):
             self._closed.set()
+
+    def _tell_where(self, ready: Ready) -> None:
+        """What the operator hands to a remote agent."""
+        if self._plan.door is None:
+            return
+        for text in (
+            f"the agent is served at {ready.submit_url}",
+            f"its bearer token is in {self._folder.bearer}; it finds it in {TOKEN_VARIABLE}",
+            f"its workspace is {self._folder.workspace}; the rules are in AGENTS.md there",
+            f"when it is done before its budget is spent: evopolicy finish {self._folder.root}",
+        ):
+            self._watch.note(self._name, text)
 
     def _jail(self) -> JailOrder | None:
         if self._plan.jail.mode == "none":
@@ -376,7 +397,7 @@ class RunPlay:
     async def _give_up(self, run: str, why: str | None) -> None:
         """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""
         with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(GIVE_UP_PATIENCE_S):
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
                 await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)

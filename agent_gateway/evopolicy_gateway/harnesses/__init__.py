@@ -20,8 +20,9 @@ from evopolicy_gateway.harnesses.codex import Codex
 from evopolicy_gateway.harnesses.command import CommandHarness
 from evopolicy_gateway.harnesses.configured import ConfiguredCli
 from evopolicy_gateway.harnesses.dialect import Dialect
+from evopolicy_gateway.harnesses.remote import RemoteHarness
 
-FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, file:AGENT.toml"
+FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, file:AGENT.toml, remote"
 _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode}
 
 
@@ -54,6 +55,8 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
     if kind in ("evolve", "random") and not colon:
         module = {"evolve": "evolve", "random": "uniform"}[kind]
         return CommandHarness(kind, _ours(module))
+    if agent == RemoteHarness.name:
+        return RemoteHarness()
     if kind == "replay" and rest:
         folder = (started_in / rest).resolve()
         if not folder.is_dir():

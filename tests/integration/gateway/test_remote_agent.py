@@ -1,0 +1,317 @@
+"""An agent on another host, or in a container: a bearer token with every request, and a run that waits for it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import stat
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, opened, prepare
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.run_record import decode_run_record
+from evopolicy_gateway.cli import app as evopolicy
+from evopolicy_gateway.door import Door, door_of
+from evopolicy_gateway.layout import RunFolder, save
+
+HOST = "127.0.0.2"
+"""Of this machine, and not what a gateway listens on by itself."""
+PATIENCE_S = 120.0
+
+
+@asynccontextmanager
+async def open_door(tmp_path: Path, door: Door | None = None) -> AsyncIterator[Served]:
+    """A gateway that serves a remote agent."""
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found)
+        save(folder.door, door or Door(host=HOST, port=0))
+        async with gateway_on(folder, double) as service:
+            yield service
+
+
+def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], door: Door | None = None) -> None:
+    async def main() -> None:
+        async with open_door(tmp_path, door) as service:
+            await script(service)
+
+    asyncio.run(main())
+
+
+def token_of(folder: RunFolder) -> str:
+    return folder.bearer.read_text().strip()
+
+
+def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        token = token_of(s.folder)
+        root = s.urls.info.removesuffix("/info")
+        given: list[dict[str, str] | list[tuple[str, str]]] = [
+            {},
+            {"Authorization": "Bearer"},
+            {"Authorization": f"Bearer {token[:-1]}"},
+            {"Authorization": f"Bearer {token}0"},
+            {"Authorization": f"Basic {token}"},
+            {"Authorization": token},
+            [("Authorization", f"Bearer {token}"), ("Authorization", "Bearer other")],
+        ]
+        answers = [
+            await s.http.request(method, url, headers=headers, content=b"{}" if method == "POST" else None)
+            for headers in given
+            for method, url in (
+                ("GET", s.urls.info),
+                ("GET", s.urls.task),
+                ("POST", s.urls.submit),
+                ("GET", f"{root}/submit/submit_000"),
+                ("GET", f"{root}/../../etc/passwd"),
+                ("DELETE", root),
+            )
+        ]
+        assert {answer.status_code for answer in answers} == {401}
+        assert len({(answer.content, tuple(answer.headers.items())) for answer in answers}) == 1
+        assert answers[0].headers["WWW-Authenticate"] == "Bearer"
+        assert not any(secret in answers[0].text for secret in (token, CAPABILITY, str(tmp_path)))
+        assert s.double.submits == []
+        assert s.desk.n_rejected == 0
+
+    play(tmp_path, script)
+
+
+def test_with_the_bearer_token_a_remote_agent_is_served_as_any_other(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        for scheme in ("Bearer", "bearer"):
+            headers = {"Authorization": f"{scheme} {token_of(s.folder)}"}
+            assert (await s.http.get(s.urls.info, headers=headers)).status_code == 200
+        answer = await s.http.post(s.urls.submit, json={"env_instances": [1]}, headers=headers)
+        assert answer.json()["status"] == "ok"
+        elsewhere = s.urls.info.replace("/info", "/nothing")
+        assert (await s.http.get(elsewhere, headers=headers)).status_code == 404
+        assert urlsplit(s.urls.info).hostname == HOST
+
+    play(tmp_path, script)
+
+
+def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        address = urlsplit(s.urls.submit)
+        _, writer = await asyncio.open_connection(address.hostname, address.port)
+        head = f"POST {address.path} HTTP/1.1\r\nHost: x\r\nContent-Length: {1 << 30}\r\n\r\n"
+        writer.write(head.encode())
+        sent = 0
+        with contextlib.suppress(ConnectionError):
+            while sent < 1 << 30:
+                writer.write(b"x" * (1 << 16))
+                sent += 1 << 16
+                await writer.drain()
+        assert sent < 64 << 20
+        writer.close()
+
+    play(tmp_path, script)
+
+
+def test_the_token_is_a_file_for_the_operator_alone_and_stays_the_same(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with open_door(tmp_path) as s:
+            assert stat.S_IMODE(s.folder.bearer.stat().st_mode) == 0o600
+            first = (s.urls, token_of(s.folder))
+            assert len(bytes.fromhex(first[1])) * 8 == 256
+            assert not s.folder.bearer.is_relative_to(s.folder.workspace)
+            assert first[1] not in (s.folder.workspace / "AGENTS.md").read_text()
+            folder, double = s.folder, s.double
+        async with answering(tmp_path, double), gateway_on(folder, double) as s:
+            assert (s.urls, token_of(s.folder)) == first
+
+    asyncio.run(main())
+
+
+def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        text = (s.folder.workspace / "AGENTS.md").read_text()
+        surroundings = {**os.environ, "EVOPOLICYGYM_TOKEN": token_of(s.folder)}
+        shell = [block.split("```")[0] for block in text.split("```bash\n")[1:]]
+        python = text.split("```python\n")[1].split("```")[0]
+        said = []
+        for command in [*(["bash", "-euc", one] for one in shell), [sys.executable, "-c", python]]:
+            process = await asyncio.create_subprocess_exec(
+                *command,
+                cwd=s.folder.workspace,
+                env=surroundings,
+                stdout=asyncio.subprocess.PIPE,
+            )
+            out, _ = await process.communicate()
+            assert process.returncode == 0, command
+            said.append(out.decode())
+        assert said[0].startswith("# A line")
+        assert json.loads(said[2])["status"] == "ok"
+        assert said[-1].startswith("submit_001 ok")
+
+    play(tmp_path, script)
+
+
+def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path: Path) -> None:
+    async def script(s: Served) -> None:
+        assert s.urls.submit.startswith("https://gym.example/run-7/")
+        assert s.urls.submit in (s.folder.workspace / "AGENTS.md").read_text()
+
+    play(tmp_path, script, Door(host=HOST, port=0, url="https://gym.example/run-7"))
+
+
+@pytest.mark.parametrize(
+    ("http", "url", "told"),
+    [
+        ("10.0.0.5", None, "HOST:PORT"),
+        (":80", None, "HOST:PORT"),
+        ("10.0.0.5:http", None, "HOST:PORT"),
+        ("10.0.0.5:65536", None, "HOST:PORT"),
+        ("0.0.0.0:80", None, "--http-url"),
+        ("[::]:80", None, "--http-url"),
+        ("10.0.0.5:80", "ftp://gym.example", "https://HOST"),
+        ("10.0.0.5:80", "https://gym.example/'; rm -rf x", "no quotes"),
+    ],
+)
+def test_a_door_that_cannot_be_is_refused_by_name(http: str, url: str | None, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        door_of(http, url)
+
+
+def test_a_door_is_what_the_operator_named() -> None:
+    assert door_of("[fd00::5]:8080", None) == Door(host="fd00::5", port=8080)
+    assert door_of("0.0.0.0:80", "https://gym.example/") == Door(
+        host="0.0.0.0", port=80, url="https://gym.example"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--agent", "remote"], "needs --http"),
+        (["--agent", "evolve", "--http", "10.0.0.5:8080", "--jail", "none"], "goes with --agent remote"),
+        (["--agent", "remote", "--http", "127.0.0.1:0", "--jail", "open-network"], "not started here"),
+        (["--agent", "remote", "--http-url", "https://gym.example"], "needs"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], told: str) -> None:
+    words = ["run", "--env", "toy/line", "--runs", str(tmp_path), *options]
+    done = subprocess.run(
+        [sys.executable, "-m", "evopolicy_gateway.cli", *words],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert told in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+class RemoteRun:
+    """`evopolicy run --agent remote` on a cluster of its own, and what it tells its operator."""
+
+    def __init__(self, root: Path, *options: str) -> None:
+        self.folder = RunFolder(root / "runs" / "theirs" / "toy_line" / "r")
+        words = ["run", "--local", "--env", "toy/line", "--agent", "remote", "--http", f"{HOST}:0"]
+        words += ["--entry", "theirs", "--exp-id", "r", "--runs", str(root / "runs"), "--slots", "1"]
+        words += ["--budget", "4", "--validation", "1", "--heldout", "1", *options]
+        self.said = root / "said"
+        with self.said.open("wb") as said:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "evopolicy_gateway.cli", *words],
+                cwd=root,
+                env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
+                stdout=said,
+                stderr=said,
+            )
+
+    def wait_until_served(self) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while "when it is done before its budget" not in self.said.read_text():
+            assert self.process.poll() is None, self.said.read_text()
+            assert time.monotonic() < deadline, self.said.read_text()
+            time.sleep(0.1)
+
+    def submit(self, episodes: list[int], token: str) -> tuple[int, str]:
+        """Status of the answer, and of the submit."""
+        url = next(line.split()[-1] for line in self.said.read_text().splitlines() if "served at" in line)
+        request = urllib.request.Request(
+            url,
+            data=json.dumps({"env_instances": episodes}).encode(),
+            headers={"Authorization": f"Bearer {token}"},
+        )
+        try:
+            with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
+                return answer.status, json.load(answer)["status"]
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, ""
+
+    def end(self) -> int:
+        try:
+            return self.process.wait(timeout=PATIENCE_S)
+        finally:
+            if self.process.poll() is None:
+                self.process.terminate()
+                self.process.wait(timeout=PATIENCE_S)
+
+
+def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(tmp_path: Path) -> None:
+    run = RemoteRun(tmp_path)
+    try:
+        run.wait_until_served()
+        token = token_of(run.folder)
+        assert str(run.folder.bearer) in run.said.read_text()
+        assert token not in run.said.read_text()
+        assert run.submit([0, 1], "guess") == (401, "")
+        assert run.submit([0, 1], token) == (200, "ok")
+        assert (run.folder.feedback / "submit_000" / "summary.json").exists()
+        with pytest.raises(SystemExit) as ended:
+            evopolicy(["finish", str(run.folder.root)])
+        assert ended.value.code == 0
+    finally:
+        code = run.end()
+    assert code == 0, run.said.read_text()
+    record = decode_run_record(run.folder.run_json.read_bytes())
+    assert (record.agent.harness, record.jail, record.outcome.budget_used) == ("remote", "none", 2)
+    assert record.outcome.closed_reason == "agent_stopped"
+    assert token not in run.said.read_text() + run.folder.harness_log.read_text()
+    assert not run.folder.state.exists()
+
+
+def test_a_remote_run_ends_by_itself_when_its_budget_is_spent(tmp_path: Path) -> None:
+    run = RemoteRun(tmp_path)
+    try:
+        run.wait_until_served()
+        assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
+    finally:
+        code = run.end()
+    assert code == 0, run.said.read_text()
+    assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "budget_spent"
+
+
+def test_a_remote_run_ends_when_its_agents_time_is_over(tmp_path: Path) -> None:
+    run = RemoteRun(tmp_path, "--agent-wall-s", "1")
+    assert run.end() == 3, run.said.read_text()
+    assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "wall_limit"
+
+
+def test_finish_is_refused_where_no_remote_agent_plays(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "evopolicy_gateway.cli", "finish", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "no open run of a remote agent" in done.stderr
