@@ -1,7 +1,8 @@
 """The feedback tree on disk: episodes stream into `submit_NNN.partial/`, one rename makes it `submit_NNN/`.
 
 Rules: everything in a folder is durable before the rename, `summary.json` is written last; a folder without `.partial`
-is whole and never changes; what an agent may have put in the way is removed, never followed.
+is whole and never changes; what an agent may have put in the way is removed, never followed. What is in a `.partial`
+need not be durable, as it is written again after a crash: one flush of the file system at the end serves all its files.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from evopolicy_common.blobs import fsync_directory
+from evopolicy_common.blobs import fsync_directory, sync_filesystem
 
 SUMMARY = "summary.json"
 
@@ -48,7 +49,6 @@ class SubmitTree:
         hidden.mkdir()
         for file_name, data in files.items():
             _write(hidden / file_name, data)
-        fsync_directory(hidden)
         hidden.rename(episodes / name)
 
     def drop_episode(self, name: str) -> None:
@@ -59,9 +59,8 @@ class SubmitTree:
         """Writes `errors.txt` (unless None), then `summary.json`, and gives the folder its name."""
         if errors is not None:
             _write(self._partial / "errors.txt", errors)
-        fsync_directory(self._partial / "episodes")
         _write(self._partial / SUMMARY, summary)
-        fsync_directory(self._partial)
+        sync_filesystem(self._partial)
         # Left by a gateway that died between the rename and its journal, or put there by the agent.
         _remove(self._final)
         self._partial.rename(self._final)
@@ -72,8 +71,6 @@ def _write(path: Path, data: bytes) -> None:
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o444)
     with os.fdopen(fd, "wb") as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _remove(path: Path) -> None:

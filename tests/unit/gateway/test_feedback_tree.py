@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from evopolicy_common.blobs import sync_filesystem
+from evopolicy_gateway import feedback
 from evopolicy_gateway.feedback import SubmitTree
 
 
@@ -42,6 +44,23 @@ def test_the_summary_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert written == ["trajectory.jsonl", "stdout.txt", "errors.txt", "summary.json"]
 
 
+def test_all_of_it_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[str]] = []
+
+    def flush(folder: Path) -> None:
+        sync_filesystem(folder)
+        seen.append(names(folder) + names(folder / "episodes") + names(tmp_path))
+
+    monkeypatch.setattr(feedback, "sync_filesystem", flush)
+    tree = SubmitTree(tmp_path, "submit_000")
+    tree.begin()
+    tree.put_episode("ep_000", {"trajectory.jsonl": b""})
+    tree.commit(b"{}\n", None)
+    assert seen == [["episodes", "summary.json", "ep_000", "submit_000.partial"]]
+
+
 def test_beginning_again_forgets_what_was_written(tmp_path: Path) -> None:
     tree = SubmitTree(tmp_path, "submit_000")
     tree.begin()
@@ -72,13 +91,13 @@ def test_a_dropped_episode_is_gone(tmp_path: Path) -> None:
 
 
 def test_links_in_the_way_are_removed_and_not_followed(tmp_path: Path) -> None:
-    feedback, outside = tmp_path / "feedback", tmp_path / "outside"
-    feedback.mkdir()
+    root, outside = tmp_path / "feedback", tmp_path / "outside"
+    root.mkdir()
     outside.mkdir()
     (outside / "precious").write_text("x")
-    (feedback / "submit_000.partial").symlink_to(outside)
-    (feedback / "submit_000").symlink_to(outside)
-    tree = SubmitTree(feedback, "submit_000")
+    (root / "submit_000.partial").symlink_to(outside)
+    (root / "submit_000").symlink_to(outside)
+    tree = SubmitTree(root, "submit_000")
     tree.begin()
     tree.commit(b"{}", None)
     assert names(outside) == ["precious"]
