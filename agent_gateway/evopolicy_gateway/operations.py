@@ -13,6 +13,7 @@ from evopolicy_common.blobs import digest_of
 from evopolicy_common.bundles import Bundle
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
+from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
     CancelRun,
@@ -25,6 +26,7 @@ from evopolicy_common.messages.operator import (
     EvaluationPoll,
     EvaluationStarted,
     OperatorReply,
+    RecordedRequest,
     RunCreated,
     RunProgress,
     RunSettings,
@@ -120,6 +122,23 @@ class Operations:
     async def download(self, digest: str) -> bytes:
         """A blob by its digest, checked."""
         return await self._requests.download(_SENDER, self._token, digest)
+
+    async def recorded(self, run: str, split: Split, submit_index: int) -> AsyncIterator[EpisodeOutcome]:
+        """Outcomes of a finished run as they were stored, in the order in which they came in.
+
+        RefusedError for a run that is not finished, or not known any more.
+        """
+        cursor = 0
+        while True:
+            message = RecordedRequest(
+                token=self._token, run=run, split=split, submit_index=submit_index, cursor=cursor
+            )
+            page = await self._requests.until_answered("recorded", message, EvaluationPage)
+            cursor = page.cursor
+            for outcome in page.outcomes:
+                yield outcome
+            if page.finished:
+                return
 
     async def evaluate(self, message: Evaluate) -> AsyncIterator[tuple[EpisodeOutcome, int, str]]:
         """Each outcome as it comes, with the number of episodes in all; waiting shows as words in its stead.

@@ -1,4 +1,4 @@
-"""What a finished run leaves: `checkpoints/`, the selected policy in `workspace/system/`, and `run.json`, written last.
+"""What a finished run leaves: `checkpoints/`, `replays/`, the selected policy in `workspace/system/`; `run.json` comes last.
 
 Holds hidden scores, so it is called only when the agent and all its children are gone.
 """
@@ -28,6 +28,7 @@ from evopolicy_common.run_record import (
     Outcome,
     ReferenceScore,
     RejectedSubmit,
+    Replay,
     RunRecord,
     RunStatus,
     Timing,
@@ -37,6 +38,7 @@ from evopolicy_common.run_record import (
     encode_run_record,
 )
 from evopolicy_common.summary import utc_text
+from evopolicy_gateway import replays
 from evopolicy_gateway.control import Progress
 from evopolicy_gateway.formatting import submit_id
 from evopolicy_gateway.journal import Journal, Rejected
@@ -70,7 +72,8 @@ async def write(
         await asyncio.to_thread(_put_in_place, folder.system, selected)
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, error=error)
-    return await asyncio.to_thread(_write_record, folder, plan, finished, last, agents_side_s)
+    recorded = await replays.fetch(folder.root, finished, operations)
+    return await asyncio.to_thread(_write_record, folder, plan, finished, last, agents_side_s, recorded)
 
 
 def run_record(
@@ -80,6 +83,7 @@ def run_record(
     rejected: Sequence[Rejected],
     last: Progress | None,
     agents_side_s: float,
+    recorded: tuple[Replay, ...] = (),
 ) -> RunRecord:
     """The record of a finished run; pure. `staged` None: it ended before its workspace was made."""
     settings = finished.settings
@@ -135,6 +139,7 @@ def run_record(
             workspace="workspace" if staged else None,
             checkpoints="checkpoints" if finished.submits else None,
             agent_log="logs/agent.jsonl" if staged else None,
+            replays=recorded,
         ),
         versions=_versions(finished, staged),
         audit=finished.audit,
@@ -272,7 +277,12 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
 
 
 def _write_record(
-    folder: RunFolder, plan: Plan, finished: RunFinished, last: Progress | None, agents_side_s: float
+    folder: RunFolder,
+    plan: Plan,
+    finished: RunFinished,
+    last: Progress | None,
+    agents_side_s: float,
+    recorded: tuple[Replay, ...],
 ) -> RunRecord:
     staged = None
     if folder.staged.exists():
@@ -282,7 +292,7 @@ def _write_record(
         journal = Journal(folder.journal)
         rejected = [entry for entry in journal.entries if isinstance(entry, Rejected)]
         journal.close()
-    done = run_record(plan, finished, staged, rejected, last, agents_side_s)
+    done = run_record(plan, finished, staged, rejected, last, agents_side_s, recorded)
     write_atomically(folder.run_json, encode_run_record(done))
     shutil.rmtree(folder.state, ignore_errors=True)
     return done
