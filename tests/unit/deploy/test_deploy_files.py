@@ -1,0 +1,287 @@
+"""What is in `deploy/` fits the commands, the sandbox, and the tools that will read it, as far as these are here to ask.
+
+`systemd-analyze verify` and `docker compose config` are asked where they are installed; the rest is checked on the files.
+"""
+
+from __future__ import annotations
+
+import configparser
+import fnmatch
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+from readme_commands import readme_commands
+
+from evopolicy_coordinator import cli as coordinator_cli
+from evopolicy_gateway import cli as gateway_cli
+from evopolicy_worker import cli as worker_cli
+
+ROOT = Path(__file__).parents[3]
+DEPLOY = ROOT / "deploy"
+UNITS = ("evopolicy-coordinator.service", "evopolicy-worker@.service")
+APPS = {
+    "evopolicy": gateway_cli.app,
+    "evopolicy-coordinator": coordinator_cli.app,
+    "evopolicy-worker": worker_cli.app,
+}
+BUBBLEWRAP_CALLS = {
+    *("clone", "clone3", "unshare", "mount", "umount2", "pivot_root", "chroot", "sethostname", "setns"),
+    *("prctl", "seccomp", "capset", "setresuid", "setresgid", "prlimit64", "sched_setaffinity"),
+    *("landlock_create_ruleset", "landlock_add_rule", "landlock_restrict_self", "memfd_create"),
+}
+"""System calls of a policy's sandbox that a unit's filter could forbid."""
+
+
+class Unit(configparser.ConfigParser):
+    """A unit file; `all` gives every value of a key that may stand several times."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(strict=False, interpolation=None, comment_prefixes=("#",), delimiters=("=",))
+        self.optionxform = str  # type: ignore[assignment, method-assign]
+        self.read_string(path.read_text())
+        self._lines = path.read_text().splitlines()
+
+    def all(self, key: str) -> list[str]:
+        return [line.partition("=")[2] for line in self._lines if line.startswith(f"{key}=")]
+
+
+def parse(words: list[str]) -> None:
+    """Fails when the command does not take these options; runs nothing."""
+    command: Any = typer.main.get_command(APPS[words[0]])
+    arguments = words[1:]
+    name: str | None = words[0]
+    while name is not None:
+        context = command.make_context(name, list(arguments))
+        rest = [*getattr(context, "_protected_args", getattr(context, "protected_args", [])), *context.args]
+        name = None
+        if rest:
+            name, command, arguments = command.resolve_command(context, rest)
+
+
+def environment_file(path: Path) -> dict[str, str]:
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    return dict(line.split("=", 1) for line in lines)
+
+
+def started(unit: Unit, variables: dict[str, str]) -> list[str]:
+    """The words that systemd starts: `${NAME}` is one word, `$NAME` is split at spaces."""
+    words: list[str] = []
+    for word in unit["Service"]["ExecStart"].replace("%i", "gpu-7").split():
+        if match := re.fullmatch(r"\$(\w+)", word):
+            words += variables[match[1]].split()
+        else:
+            words.append(re.sub(r"\$\{(\w+)\}", lambda found: variables[found[1]], word))
+    return [Path(words[0]).name, *words[1:]]
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [(UNITS[0], "coordinator.env"), (UNITS[1], "worker.env")], ids=["coordinator", "worker"]
+)
+def test_a_unit_starts_its_command_with_options_that_this_takes(name: str, file: str) -> None:
+    unit = Unit(DEPLOY / name)
+    own = dict(shlex.split(line)[0].split("=", 1) for line in unit.all("Environment"))
+    given = environment_file(DEPLOY / file)
+    assert given.keys() <= own.keys(), "a variable that the unit does not use"
+    for variables in (own, {**own, **given}):
+        parse(started(unit, variables))
+    assert f"-/etc/evopolicy/{file}" in unit.all("EnvironmentFile")
+
+
+def test_parsing_a_command_finds_an_option_that_is_not_there() -> None:
+    for words in (["evopolicy-worker", "--gpu"], ["evopolicy-coordinator", "certs", "issue", "--gpu", "x"]):
+        with pytest.raises(Exception, match="gpu"):
+            parse(words)
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_unit_is_taken_by_systemd(name: str, tmp_path: Path) -> None:
+    analyze = shutil.which("systemd-analyze")
+    unit = Unit(DEPLOY / name)
+    assert set(unit.sections()) == {"Unit", "Service", "Install"}
+    if analyze is None:
+        pytest.skip("systemd-analyze is not installed")
+    program = Path(sys.executable).with_name(started(unit, _any())[0])
+    path = tmp_path / name
+    text = (DEPLOY / name).read_text()
+    path.write_text(re.sub(r"^ExecStart=\S+", f"ExecStart={program}", text, flags=re.MULTILINE))
+    done = subprocess.run([analyze, "verify", str(path)], capture_output=True, text=True, timeout=100)
+    said = [line for line in done.stderr.splitlines() if line.startswith("evopolicy")]
+    assert (done.returncode, said) == (0, [])
+
+
+def test_the_worker_unit_leaves_bubblewrap_what_it_needs() -> None:
+    service = Unit(DEPLOY / UNITS[1])["Service"]
+    in_its_way = {
+        *("RestrictNamespaces", "ProtectHostname", "PrivateUsers", "ProtectKernelTunables"),
+        *("ProtectKernelLogs", "ProtectProc", "ProcSubset", "PrivateDevices", "MemoryDenyWriteExecute"),
+    }
+    text = (DEPLOY / UNITS[1]).read_text()
+    for key in in_its_way:
+        assert key not in service
+        assert key in text, f"the unit does not say why {key} is not set"
+    assert service["SystemCallFilter"].startswith("~")
+    if (analyze := shutil.which("systemd-analyze")) is not None:
+        denied = set(system_calls(analyze, service["SystemCallFilter"][1:].split()))
+        assert "swapon" in denied
+        assert denied & BUBBLEWRAP_CALLS == set()
+
+
+def system_calls(analyze: str, sets: list[str]) -> Iterator[str]:
+    """The calls of systemd's sets, and of the sets in them."""
+    for name in sets:
+        done = subprocess.run(
+            [analyze, "syscall-filter", name], capture_output=True, text=True, check=True, timeout=100
+        )
+        words = [line.strip() for line in done.stdout.splitlines()[1:]]
+        yield from (word for word in words if re.fullmatch(r"\w+", word))
+        yield from system_calls(analyze, [word for word in words if word.startswith("@")])
+
+
+def test_bubblewrap_works_for_an_ordinary_user_without_new_privileges_or_capabilities() -> None:
+    bwrap = shutil.which("bwrap")
+    assert bwrap is not None, "bubblewrap is missing: bash deploy/setup-host.sh"
+    rights = ["setpriv", "--no-new-privs"]
+    if os.getuid() == 0:
+        rights += ["--reuid", "65534", "--regid", "65534", "--clear-groups"]
+        rights += ["--bounding-set=-all", "--inh-caps=-all"]
+    sandbox = [bwrap, "--unshare-all", "--hostname", "policy", "--cap-add", "CAP_SYS_ADMIN"]
+    sandbox += ["--ro-bind", "/", "/", "--tmpfs", "/tmp", "uname", "-n"]
+    done = subprocess.run([*rights, *sandbox], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout.strip()) == (0, "policy"), done.stderr
+
+
+def test_units_run_as_users_that_the_sysusers_file_makes() -> None:
+    lines = [line.split() for line in (DEPLOY / "evopolicy.sysusers.conf").read_text().splitlines()]
+    users = {words[1] for words in lines if words[0] == "u"}
+    wanted = [Unit(DEPLOY / name)["Service"]["User"] for name in UNITS]
+    assert set(wanted) == users
+    assert len(users) == 2, "a worker must not be able to read the coordinator's state"
+
+
+def instructions() -> list[tuple[str, str]]:
+    """Of the Dockerfile: name and the rest, continued lines joined, comments left out."""
+    text = re.sub(r"^#.*\n", "", (DEPLOY / "Dockerfile").read_text(), flags=re.MULTILINE)
+    lines = [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+    return [(name, rest.strip()) for name, _, rest in (line.partition(" ") for line in lines)]
+
+
+def test_the_dockerfile_copies_what_there_is_and_installs_what_was_tested() -> None:
+    known = {"FROM", "WORKDIR", "COPY", "RUN", "ENV", "USER", "EXPOSE", "CMD"}
+    sent = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
+    assert sent[0] == "*"
+    copied = set()
+    for name, rest in instructions():
+        assert name in known
+        if name == "COPY" and not rest.startswith("--from"):
+            copied |= set(rest.split()[:-1])
+    assert copied == {line[1:] for line in sent if line.startswith("!")}
+    for source in copied:
+        assert (ROOT / source).exists()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    assert {package.partition("/")[0] for package in packages} | {project["project"]["readme"]} <= copied
+    install = next(rest for name, rest in instructions() if "pip install" in rest)
+    extras = re.search(r"'\.\[(.+)\]'", install)
+    assert extras is not None
+    assert set(extras[1].split(",")) == set(project["project"]["optional-dependencies"]) - {"dev"}
+    assert "-c constraints.txt" in install
+    for name, rest in instructions():
+        if name == "CMD":
+            parse(yaml.safe_load(rest))
+
+
+def compose() -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    return loaded
+
+
+def test_the_compose_file_has_services_that_start_with_options_that_they_take() -> None:
+    services = compose()["services"]
+    known = {
+        *("image", "build", "restart", "init", "read_only", "tmpfs", "cap_drop", "command", "volumes"),
+        *("security_opt", "ports", "depends_on", "user"),
+    }
+    for name, service in services.items():
+        assert service.keys() <= known
+        if name != "router":
+            assert service["command"][0] in APPS
+            parse(service["command"])
+            assert (DEPLOY / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
+        for volume in service["volumes"]:
+            source = volume.partition(":")[0]
+            assert source.startswith("./") or source in compose()["volumes"]
+        assert set(service.get("depends_on", [])) <= services.keys()
+
+
+def test_the_compose_file_has_the_zenoh_router_of_our_version_and_it_offers_nothing_else() -> None:
+    router = compose()["services"]["router"]
+    assert router["image"] == f"eclipse/zenoh:{metadata.version('eclipse-zenoh')}"
+    pinned = re.search(r"^eclipse-zenoh==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert pinned is not None
+    assert router["image"].endswith(f":{pinned[1]}")
+    command = router["command"]
+    assert command[command.index("--rest-http-port") + 1] == "none"
+    assert command[command.index("--adminspace-permissions") + 1] == "none"
+    users = [rest for name, rest in instructions() if name == "USER"]
+    assert users == [router["user"]], "the router reads folders that the image's user owns"
+
+
+def test_only_the_container_with_a_sandbox_inside_is_let_out_of_dockers_filters() -> None:
+    for name, service in compose()["services"].items():
+        assert service["cap_drop"] == ["ALL"]
+        assert service["read_only"] is True
+        outer = {option for option in service["security_opt"] if option != "no-new-privileges:true"}
+        assert outer == ({"seccomp=unconfined", "apparmor=unconfined"} if name == "worker" else set())
+        assert "privileged" not in service
+
+
+def test_docker_takes_the_compose_file() -> None:
+    docker = shutil.which("docker")
+    if docker is None or subprocess.run([docker, "compose", "version"], capture_output=True).returncode:
+        pytest.skip("docker compose is not installed")
+    done = subprocess.run(
+        [docker, "compose", "--file", str(DEPLOY / "compose.yaml"), "config", "--quiet"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_commands_of_the_readme_are_taken() -> None:
+    parsed = [words for block in readme_commands(DEPLOY / "README.md") for words in block]
+    for words in parsed:
+        parse(words)
+    assert len(parsed) >= 9
+
+
+def test_the_readme_names_every_file_and_no_other() -> None:
+    told = set(
+        re.findall(
+            r"`([\w@.-]+\.(?:service|env|conf|yaml|sh)|Dockerfile)`", (DEPLOY / "README.md").read_text()
+        )
+    )
+    there = {path.name for path in DEPLOY.iterdir()}
+    assert there - {"README.md", "Dockerfile.dockerignore"} == told
+
+
+def _any() -> dict[str, str]:
+    """Some value for every variable."""
+    return {"EVOPOLICY_LISTEN": "", "EVOPOLICY_OPTIONS": "", "EVOPOLICY_WORKER_OPTIONS": ""}
+
+
+def test_dockerignore_lets_no_caches_through() -> None:
+    lines = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
+    assert any(fnmatch.fnmatchcase("common/evopolicy_common/__pycache__", line) for line in lines)
