@@ -48,6 +48,9 @@ from evopolicy_gateway.tickets import ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
+LINGER_S = 0.02
+LINGER_EPISODES = 8
+"""With at least so many to come, the next results are asked for a little later: of short episodes several come at once."""
 DISK_PAUSE_S = 2.0
 """Between tries to write feedback while the disk refuses."""
 MAX_REJECTED_KEPT = 1000
@@ -340,6 +343,8 @@ class Desk:
             await self._write_page(tree, page, first, scores)
             ticket.n_done, ticket.waits_for = len(scores), page.waits_for
             self._on_change()
+            if done is None and len(ticket.request.env_instances) - len(scores) >= LINGER_EPISODES:
+                await asyncio.sleep(LINGER_S)
         last_result = time.monotonic()
         committed = await asyncio.to_thread(self._commit, tree, index, done, scores)
         self.feedback_s += time.monotonic() - last_result
