@@ -120,7 +120,8 @@ class Kept:
 class FaultCluster:
     """Coordinator and a worker with two slots, kept up, at one of the `Site`s."""
 
-    def __init__(self, root: Path, site: Site = "one host") -> None:
+    def __init__(self, root: Path, site: Site, stack: contextlib.ExitStack) -> None:
+        """What is started here ends with the stack, also when not all of it can be started."""
         self.root = root
         root.mkdir(exist_ok=True)
         self.state = root / "state"
@@ -130,15 +131,19 @@ class FaultCluster:
             subprocess.run(
                 ["mount", "-t", "tmpfs", "-o", f"mode=700,size={DISK_BYTES}", "none", folder], check=True
             )
+            stack.callback(subprocess.run, ["umount", "--lazy", folder], check=True)
         self.clock = Clock(root) if site == "clock that jumps" else None
         self._environment = {} if self.clock is None else self.clock.environment
         self.cable = Cable() if site == "two hosts" else None
+        if self.cable is not None:
+            stack.callback(self.cable.close)
         self._ready = root / "ready.json"
         launcher = Path(__file__).with_name("fixed_coordinator.py")
         coordinator = [sys.executable, str(launcher), str(self.state), str(self._ready)]
         if self.cable is not None:
             coordinator.append(f"tcp/{Cable.NEAR}:0")
         self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
+        stack.callback(self.coordinator.end)
         deadline = time.monotonic() + PATIENCE_S
         while not self._ready.exists():
             assert time.monotonic() < deadline, (root / "coordinator.log").read_text()
@@ -151,10 +156,12 @@ class FaultCluster:
         self.link: WeakLink | None = None
         if self.cable is None:
             self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
+            stack.callback(self.link.close)
             worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
         else:
             worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
         self.worker = Kept(worker, root / "worker.log", self._environment)
+        stack.callback(self.worker.end)
         self.afterwards: list[operator.CancelRun] = []
         """What the coordinator is to be told once a fault is over."""
         self._agent = root / "agent.py"
@@ -221,29 +228,14 @@ class FaultCluster:
         words = [f"{pid}: {command_line(pid)[:120]}" for pid in found if command_line(pid)]
         return words + ([f"{len(slots)} slot processes"] if len(slots) > 2 else [])
 
-    def close(self) -> None:
-        self.worker.end()
-        if self.link is not None:
-            self.link.close()
-        self.coordinator.end()
-        if self.cable is not None:
-            self.cable.close()
-        for folder in (self.state, self.runs):
-            subprocess.run(["umount", "--lazy", folder], check=True)
-
 
 @contextlib.contextmanager
 def fault_cluster(root: Path, site: Site = "one host") -> Iterator[FaultCluster]:
     """The cluster inside the `with`; everything below this process is gone after it."""
     processes.become_subreaper()
-    cluster: FaultCluster | None = None
-    try:
-        cluster = FaultCluster(root, site)
-        yield cluster
-    finally:
-        if cluster is not None:
-            cluster.close()
-        processes.end_descendants(0.0)
+    with contextlib.ExitStack() as stack:
+        stack.callback(processes.end_descendants, 0.0)
+        yield FaultCluster(root, site, stack)
 
 
 def command_line(pid: int) -> str:
