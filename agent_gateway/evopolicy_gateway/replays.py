@@ -1,6 +1,6 @@
 """`replays/heldout_NNN/video.mp4`: the selected checkpoint's held-out episodes, as workers recorded them.
 
-Rules: which episodes there are is the run's option `video` (off, the first, all). NNN is the position in the split, from 0;
+Rules: which episodes there are is the run's option `replays` (off, first, all), or `video` where that is not given. NNN is the position in the split, from 0;
 the case's seed is nowhere. A recording is an extra: one that a worker could not make, or the cluster has no more, is left
 out, and nothing else of the run depends on it. What was fetched before is not fetched again.
 """
@@ -22,7 +22,7 @@ FOLDER = "replays"
 async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tuple[Replay, ...]:
     """Writes the recordings under the run directory `root`; one `Replay` each, in the split's order."""
     index = finished.best_submit_index
-    if finished.settings.video == "off" or index is None:
+    if finished.settings.recorded_heldout == "off" or index is None:
         return ()
     found: list[Replay] = []
     async for outcome in operations.recorded(finished.run, "heldout", index):

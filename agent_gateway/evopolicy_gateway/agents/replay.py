@@ -2,7 +2,8 @@
 
 Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is a
 folder with a `policy.py`, or with a `system/` that has one (as a run's `checkpoints/submit_NNN/`). DIR is one itself, or
-its subfolders are, and are played in sorted order.
+its subfolders are, and are played in sorted order. Where DIR has a folder named like the environment, with `/` as `_`, it
+is played instead: one DIR for many environments, such as `examples/policies`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ def policies_in(folder: Path) -> list[Path]:
         return [itself]
     found = (_policy(child) for child in sorted(folder.iterdir()) if child.is_dir())
     return [policy for policy in found if policy is not None]
+
+
+def folder_for(folder: Path, env: str) -> Path:
+    """`folder`, or what it has for this environment."""
+    own = folder / env.replace("/", "_")
+    return own if own.is_dir() else folder
 
 
 def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
@@ -54,6 +61,7 @@ def play(client: Client, folder: Path, workspace: Path) -> int:
     """Submits all; how many were taken. ProtocolError when the gateway stays away."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])
+    folder = folder_for(folder, str(info["env_meta"]["env"]))
     policies = policies_in(folder)
     if not policies:
         raise ProtocolError(f"{folder} holds no policy: neither policy.py nor folders with one")

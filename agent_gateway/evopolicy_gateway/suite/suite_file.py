@@ -42,6 +42,7 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     observations: ObservationForm | None = None
     tier: Tier | None = None
     video: VideoOption | None = None
+    replays: VideoOption | None = None
     limits: dict[str, float] | None = None
     agent_wall_s: Annotated[float, Meta(gt=0)] | None = None
     repeats: Positive | None = None
@@ -139,8 +140,9 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
         config = None if self.config is None else msgspec.to_builtins(self.config)
         if config is not None:
             config = {name: value for name, value in config.items() if name not in operational}
-        settings = msgspec.structs.replace(self.settings, attempt=1)
-        whole = [self.harness, config, msgspec.to_builtins(settings), self.wall_s]
+        settings = msgspec.to_builtins(msgspec.structs.replace(self.settings, attempt=1))
+        del settings["replays"]  # recorded once all is over, it changes nothing of the run
+        whole = [self.harness, config, settings, self.wall_s]
         return hashlib.sha256(msgspec.json.encode(whole, order="sorted")).hexdigest()[:16]
 
     def folder(self, root: Path) -> RunFolder:
@@ -263,6 +265,7 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         observations=table.observations or "arrays",
         sandbox_tier=table.tier or "bwrap",
         video=table.video or "off",
+        replays=table.replays,
         limits=_limits(table.limits or {}),
         notes={"suite": suite.name},
     )

@@ -40,9 +40,16 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     observations: ObservationForm = "arrays"
     sandbox_tier: Tier = "bwrap"
     video: VideoOption = "off"
+    replays: VideoOption | None = None
+    """Which held-out episodes of the selected checkpoint are recorded for people to watch; None: as `video`."""
     limits: ResourceLimits = ResourceLimits()
     notes: dict[str, str] = {}
     """The operator's own labels; kept in `run.json`."""
+
+    @property
+    def recorded_heldout(self) -> VideoOption:
+        """Which held-out episodes are recorded."""
+        return self.video if self.replays is None else self.replays
 
 
 class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):

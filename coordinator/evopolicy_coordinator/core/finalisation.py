@@ -85,7 +85,7 @@ def _open(
         env_meta=meta,
         observations=settings.observations,
         record="actions",
-        video=settings.video if kind == "heldout" else "off",
+        video=settings.recorded_heldout if kind == "heldout" else "off",
         tier=settings.sandbox_tier,
         limits=settings.limits,
     )

@@ -62,3 +62,19 @@ def edit() -> None:
     policy = Path("system/policy.py")
     if policy.is_file():
         policy.write_text(policy.read_text() + f"\n# edited {time.time_ns()}\n")
+
+
+def read(path: str) -> str:
+    """A file of the workspace."""
+    return Path(path).read_text()
+
+
+def change(turns: int) -> None:
+    """Another function at every odd turn, another constant in the last one at every even turn after the first."""
+    policy = Path("system/policy.py")
+    if turns % 2:
+        policy.write_text(policy.read_text() + f"\n\ndef term_{turns}(x):\n    return {turns}.0 * x\n")
+    elif turns:
+        policy.write_text(
+            policy.read_text().replace(f"return {turns - 1}.0 * x", f"return {turns - 1}.5 * x")
+        )

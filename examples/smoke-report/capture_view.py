@@ -1,0 +1,45 @@
+"""`evopolicy suite …` with its live view also written as a picture, every few seconds, in place of the one before.
+
+python examples/smoke-report/capture_view.py VIEW.svg SUITE.toml [options of `evopolicy suite`]
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from pathlib import Path
+
+import typer
+from rich.console import Console, Group
+
+from evopolicy_gateway.suite import suite_cli, suite_view
+
+EVERY_S = 5.0
+WIDTH = 118
+
+
+def main() -> None:
+    """Plays the suite; the picture shows at most the last moment at which runs went on."""
+    picture, arguments = Path(sys.argv[1]), sys.argv[2:]
+    render = suite_view.TableView.render
+    written = [0.0]
+
+    def rendered(view: suite_view.TableView) -> Group:
+        group = render(view)
+        running = sum(row.state == "running" for row in view.rows.values())
+        if running > 1 and time.monotonic() - written[0] > EVERY_S:
+            written[0] = time.monotonic()
+            console = Console(record=True, width=WIDTH, file=io.StringIO(), force_terminal=True)
+            console.print(render(view))
+            picture.write_text(console.export_svg(title="evopolicy suite"), encoding="utf-8")
+        return group
+
+    suite_view.TableView.render = rendered  # type: ignore[method-assign]
+    app = typer.Typer(rich_markup_mode=None)
+    app.command()(suite_cli.suite)
+    app(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""Recordings of held-out episodes: one sweep on a real cluster plays the same policy unrecorded, recorded, and with videos
+in its feedback; the report of it is looked at in a real headless Chromium."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from browser import Page
+from typer.testing import CliRunner
+
+from evopolicy_common.run_difference import differences
+from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_coordinator.analysis.reader import load_runs
+from evopolicy_coordinator.analysis.trace import trace
+from evopolicy_coordinator.report_cli import app
+
+PATIENCE_S = 600.0
+ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")
+"""The second one's episode is another when it is drawn without care."""
+SUITE = """
+name = "t"
+environments = ["toy/line", "gymnasium/FetchPickAndPlace-v4"]
+[defaults]
+budget = 3
+validation = 1
+heldout = 2
+[[agents]]
+name = "plain"
+agent = "replay:policies"
+[[agents]]
+name = "filmed"
+agent = "replay:policies"
+[agents.run]
+replays = "all"
+[[agents]]
+name = "shown"
+agent = "replay:policies"
+environments = ["toy/line"]
+[agents.run]
+video = "first"
+[[agents]]
+name = "shown all"
+agent = "replay:policies"
+environments = ["toy/line"]
+[agents.run]
+video = "all"
+replays = "off"
+
+[[agents]]
+name = "codex"
+environments = ["toy/line"]
+[agents.config]
+harness = "codex"
+program = ["{python}", "{fakes}/codex"]
+environment = { FAKE_STATE = ".fake", FAKE_SCENARIO = "evolves" }
+[agents.jail]
+read = ["{fakes}"]
+[[agents]]
+name = "claude"
+environments = ["toy/line"]
+[agents.config]
+harness = "claude-code"
+program = ["{python}", "{fakes}/claude"]
+environment = { FAKE_STATE = ".fake", FAKE_SCENARIO = "evolves" }
+[agents.jail]
+read = ["{fakes}"]
+"""
+FAKES = Path(__file__).parents[2] / "support" / "fake_clis"
+POLICY = """
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        self.space = action_space
+        self.t = 0
+
+    def reset(self, episode_index):
+        self.t = 0
+
+    def act(self, obs):
+        self.t += 1
+        if self.space["type"] == "Discrete":
+            return self.space.get("start", 0) + self.t % self.space["n"]
+        return [(-1.0) ** (self.t // 5) * 0.9] * self.space["shape"][0]
+"""
+VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => new Promise((done) => {
+  const told = () => done([video.readyState, video.videoWidth, video.videoHeight, video.duration, video.error && video.error.message]);
+  if (video.readyState >= 2 || video.error) { told(); return; }
+  video.addEventListener('loadeddata', told); video.addEventListener('error', told);
+  video.preload = 'auto'; video.load();
+})))"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("r")
+    (folder / "t.toml").write_text(SUITE.replace("{python}", sys.executable).replace("{fakes}", str(FAKES)))
+    (folder / "policies").mkdir()
+    (folder / "policies/policy.py").write_text(POLICY)
+    command = [sys.executable, "-m", "evopolicy_gateway.cli", "suite", "t.toml", "--local", "--parallel", "2"]
+    running = subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, "XDG_STATE_HOME": str(folder / "xdg")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = running.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(running.pid, signal.SIGTERM)
+        raise
+    assert running.returncode == 0, said
+    return folder / "runs/t"
+
+
+def run_dir(runs: Path, entry: str, env: str) -> Path:
+    return runs / entry / env.replace("/", "_") / "t-0"
+
+
+def record_in(folder: Path) -> RunRecord:
+    return decode_run_record((folder / "run.json").read_bytes())
+
+
+def n_frames(path: Path) -> int:
+    with av.open(io.BytesIO(path.read_bytes())) as container:
+        return sum(1 for _ in container.decode(video=0))
+
+
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_recordings_are_in_the_run_directory_and_run_json_names_them(runs: Path, env: str) -> None:
+    folder = run_dir(runs, "filmed", env)
+    record = record_in(folder)
+    replays = record.artifacts.replays
+    assert [replay.path for replay in replays] == [
+        "replays/heldout_000/video.mp4",
+        "replays/heldout_001/video.mp4",
+    ]
+    assert [replay.episode for replay in replays] == [0, 1]
+    assert {replay.submit_index for replay in replays} == {record.outcome.best_submit_index}
+    assert tuple(replay.episode_return for replay in replays) == record.outcome.heldout_returns
+    for replay in replays:
+        assert n_frames(folder / replay.path) == replay.length
+
+
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_recording_changes_no_score_and_no_byte_of_the_run(runs: Path, env: str) -> None:
+    plain, filmed = run_dir(runs, "plain", env), run_dir(runs, "filmed", env)
+    assert record_in(plain).outcome.heldout_returns == record_in(filmed).outcome.heldout_returns
+    assert not (plain / "replays").exists()
+    found = differences(plain, filmed)
+    # Names of the two entries, and random actions, which are every run's own.
+    own = ("model", "agent.entry", "artifacts.replays", "outcome.random_reference")
+    left = [
+        line
+        for line in found
+        if not line.startswith("replays/") and not any(f"run.json: {name}" in line for name in own)
+    ]
+    assert left == []
+
+
+def test_feedback_has_videos_of_the_first_episode_or_of_all(runs: Path) -> None:
+    def videos(entry: str) -> list[bool]:
+        episodes = (run_dir(runs, entry, "toy/line") / "workspace/feedback/submit_000/episodes").iterdir()
+        return [(episode / "video.mp4").exists() for episode in sorted(episodes)]
+
+    assert videos("plain") == videos("filmed") == [False, False, False]
+    assert videos("shown") == [True, False, False]
+    assert videos("shown all") == [True, True, True]
+
+
+def test_held_out_recordings_follow_the_feedbacks_option_unless_they_have_their_own(runs: Path) -> None:
+    shown = record_in(run_dir(runs, "shown", "toy/line"))
+    assert [replay.episode for replay in shown.artifacts.replays] == [0]
+    assert record_in(run_dir(runs, "shown all", "toy/line")).artifacts.replays == ()
+
+
+def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Path, tmp_path: Path) -> None:
+    told = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path / "report"), "--jobs", "1", "--json"])
+    assert told.exit_code == 0, told.output
+    pages = sorted((tmp_path / "report/replays").glob("*.html"))
+    assert [page.stem for page in pages] == ["gymnasium-FetchPickAndPlace-v4", "toy-line"]
+    with Page() as page:
+        found: dict[str, list[Any]] = {}
+        for path in [*pages, *sorted((tmp_path / "report/traces").glob("toy-line-shown-*.html"))]:
+            page.open(path)
+            found[path.stem] = page.run(VIDEOS)
+            if path.parent.name == "replays":
+                assert page.run("document.querySelectorAll('.card').length") == len(found[path.stem])
+        # Two episodes of "filmed"; on the toy one of "shown" besides. Two feedback videos beside their submits.
+        assert sorted(len(videos) for videos in found.values()) == [1, 1, 2, 3]
+        for stem, videos in found.items():
+            for ready, width, height, duration, error in videos:
+                assert error is None, (stem, error)
+                assert ready >= 2, stem
+                assert width > 0 < height, stem
+                assert duration > 0, stem
+        assert page.problems == []
+
+
+def test_report_says_which_recordings_there_are(runs: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path / "report"), "--no-pages"])
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "report/index.html").read_text()
+    assert 'href="replays/toy-line.html"' in text
+    assert json.loads((tmp_path / "report/report.json").read_text())["left_out"] == []
+
+
+@pytest.mark.parametrize("entry", ["codex", "claude"])
+def test_a_harnesss_log_tells_what_was_read_and_said_before_each_submit(runs: Path, entry: str) -> None:
+    loaded = load_runs([run_dir(runs, entry, "toy/line")])
+    (run,) = loaded.runs
+    found = trace(run)
+    assert [row.submit.index for row in found.rows] == [0, 1, 2]
+    first, second, third = (row.evidence for row in found.rows)
+    assert first is not None
+    assert (first.read, first.messages) == ((), ())
+    for evidence, row, plan in (
+        (second, found.rows[0], "add a term"),
+        (third, found.rows[1], "change a constant"),
+    ):
+        assert evidence is not None
+        name = f"submit_{row.submit.index:03d}"
+        assert evidence.read == (f"feedback/{name}/summary.json",)
+        said = f"{name} came to a mean return of {row.submit.mean_return:.4g}. I {plan} next."
+        assert evidence.attribution == said
+        assert evidence.messages == ("submitted", said)
+    assert found.unplaced == ("submitted",)
+    assert [row.transition.edit for row in found.rows if row.transition] == [
+        "first",
+        "synthesis",
+        "parametric",
+    ]
+
+
+def test_trace_page_quotes_the_agent_beside_the_files_that_it_read(runs: Path, tmp_path: Path) -> None:
+    arguments = [str(run_dir(runs, "codex", "toy/line")), "--out", str(tmp_path / "report")]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    (path,) = (tmp_path / "report/traces").glob("*.html")
+    with Page() as page:
+        page.open(path)
+        row = "document.getElementById('s002').cells"
+        assert page.run(f"{row}[2].textContent.trim()") == "feedback/submit_001/summary.json"
+        assert page.run(f"{row}[3].querySelector('blockquote').textContent").endswith(
+            "I change a constant next."
+        )
+        assert page.problems == []
