@@ -180,7 +180,7 @@ def test_a_body_that_does_not_come_is_refused_and_its_rest_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SOON_S)
-    monkeypatch.setattr(http, "_LINGER_S", SOON_S)
+    monkeypatch.setattr(http, "LINGER", (1 << 20, SOON_S))
 
     async def main() -> bytes:
         async with served(tmp_path) as s:
@@ -190,6 +190,28 @@ def test_a_body_that_does_not_come_is_refused_and_its_rest_not_waited_for(
     answer = asyncio.run(main())
     assert answer.startswith(b"HTTP/1.1 400")
     assert b"did not arrive" in answer
+
+
+def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "STRANGER_LINGER", (1 << 20, SOON_S))
+    told: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        await asyncio.sleep(1000)
+        return {}
+
+    async def send(message: Any) -> None:
+        told.append(message)
+
+    async def main() -> None:
+        gate = http._TokenGate(PlainTextResponse("never"), "token", "bearer")
+        scope = {"type": "http", "method": "POST", "path": "/token/submit", "headers": []}
+        async with asyncio.timeout(60):
+            await gate(scope, receive, send)  # type: ignore[arg-type]
+
+    asyncio.run(main())
+    assert told[0]["status"] in (401, 403)
+    assert told[-1]["more_body"] is False
 
 
 def test_a_submit_that_is_not_waited_for_is_answered_before_it_is_decided(

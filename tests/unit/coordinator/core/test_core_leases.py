@@ -339,3 +339,23 @@ def test_no_poll_waits_longer_than_the_longest_wait() -> None:
     beat = rig._requests
     rig.pass_time(5.0)
     assert {lease, beat, "wait"} <= rig.replies.keys()
+
+
+def test_a_limit_verdict_of_a_worker_that_was_silent_for_long_is_not_counted() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.pass_time(2.0)
+    rig.beat(first, lease)
+    rig.pass_time(rig.settings.silence_s + 1.0)
+    rig.play(first, lease, failure="act_timeout")
+    assert rig.core.groups[GROUP].done == 0
+
+
+def test_a_limit_verdict_of_a_job_during_which_the_loop_stood_still_is_not_counted() -> None:
+    rig, (first,), lease = one_job("w1")
+    rig.pass_time(2.0)
+    rig.beat(first, lease)
+    assert rig.settings.standstill_s + 1.5 < rig.settings.silence_s
+    rig.now += rig.settings.standstill_s + 1.5
+    rig.pass_time(0.0)
+    rig.play(first, lease, failure="act_timeout")
+    assert rig.core.groups[GROUP].done == 0
