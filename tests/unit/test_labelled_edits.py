@@ -1,0 +1,61 @@
+"""The labelled edits of the smoke report: the classifier finds in them what their names say."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from evopolicy_common import catalogue
+from evopolicy_coordinator.analysis.sources import reachable_modules, source_digest
+from evopolicy_coordinator.analysis.topology import describe
+from evopolicy_gateway.agents.replay import folder_for, policies_in
+
+SCRIPT = Path(__file__).parents[2] / "examples/smoke-report/labelled_edits.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("labelled_edits", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def written(script: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out: Path = tmp_path_factory.mktemp("edits")
+    script.write(out)
+    return out
+
+
+@pytest.mark.parametrize("env", catalogue.suites()["core16"].environments)
+def test_every_edit_is_of_the_type_that_its_name_says(written: Path, env: str) -> None:
+    seen: list[tuple[str, str]] = []
+    found = []
+    for folder in policies_in(folder_for(written, env)):
+        files = {path.name: path.read_bytes() for path in folder.glob("*.py")}
+        modules = reachable_modules(files)
+        now = (source_digest(modules), describe(modules)[0])
+        if not seen:
+            edit = "first"
+        elif now[0] == seen[-1][0]:
+            edit = "retest"
+        elif now[1] == seen[-1][1]:
+            edit = "parametric"
+        else:
+            edit = "rollback" if now[1] in {topology for _, topology in seen} else "synthesis"
+        found.append(f"{len(seen):02d}-{edit}")
+        seen.append(now)
+    assert found == [folder.name for folder in policies_in(folder_for(written, env))]
+    assert {label[3:] for label in found} == {"first", "synthesis", "parametric", "retest", "rollback"}
+
+
+def test_a_folder_without_the_environment_is_played_itself(tmp_path: Path) -> None:
+    (tmp_path / "gym_acrobot").mkdir()
+    assert folder_for(tmp_path, "gym/acrobot") == tmp_path / "gym_acrobot"
+    assert folder_for(tmp_path, "gym/racing") == tmp_path
