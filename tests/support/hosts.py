@@ -31,7 +31,9 @@ def refusal() -> str | None:
         return f"{', '.join(missing)} missing: bash deploy/setup-host.sh --tests"
     try:
         with network() as hosts:
-            hosts.cable(hosts.host("a"), "10.92.0.1/30", hosts.host("b"), "10.92.0.2/30")
+            near, far = hosts.host("a"), hosts.host("b")
+            hosts.cable(near, "10.92.0.1/30", far, "10.92.0.2/30")
+            hosts.wire(near, "10.92.0.5/30", far, "10.92.0.6/30")
     except (AssertionError, OSError, subprocess.CalledProcessError) as error:
         return f"network namespaces are not permitted here: {error}"
     return None
@@ -191,12 +193,16 @@ class Network:
             [*near.enter, sys.executable, str(_WIRE), ends[0][1], ends[1][1]],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         )
         wire = Wire(ends, process)
         self._wires.append(wire)
         assert process.stdout is not None
-        with process.stdout:
-            assert process.stdout.readline() == b"ready\n", "no TUN device; see what was said to stderr"
+        assert process.stderr is not None
+        with process.stdout, process.stderr:
+            if process.stdout.readline() != b"ready\n":
+                said = process.stderr.read().decode(errors="replace").strip().splitlines()
+                raise AssertionError(f"no TUN device: {said[-1] if said else 'nothing said'}")
         near.run("ip", "link", "set", ends[1][1], "netns", str(far.pid))
         for (host, device), address in zip(ends, (near_address, far_address), strict=True):
             _bring_up(host, device, address)

@@ -68,7 +68,7 @@ class Site:
         config = transport.tls_server_config(
             CLUSTER, [self.certs.endpoint], machines.passwords, listed, machines.tls
         )
-        async with transport.serve(config, answer) as server, self.router():
+        async with transport.serve(config, answer) as server, open_router(self.folder):
             server.declare(
                 [keys.worker_expr(CLUSTER), keys.gateway_expr(CLUSTER), keys.operator_expr(CLUSTER)]
             )
@@ -78,21 +78,20 @@ class Site:
                 )
             yield asked
 
-    @contextlib.asynccontextmanager
-    async def router(self) -> AsyncIterator[None]:
-        """What zenohd is: a session in router mode of the file."""
-        session = await asyncio.to_thread(
-            zenoh.open, zenoh.Config.from_file(str(self.folder / "zenohd.json"))
-        )
-        try:
-            yield
-        finally:
-            await asyncio.to_thread(session.close)
-
     def link(self, role: Role, folder: Path | None = None) -> contextlib.AbstractAsyncContextManager[Link]:
         """A session of a machine of the site, which knows the site's router only."""
         found = credentials.find(role, (self.endpoint,), folder or self.folders[role])
         return transport.connect(found, timeout_s=30.0)
+
+
+@contextlib.asynccontextmanager
+async def open_router(folder: Path) -> AsyncIterator[None]:
+    """What zenohd is: a session in router mode of the folder's file."""
+    session = await asyncio.to_thread(zenoh.open, zenoh.Config.from_file(str(folder / "zenohd.json")))
+    try:
+        yield
+    finally:
+        await asyncio.to_thread(session.close)
 
 
 async def answered(link: Link, key: str, attempts: int = 1) -> bool:
@@ -176,12 +175,45 @@ def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(site: 
     asyncio.run(scenario())
 
 
+def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
+    far = site.certs.issue("router", "far")
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    write_router_config(
+        site.certs.state,
+        "far",
+        far,
+        listen=(endpoint,),
+        connect=(site.endpoint,),
+        uplink="router/site",
+        admit=("worker/elsewhere",),
+    )
+    write_router_config(
+        site.certs.state,
+        "site",
+        site.folder,
+        listen=(site.endpoint,),
+        connect=(site.certs.endpoint,),
+        admit=("router/far", "worker/here"),
+    )
+
+    async def scenario() -> None:
+        alive: list[tuple[str, bool]] = []
+        found = credentials.find("worker", (endpoint,), site.elsewhere)
+        async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:
+            assert await answered(link, OWN_KEY["worker"], attempts=300)
+            assert not await answered(link, OWN_KEY["gateway"])
+            key = keys.liveliness_key(CLUSTER, "elsewhere")
+            link.declare_alive(key)
+            await until(lambda: alive == [(key, True)])
+            async with site.link("worker") as other:
+                assert await answered(other, OWN_KEY["worker"], attempts=300)
+
+    asyncio.run(scenario())
+
+
 def test_a_restarted_router_carries_on(site: Site) -> None:
     async def scenario() -> None:
         async with contextlib.AsyncExitStack() as stack:
-            machines = Machines(site.certs.state)
-            machines.write_passwords()
-            link = None
             async with site.up():
                 link = await stack.enter_async_context(site.link("worker"))
                 assert await answered(link, OWN_KEY["worker"], attempts=300)
