@@ -54,6 +54,10 @@ Scope = Annotated[str, typer.Option(help="episode: a fresh Policy each; submit: 
 Observations = Annotated[str, typer.Option(help="arrays, or lists as in v2.0-draft.")]
 TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
 Video = Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")]
+Replays = Annotated[
+    str | None,
+    typer.Option(help="Videos of the score's held-out episodes: off, first, all; default: as --video."),
+]
 Wall = Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")]
 Runs = Annotated[Path, typer.Option(help="Folder of run directories.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")]
@@ -87,6 +91,7 @@ def run(
     observations: Observations = "arrays",
     tier: TierName = "bwrap",
     video: Video = "off",
+    replays: Replays = None,
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
     jail: options.JailMode = "bwrap",
@@ -123,6 +128,7 @@ def run(
             observations=observations,
             tier=tier,
             video=video,
+            replays=replays,
             limits=limit or (),
         )
         served = options.door_from(http, http_url)
@@ -161,6 +167,7 @@ def local(
     observations: Observations = "arrays",
     tier: TierName = "bwrap",
     video: Video = "off",
+    replays: Replays = None,
     limit: options.Limits = None,
     agent_wall_s: Wall = WALL_S,
     jail: options.JailMode = "bwrap",
@@ -195,6 +202,7 @@ def local(
             observations=observations,
             tier=tier,
             video=video,
+            replays=replays,
             limits=limit or (),
         )
         held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)

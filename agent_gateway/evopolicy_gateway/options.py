@@ -118,6 +118,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     observations: str
     tier: str
     video: str
+    replays: str | None = None
     limits: Sequence[str]
 
     def settings(self, env: str, exp_id: str) -> RunSettings:
@@ -137,6 +138,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             observations=_one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
             sandbox_tier=tier_of(self.tier),
             video=_one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
+            replays=None if self.replays is None else _one_of("--replays", self.replays, VideoOption),  # type: ignore[arg-type]
             limits=limits_of(self.limits),
         )
 

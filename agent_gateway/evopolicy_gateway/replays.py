@@ -1,8 +1,8 @@
 """`replays/heldout_NNN/video.mp4`: the selected checkpoint's held-out episodes, as workers recorded them.
 
-Rules: which episodes there are is the run's option `replays` (off, first, all), or `video` where that is not given. NNN is the position in the split, from 0;
-the case's seed is nowhere. A recording is an extra: one that a worker could not make, or the cluster has no more, is left
-out, and nothing else of the run depends on it. What was fetched before is not fetched again.
+Rules: which episodes there are is the run's option `replays` (off, first, all), or `video` where that is not given. NNN is
+the position in the split, from 0; the case's seed is nowhere. A recording is an extra: one that a worker could not make, or
+the cluster has no more, is left out, and nothing else of the run depends on it. What was fetched before is not fetched again.
 """
 
 from __future__ import annotations
