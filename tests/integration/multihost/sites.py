@@ -159,7 +159,7 @@ class Sites:
         """Starts a run from this host, with an agent that is installed at the same place everywhere."""
         folder = self.root / host
         agent = self.root / f"{env.replace('/', '_')}.py"
-        agent.write_text(AGENT % ("%r", "%r", SUBMITS, 0.002 if env == TOY else 0.0, EPISODES))
+        agent.write_text(AGENT % ("%r", "%r", SUBMITS, 0.004 if env == TOY else 0.0, EPISODES))
         program = ["-m", "evopolicy_gateway.cli", "run", "--env", env]
         program += ["--agent", f"command:{sys.executable} {agent}", "--entry", "tester", "--exp-id", name]
         program += ["--budget", str(SUBMITS * EPISODES), "--validation", str(HIDDEN)]
@@ -182,19 +182,29 @@ class Sites:
             return pid != os.getpid() and os.fsencode(self.root) in told
         return False
 
-    def status(self) -> operator.StatusReply:
-        """What the coordinator tells an operator at its own machine."""
+    def status_until(
+        self, fits: Callable[[operator.StatusReply], bool], process: subprocess.Popen[bytes] | None = None
+    ) -> operator.StatusReply:
+        """What the coordinator tells an operator at its own machine, once it fits.
+
+        AssertionError when the process ends before, or it takes too long.
+        """
 
         async def ask() -> operator.StatusReply:
+            deadline = time.monotonic() + PATIENCE_S
             async with connect(credentials.read(Path(self.own["operator"]))) as link:
                 requester = Requester(
                     link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
                 )
                 message = operator.StatusRequest(token=link.credentials.token)
-                while True:
+                while time.monotonic() < deadline:
                     with contextlib.suppress(TransportError):
-                        return await requester.once("status", message, operator.StatusReply)
-                    await asyncio.sleep(0.05)
+                        told = await requester.once("status", message, operator.StatusReply)
+                        if fits(told):
+                            return told
+                    assert process is None or process.poll() is None, "it ended before"
+                    await asyncio.sleep(0.02)
+            raise AssertionError(f"not within {PATIENCE_S:g} s")
 
         return asyncio.run(ask())
 

@@ -12,12 +12,14 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import hosts
 import pytest
-from sites import EPISODES, PATIENCE_S, REAL, SUBMITS, TOTAL, TOY, Sites, sites, until
+from sites import EPISODES, PATIENCE_S, REAL, SUBMITS, TOTAL, TOY, Sites, sites
 
+from evopolicy_common.messages.operator import StatusReply
 from evopolicy_common.run_difference import differences
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -25,6 +27,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 REFUSAL = hosts.refusal()
 DELAY_S = 0.1
 LOSS = 0.01
+Command = subprocess.Popen[bytes]
 AWAY_S = 4.0
 """Longer than a lease lives here (`fixed_coordinator`)."""
 
@@ -45,12 +48,12 @@ def cluster() -> Iterator[Sites]:
         alone.wait(PATIENCE_S)
         for name in ("one", "two"):
             worker = made.start_worker(name, root / name / "keys")
-            until(lambda: is_active(made, name), worker, root / name / "worker.log")  # noqa: B023
+            made.status_until(partial(is_active, name), worker)
         yield made
 
 
-def is_active(cluster: Sites, name: str) -> bool:
-    return any(each.worker == name and each.state == "active" for each in cluster.status().workers)
+def is_active(name: str, told: StatusReply) -> bool:
+    return any(each.worker == name and each.state == "active" for each in told.workers)
 
 
 def ended_well(cluster: Sites, command: subprocess.Popen[bytes], host: str, name: str) -> None:
@@ -62,15 +65,15 @@ def ended_well(cluster: Sites, command: subprocess.Popen[bytes], host: str, name
     assert code == 0, cluster.log(host, name)
 
 
-def play(cluster: Sites, name: str, env: str = TOY, meanwhile: Callable[[], None] | None = None) -> None:
+def play(
+    cluster: Sites, name: str, env: str = TOY, meanwhile: Callable[[Command], object] | None = None
+) -> None:
     """A run from the desk; `meanwhile` happens when a third of its episodes are done. It must be that of one machine."""
-    before = cluster.status().episodes_done
+    before = cluster.status_until(lambda told: True).episodes_done
     command = cluster.begin("desk", name, env, cluster.root / "desk" / "keys")
     if meanwhile is not None:
-        while command.poll() is None and cluster.status().episodes_done - before < TOTAL // 3:
-            time.sleep(0.02)
-        assert command.poll() is None, cluster.log("desk", name)
-        meanwhile()
+        cluster.status_until(lambda told: told.episodes_done - before >= TOTAL // 3, command)
+        meanwhile(command)
     ended_well(cluster, command, "desk", name)
     folder = cluster.folder("desk", name, env)
     assert differences(cluster.folder("coordinator", "alone", env), folder) == []
@@ -82,21 +85,20 @@ def test_a_run_over_several_hosts_is_that_of_one_machine(cluster: Sites, env: st
     play(cluster, "quiet", env)
 
 
-def test_both_workers_play_and_see_nothing_of_the_coordinators_disk(cluster: Sites) -> None:
-    def both() -> None:
-        busy: set[str] = set()
-        deadline = time.monotonic() + PATIENCE_S
-        while not busy >= {"one", "two"} and time.monotonic() < deadline:
-            busy |= {each.worker for each in cluster.status().workers if each.running}
-        assert busy == {"one", "two"}
+def test_both_workers_are_given_work_and_see_nothing_of_the_coordinators_disk(cluster: Sites) -> None:
+    busy: set[str] = set()
+
+    def both(told: StatusReply) -> bool:
+        busy.update(each.worker for each in told.workers if each.held)
+        return busy >= {"one", "two"}
 
     for name in ("one", "two", "desk", "router"):
         assert cluster.hosts[name].run("ls", "-A", str(cluster.root / "coordinator")) == ""
-    play(cluster, "both", meanwhile=both)
+    play(cluster, "both", meanwhile=lambda command: cluster.status_until(both, command))
 
 
 def test_a_worker_host_is_unplugged_and_plugged_in_again(cluster: Sites) -> None:
-    def unplug() -> None:
+    def unplug(command: Command) -> None:
         cluster.cables["one"].pull()
         time.sleep(AWAY_S)
         cluster.cables["one"].restore()
@@ -105,11 +107,11 @@ def test_a_worker_host_is_unplugged_and_plugged_in_again(cluster: Sites) -> None
 
 
 def test_the_router_host_is_restarted(cluster: Sites) -> None:
-    play(cluster, "router", meanwhile=lambda: cluster.restart_router(AWAY_S))
+    play(cluster, "router", meanwhile=lambda command: cluster.restart_router(AWAY_S))
 
 
 def test_packets_to_the_coordinator_are_late_and_get_lost(cluster: Sites) -> None:
-    def spoil() -> None:
+    def spoil(command: Command) -> None:
         cluster.wire.weather(DELAY_S, LOSS)
 
     try:
