@@ -191,7 +191,9 @@ def _database(state: Path) -> Iterator[sqlite3.Connection]:
         raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
     try:
         uri = f"{path.absolute().as_uri()}?mode=rw"
-        with contextlib.closing(sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as db:
+        with contextlib.closing(
+            sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+        ) as db:
             yield db
     except sqlite3.Error as error:
         raise StorageError(f"{path}: {error}") from error

@@ -75,7 +75,8 @@ class EnvProcess:
             with contextlib.suppress(OSError):
                 os.sched_setaffinity(0, {start.core})
         scratch = Path(start.scratch)
-        scratch.mkdir(parents=True, exist_ok=True)
+        # Without its parents: a worker that has gone meanwhile has taken them with it.
+        scratch.mkdir(exist_ok=True)
         plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed)
         player = Player(Zygote(plan, scratch), plan, self._monitor, scratch)
         for command in early:
