@@ -87,7 +87,9 @@ class Gateway:
                 workspace.stage(self._folder, opened, address.urls())
                 blobs = BlobStore(self._folder.blobs)
                 desk = Desk(session, opened, self._folder.workspace, journal, blobs, self._changed.set)
-                http = await stack.enter_async_context(serving(make_app(desk, address.token, address.bearer), sock))
+                http = await stack.enter_async_context(
+                    serving(make_app(desk, address.token, address.bearer), sock)
+                )
                 log.info("serving", run=run, env=opened.env.env, port=address.port)
                 self._on_ready(address.urls(), desk)
                 try:

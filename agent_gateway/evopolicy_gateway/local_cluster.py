@@ -75,7 +75,8 @@ async def local_cluster(
         try:
             keepers.append(asyncio.create_task(_keep(coordinator, logs / "coordinator.log", held)))
             cluster = await _ready(ready_file, keepers[0])
-            worker = [*_module("evopolicy_worker.cli"), "--grace", "1"]
+            # Who starts this cluster is the one who chooses the tiers of its runs.
+            worker = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed"]
             worker += ["--credentials", cluster.credentials["worker"]]
             for env_id in env_ids:
                 worker += ["--env", env_id]

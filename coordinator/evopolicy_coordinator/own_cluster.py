@@ -39,7 +39,17 @@ class OwnCluster:
 
     async def start_worker(self, env: str, slots: int) -> asyncio.Task[None]:
         """Starts a worker that offers `env`; the task ends only with the ConfigError that says why it ended."""
-        program = ["evopolicy_worker.cli", "--slots", str(slots), "--grace", "1", "--env", env]
+        # Who starts this cluster is the one who chooses the tiers of what it plays.
+        program = [
+            "evopolicy_worker.cli",
+            "--slots",
+            str(slots),
+            "--grace",
+            "1",
+            "--unsandboxed",
+            "--env",
+            env,
+        ]
         log = self._root / "logs" / "verify-worker.log"
         child = await _start([*program, "--credentials", self._worker_file], log)
         self._children.append(child)

@@ -67,6 +67,13 @@ def work(
         list[str] | None,
         typer.Option(help="Package that policies may import beside numpy; may be repeated."),
     ] = None,
+    unsandboxed: Annotated[
+        bool,
+        typer.Option(
+            "--unsandboxed",
+            help="Also play runs that ask for tier none, whose policies are not locked in: they can do all that you can.",
+        ),
+    ] = False,
     grace: Annotated[
         float, typer.Option(min=0.0, help="Seconds that running episodes get on SIGTERM.")
     ] = 10.0,
@@ -95,9 +102,12 @@ def work(
                 f"{', '.join(missing)}: not installed here; install the worker's extra: pip install 'evopolicy[worker]'"
             )
         found = credentials.find("worker", tuple(connect or ()), credentials_file)
-        tiers = available_tiers()
+        tiers = available_tiers(unsandboxed=unsandboxed)
         if not tiers:
-            raise ConfigError("no sandbox tier works here; run `evopolicy-worker doctor` to see why")
+            raise ConfigError(
+                "no sandbox works here: `evopolicy-worker doctor` tells why and what to do; --unsandboxed plays runs that"
+                " ask for --tier none"
+            )
         with scratch_folder("worker") as scratch:
             asyncio.run(
                 _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
@@ -125,7 +135,9 @@ def doctor(
         for check in checks:
             table.add_row(check.name, check.verdict, check.found, check.advice)
         Console().print(table)
-        typer.echo(f"tier: {best or 'none (policies would not be locked in; only for runs that ask for it)'}")
+        typer.echo(
+            f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
+        )
     raise typer.Exit(0 if best else 1)
 
 

@@ -36,14 +36,10 @@ def callers():
 
 
 def names_above():
-    """Names that the callers have: a split or a seed would be among their values."""
+    """Names that the callers have: not their values, among which are numbers of pipes and moments."""
     frame, found = sys._getframe(2), []
     while frame is not None:
-        plain = (int, str, bytes, bool, type(None))
-        # The number of a pipe tells how often its slot has played, and no more.
-        found += [
-            (k, repr(v)) for k, v in sorted(frame.f_locals.items()) if isinstance(v, plain) and k != "fd"
-        ]
+        found.append(sorted(frame.f_locals))
         frame = frame.f_back
     return found
 
@@ -82,7 +78,7 @@ class Policy:
         yield "calls before the first act", lambda: self.calls
         yield "who builds it", lambda: self.built_by
         yield "who resets it", lambda: self.reset_by
-        yield "values of those who build it", lambda: self.around
+        yield "names that those who build it have", lambda: self.around
         yield "kind of observation", lambda: (str(type(obs)), str(obs.dtype), obs.shape, str(obs.flags))
         yield "environment variables", lambda: sorted(os.environ.items())
         yield "arguments", lambda: (sys.argv, sys.orig_argv, sys.flags)

@@ -12,13 +12,15 @@ from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
 
 
-def available_tiers(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Tier, ...]:
-    """Tiers that work on this machine, the strongest first; `none` always does, and is used only where it is asked for.
+def available_tiers(
+    allowed_packages: tuple[str, ...] = ("numpy",), *, unsandboxed: bool = False
+) -> tuple[Tier, ...]:
+    """Tiers that this machine offers, the strongest first; `none` only when its operator says so.
 
     Nothing falls back from one tier to another: a job names its tier.
     """
     found: list[Tier] = [tier for tier in ("bwrap", "landlock") if why_not(tier, allowed_packages) is None]
-    return (*found, "none")
+    return (*found, "none") if unsandboxed else tuple(found)
 
 
 @cache

@@ -427,7 +427,7 @@ def replays_page(env: str, episodes: Sequence[PlayedEpisode], looks: Mapping[str
         title=f"Replays: {title_of(env)}",
         env_title=title_of(env),
         looks=looks,
-        groups=[{"title": f"{split.capitalize()} case {n}", "cards": cards} for (split, n), cards in groups.items()],
+        groups=[{"title": f"{'Held-out' if split == 'heldout' else split.capitalize()} case {n}", "cards": cards} for (split, n), cards in groups.items()],
     )  # fmt: skip
 
 

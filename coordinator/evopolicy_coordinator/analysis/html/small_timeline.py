@@ -62,7 +62,7 @@ def _axis(last: int, x: Callable[[float], float]) -> str:
         for tick in range(0, last + 1, step)
     )
     title = (
-        f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 2}" text-anchor="middle" fill="var(--ink)" font-size="11">'
+        f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 5}" text-anchor="middle" fill="var(--ink)" font-size="11">'
         "Train episodes consumed</text>"
     )
     return f'<path d="M{_LEFT} {_AXIS}H{_WIDTH - _RIGHT}" stroke="var(--muted)" fill="none"/>{ticks}{title}'

@@ -175,10 +175,10 @@ def test_without_bubblewrap_the_error_says_what_to_install(
     why_not.cache_clear()
 
 
-def test_a_tier_that_works_is_offered_and_none_comes_last() -> None:
-    tiers = available_tiers()
-    assert tiers[0] == "bwrap"
-    assert tiers[-1] == "none"
+def test_a_tier_that_works_is_offered_and_none_only_when_it_is_asked_for() -> None:
+    assert available_tiers()[0] == "bwrap"
+    assert "none" not in available_tiers()
+    assert available_tiers(unsandboxed=True) == (*available_tiers(), "none")
 
 
 def test_a_package_that_is_not_installed_is_named(tmp_path: Path) -> None:
