@@ -1,0 +1,226 @@
+"""Agents that turn to the cluster itself: with stolen credentials of their own gateway, since a jailed one has none."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cheated import PATIENCE_S, Cheated
+from coordinator_harness import (
+    Coordinator,
+    GatewayClient,
+    bundle_of,
+    gateway_of,
+    operator_of,
+    working,
+)
+
+from evopolicy_common import codec, keys
+from evopolicy_common.errors import RefusedError
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.worker import Refused
+from evopolicy_common.run_record import decode_run_record
+
+EAVESDROPPER = Path(__file__).parent / "eavesdropping_agent.py"
+
+
+def until(condition: Any) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+class Eavesdropped:
+    """A run whose agent listens to everything while another run is played on the same cluster."""
+
+    def __init__(self, cheated: Cheated) -> None:
+        workspace = cheated.runs / "e" / "toy_line" / "eavesdropper" / "workspace"
+        played: list[tuple[int, str, Path]] = []
+
+        def eavesdrop() -> None:
+            words = f"command:{sys.executable} {EAVESDROPPER}"
+            played.append(cheated.play(words, "eavesdropper", "--jail", "none"))
+
+        thread = threading.Thread(target=eavesdrop)
+        thread.start()
+        try:
+            until(lambda: (workspace / "listening").exists() or played)
+            assert not played, played
+            self.code, self.said, self.honest = cheated.play("evolve", "overheard")
+            (workspace / "enough").touch()
+        finally:
+            thread.join(PATIENCE_S)
+        ((code, said, self.folder),) = played
+        assert code == 0, said
+        self.report: dict[str, Any] = json.loads((workspace / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def eavesdropped(cheated: Cheated) -> Eavesdropped:
+    return Eavesdropped(cheated)
+
+
+def test_an_agent_with_its_own_session_hears_nothing_of_other_runs_and_workers(
+    eavesdropped: Eavesdropped,
+) -> None:
+    assert eavesdropped.report["connected"]
+    assert eavesdropped.report["heard"] == []
+
+
+def test_its_session_is_answered_on_its_own_runs_keys_alone(eavesdropped: Eavesdropped) -> None:
+    answers = eavesdropped.report["answers"]
+    # Without this one the others would prove nothing.
+    assert answers.pop("own state") == "state_reply"
+    assert answers == {
+        "status of the cluster": None,
+        "work": None,
+        "every key": None,
+        "admin spaces": [],
+        "liveliness": None,
+        "another run": "refused",
+    }
+
+
+def test_the_honest_run_beside_it_is_played_as_if_nobody_listened(eavesdropped: Eavesdropped) -> None:
+    assert eavesdropped.code == 0, eavesdropped.said
+    record = decode_run_record((eavesdropped.honest / "run.json").read_bytes())
+    assert (record.outcome.status, record.outcome.budget_used) == ("completed", 4)
+    assert decode_run_record((eavesdropped.folder / "run.json").read_bytes()).outcome.budget_used == 1
+
+
+@pytest.fixture(scope="module")
+def coordinator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Coordinator]:
+    coordinator = Coordinator(tmp_path_factory.mktemp("replayed") / "st")
+    yield coordinator
+    coordinator.kill()
+
+
+@asynccontextmanager
+async def two_runs(
+    coordinator: Coordinator, name: str
+) -> AsyncIterator[tuple[GatewayClient, GatewayClient, Any]]:
+    """The gateways of two runs, and the operator."""
+    async with operator_of(coordinator) as client:
+        mine, other = await client.create(f"{name}-mine"), await client.create(f"{name}-other")
+        async with gateway_of(coordinator, mine) as owner, gateway_of(coordinator, other) as victim:
+            yield owner, victim, client
+
+
+def in_time(scenario: Any) -> None:
+    asyncio.run(asyncio.wait_for(scenario, 2 * PATIENCE_S))
+
+
+def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with (
+            two_runs(coordinator, "captured") as (owner, thief, client),
+            working(coordinator, "w-1") as w,
+        ):
+            bundle = bundle_of("# captured")
+            first = await owner.submit(bundle, (0, 1), "key")
+            captured = codec.encode(
+                gateway.Submit(
+                    run=owner.run, token=owner.token, key="key", env_instances=(0, 1), bundle=bundle.digest
+                )
+            )
+            link = thief.ask._link
+            cluster = link.credentials.cluster
+            for _ in range(5):
+                reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
+                assert codec.decode(codec.gateway_replies, reply) == first
+            # On the thief's own key the same bytes are of another run.
+            reply = await link.ask(keys.gateway_key(cluster, thief.run, "submit"), captured, 10)
+            refused = codec.decode(codec.gateway_replies, reply)
+            assert isinstance(refused, Refused)
+            assert refused.status == "wrong_key"
+            await owner.results(0)
+            assert ((await owner.state()).remaining_budget, (await thief.state()).remaining_budget) == (
+                14,
+                16,
+            )
+            await owner.close()
+            # Sent again when the run is over it is the same submit still, or none.
+            reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
+            assert isinstance(codec.decode(codec.gateway_replies, reply), Refused | gateway.SubmitAccepted)
+            finished = await client.finished(owner.run)
+            assert (finished.budget_used, len(finished.submits)) == (2, 1)
+            train = [job for job in w.jobs if job.bundle == bundle.digest and job.record == "full"]
+            assert len(train) == 2
+
+    in_time(scenario())
+
+
+def test_a_key_that_is_used_again_with_another_bundle_is_refused_and_the_first_one_counts(
+    coordinator: Coordinator,
+) -> None:
+    async def scenario() -> None:
+        async with two_runs(coordinator, "switched") as (owner, _, client), working(coordinator, "w-2") as w:
+            weak, strong = bundle_of("# weak"), bundle_of("# strong")
+            first = await owner.submit(weak, (0,), "key")
+            for ids in ((0,), (0, 1)):
+                with pytest.raises(RefusedError) as refused:
+                    await owner.submit(strong, ids, "key")
+                assert refused.value.status == "key_conflict"
+            assert await owner.submit(weak, (0,), "key") == first
+            await owner.results(0)
+            with pytest.raises(RefusedError):
+                await owner.submit(strong, (0,), "key")
+            await owner.close()
+            finished = await client.finished(owner.run)
+            assert [submit.bundle for submit in finished.submits] == [weak.digest]
+            assert finished.budget_used == 1
+            assert strong.digest not in {job.bundle for job in w.jobs}
+
+    in_time(scenario())
+
+
+def test_the_same_key_sent_ten_times_at_once_is_one_submit(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with two_runs(coordinator, "at once") as (owner, _, client), working(coordinator, "w-3"):
+            bundle = bundle_of("# at once")
+            await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
+            answers = await asyncio.gather(
+                *(owner.submit_digest(bundle.digest, (0, 1, 2), "key") for _ in range(10))
+            )
+            assert len(set(answers)) == 1
+            await owner.results(0)
+            await owner.close()
+            assert (await client.finished(owner.run)).budget_used == 3
+
+    in_time(scenario())
+
+
+def test_a_submit_while_the_run_is_scored_is_refused_and_changes_nothing(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with two_runs(coordinator, "late") as (owner, _, client):
+            honest, late = bundle_of("# honest"), bundle_of("# late")
+            async with working(coordinator, "w-4") as w:
+                await owner.ask.upload(owner.run, owner.token, late.digest, late.packed)
+                await owner.submit(honest, (0,), "honest")
+                await owner.results(0)
+                w.hold.clear()
+                await owner.close()
+                assert (await client.progress(owner.run, 0.0)).finished is None
+                with pytest.raises(RefusedError) as refused:
+                    await owner.submit_digest(late.digest, (0,), "late")
+                assert refused.value.status in ("run_closed", "run_finished")
+                with pytest.raises(RefusedError) as refused:
+                    await owner.submit(bundle_of("# later still"), (0,), "later")
+                # Reading what it has had already is no harm; it is not told how the scoring goes.
+                assert (await owner.state()).is_finalized
+                w.hold.set()
+                finished = await client.finished(owner.run)
+            assert [submit.bundle for submit in finished.submits] == [honest.digest]
+            assert finished.budget_used == 1
+            assert late.digest not in {job.bundle for job in w.jobs}
+
+    in_time(scenario())
