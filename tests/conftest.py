@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 
 
@@ -12,3 +14,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=0,
         help="tests/faults: instants at which each kind of fault strikes; 0: some kinds only, at one",
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # A shell ignores Ctrl-C for what it starts in the background, and children inherit that: tests that press it could
+    # not be run there.
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from host_faults import Cable, Clock
+from own_processes import only_what_starts_inside
 from weak_link import WeakLink
 
 from evopolicy_common import codec, credentials, keys
@@ -231,9 +232,9 @@ class FaultCluster:
 
 @contextlib.contextmanager
 def fault_cluster(root: Path, site: Site = "one host") -> Iterator[FaultCluster]:
-    """The cluster inside the `with`; everything below this process is gone after it."""
-    processes.become_subreaper()
-    with contextlib.ExitStack() as stack:
+    """The cluster inside the `with`; everything that was started there is gone after it."""
+    with only_what_starts_inside(), contextlib.ExitStack() as stack:
+        processes.become_subreaper()
         stack.callback(processes.end_descendants, 0.0)
         yield FaultCluster(root, site, stack)
 

@@ -13,6 +13,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from own_processes import only_what_starts_inside
+
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
@@ -120,7 +122,7 @@ def play(
     workspace = folder / "workspace"
     (workspace / "system").mkdir(parents=True, exist_ok=True)
     played = Played(folder)
-    with counting_gateway(budget, asked_in_flight) as urls:
+    with counting_gateway(budget, asked_in_flight) as urls, only_what_starts_inside():
         environment = {
             "PATH": f"{FAKES}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "HOME": str(folder),

@@ -26,7 +26,7 @@ class FakeClient:
 
     def info(self) -> dict[str, Any]:
         return {
-            "env_meta": {"n_env_instances": 3},
+            "env_meta": {"env": "toy/line", "n_env_instances": 3},
             "state": {"remaining_budget": self.budget},
             "min_episodes_per_submit": self.least,
             "max_episodes_per_submit": self.most,
