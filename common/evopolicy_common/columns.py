@@ -7,6 +7,7 @@ extension or readable text.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 import msgspec
@@ -78,20 +79,23 @@ class Pictures:
         return ["pictures", self._n, self._dtype.str, list(self._shape), data]
 
 
-class Column:
+class Column(ABC):
     """Rows of one leaf, or of a dict or tuple of leaves."""
 
+    @abstractmethod
     def __len__(self) -> int:
-        raise NotImplementedError
+        """How many rows there are."""
 
+    @abstractmethod
     def row(self, t: int) -> Any:
-        raise NotImplementedError
+        """What the leaf, dict or tuple was at row t."""
 
+    @abstractmethod
     def values(self) -> Any:
         """The column in the form that `Trajectory.obs` promises."""
-        raise NotImplementedError
 
     def rows(self) -> list[Any]:
+        """All rows, one by one."""
         return [self.row(t) for t in range(len(self))]
 
 

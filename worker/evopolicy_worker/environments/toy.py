@@ -7,6 +7,7 @@ every step costs, so that ending early would pay if it were allowed to.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections import deque
 from typing import Any
 
@@ -55,8 +56,9 @@ class _Toy(Environment):
     def render(self) -> Frame:
         return self._draw() if self._renders else super().render()
 
+    @abstractmethod
     def _draw(self) -> Frame:
-        raise NotImplementedError
+        """The present state as a picture."""
 
     def close(self) -> None:
         pass

@@ -10,6 +10,7 @@ keep the library's methods.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ _REMEMBERED = 64
 Coordinates = tuple[float, float]
 
 
-class _Remembering(AbstractLane):  # type: ignore[misc]
+class _Remembering(AbstractLane, ABC):  # type: ignore[misc]
     """Looks a position up before it is computed."""
 
     _known: dict[tuple[float, float], Coordinates]
@@ -40,8 +41,9 @@ class _Remembering(AbstractLane):  # type: ignore[misc]
                 self._known[key] = known
         return known
 
+    @abstractmethod
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
-        raise NotImplementedError
+        """The coordinates along the lane of `position`, which is (x, y)."""
 
     def on_lane(
         self, position: Any, longitudinal: Any = None, lateral: Any = None, margin: float = 0
