@@ -1,84 +1,25 @@
-"""Child processes of an operator's command: on a leash, in a session of their own, with their log in a file.
-
-They are in sessions of their own so that Ctrl-C reaches the command alone, which then ends them in order.
-"""
+"""Child processes of an operator's command that speak the lines of `control.py`, and the end of what they leave behind."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import signal
-import weakref
-from collections.abc import AsyncIterator, Sequence
-from pathlib import Path
+from collections.abc import AsyncIterator
 
-import msgspec
-
+from evopolicy_common import child_process
+from evopolicy_common.child_process import ChildProcess
 from evopolicy_gateway import processes
 from evopolicy_gateway.control import AnyEvent, Order, event_of, line
-from evopolicy_gateway.leash import leashed
-
-_LINE_LIMIT = 4 << 20
-
-live: set[int] = set()
-"""Ids of the running children of this process, which its search for orphans leaves alone."""
-
-
-_locks: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = weakref.WeakKeyDictionary()
-
-
-def _starting() -> asyncio.Lock:
-    return _locks.setdefault(asyncio.get_running_loop(), asyncio.Lock())
 
 
 async def end_orphans() -> None:
-    """Ends what has become this process's child by its parent's death.
-
-    No child is started meanwhile: between its birth and its place in `live` it would be taken for an orphan.
-    """
-    async with _starting():
-        await asyncio.to_thread(processes.end_orphans, frozenset(live))
+    """Ends what has become this process's child by its parent's death."""
+    async with child_process.starting():
+        await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
 
 
-class Child:
-    """A running child. Start it on the main thread: its leash is that thread's life."""
-
-    def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
-        self._process = process
-        self.log = log
-
-    @classmethod
-    async def start(cls, program: Sequence[str], log: Path, *, talks: bool = False) -> Child:
-        """Starts `program` with stderr appended to `log`; `talks`: it speaks the lines of `control.py`."""
-        log.parent.mkdir(parents=True, exist_ok=True)
-        pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
-        with log.open("ab") as out:
-            async with _starting():
-                process = await asyncio.create_subprocess_exec(
-                    *leashed(program),
-                    stdin=pipe,
-                    stdout=pipe,
-                    stderr=out,
-                    start_new_session=True,
-                    limit=_LINE_LIMIT,
-                    env={
-                        name: value
-                        for name, value in os.environ.items()
-                        if not name.startswith("EVOPOLICYGYM_")
-                    },
-                )
-                live.add(process.pid)
-        return cls(process, log)
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    @property
-    def exit_code(self) -> int | None:
-        """None while it runs."""
-        return self._process.returncode
+class Child(ChildProcess):
+    """A running child, started with `talks=True`."""
 
     async def events(self) -> AsyncIterator[AnyEvent]:
         """What it says, until it ends."""
@@ -93,48 +34,3 @@ class Child:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             stdin.write(line(order))
             await stdin.drain()
-
-    async def ended(self) -> int:
-        """Its exit status."""
-        code = await self._process.wait()
-        live.discard(self.pid)
-        return code
-
-    async def end(self, grace_s: float) -> None:
-        """SIGTERM, and SIGKILL after `grace_s` seconds. Nothing when it is gone already."""
-        if self._process.returncode is None:
-            self._signal(signal.SIGTERM)
-            try:
-                async with asyncio.timeout(grace_s):
-                    await self.ended()
-            except TimeoutError:
-                self._signal(signal.SIGKILL)
-        await self.ended()
-
-    def last_words(self) -> str:
-        """The last line of its log, for a message about why it ended."""
-        try:
-            with self.log.open("rb") as file:
-                file.seek(max(0, self.log.stat().st_size - 4096))
-                lines = file.read().decode("utf-8", "replace").strip().splitlines()
-        except OSError:
-            return ""
-        return _said(lines[-1]) if lines else ""
-
-    def _signal(self, number: signal.Signals) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            self._process.send_signal(number)
-
-
-class _LogLine(msgspec.Struct):
-    event: str
-    error: str = ""
-
-
-def _said(line: str) -> str:
-    """A log line for people: of a JSON line what happened and why."""
-    try:
-        entry = msgspec.json.decode(line, type=_LogLine)
-    except msgspec.DecodeError:
-        return line.removeprefix("error: ")
-    return f"{entry.event}: {entry.error}" if entry.error else entry.event

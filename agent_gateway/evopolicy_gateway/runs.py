@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
@@ -13,10 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from evopolicy_common import transport
+from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.local_cluster import local_cluster, unless_failed
 from evopolicy_common.run_record import RunRecord
-from evopolicy_gateway.local_cluster import local_cluster
 from evopolicy_gateway.operations import Operations, find_credentials
 from evopolicy_gateway.play import Plan, RunPlay
 from evopolicy_gateway.watch import Watch, watching
@@ -63,35 +63,21 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 @contextlib.asynccontextmanager
 async def connected(
     where: Cluster, env_ids: Sequence[str]
-) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Task[None] | None]]:
-    """A link to the cluster, the gateways' credentials, and the task that fails when a local cluster cannot be kept up."""
-    _end_on_sigterm()
+) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
+    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up."""
+    end_on_sigterm()
     async with contextlib.AsyncExitStack() as stack:
-        failed: asyncio.Task[None] | None = None
+        failed: asyncio.Future[None] | None = None
         file = where.file
         if where.local_slots is not None:
-            cluster, failed = await stack.enter_async_context(
-                local_cluster(
-                    env_ids, slots=where.local_slots, state=where.state, data=where.data, audit=where.audit
-                )
+            cluster = await stack.enter_async_context(
+                local_cluster("local", state=where.state, data=where.data, audit=where.audit)
             )
-            file = cluster.operator_file
+            await cluster.start_workers(env_ids, slots=where.local_slots)
+            file, failed = cluster.operator_file, cluster.failed
         operator, gateway = find_credentials(where.connect, file)
         link = await stack.enter_async_context(transport.connect(operator))
         yield Operations(link), gateway, failed
-
-
-async def unless_failed(work: asyncio.Task[None], failed: asyncio.Task[None] | None) -> None:
-    """Waits for `work`; when the local cluster fails first, its error."""
-    try:
-        await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
-        if failed is not None and failed.done() and not work.done():
-            failed.result()
-        await work
-    finally:
-        if not work.done():
-            work.cancel()
-            await asyncio.gather(work, return_exceptions=True)
 
 
 async def play_all(plans: Sequence[Plan], where: Cluster, parallel: int, console: Console) -> list[RunResult]:
@@ -189,13 +175,3 @@ def _result(plan: Plan, record: RunRecord) -> RunResult:
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
-
-
-def _end_on_sigterm() -> None:
-    """SIGTERM ends a command as Ctrl-C does: in order."""
-    main = asyncio.current_task()
-    if main is not None:
-        with contextlib.suppress(
-            RuntimeError, ValueError
-        ):  # not on the main thread: there are no signals here
-            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from evopolicy_common import bundles
 from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
@@ -22,7 +23,7 @@ from evopolicy_gateway import options
 from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_gateway.formatting import cut_text
 from evopolicy_gateway.operations import Operations
-from evopolicy_gateway.runs import Cluster, connected, unless_failed
+from evopolicy_gateway.runs import Cluster, connected
 
 
 class Trial(msgspec.Struct, frozen=True, kw_only=True):

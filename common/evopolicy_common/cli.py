@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Any, NoReturn, TextIO, cast
@@ -67,6 +69,14 @@ def fail_on_our_errors() -> Iterator[None]:
         fail(str(error), FAILURE)
     except KeyboardInterrupt:
         fail("interrupted", 130)
+
+
+def end_on_sigterm() -> None:
+    """From now on SIGTERM cancels the task that calls this: a command ends as with Ctrl-C, in order."""
+    main = asyncio.current_task()
+    assert main is not None
+    with contextlib.suppress(RuntimeError, ValueError):  # not on the main thread: there are no signals here
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
 
 
 def run_app(app: typer.Typer) -> None:

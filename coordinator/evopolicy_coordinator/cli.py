@@ -14,10 +14,11 @@ from evopolicy_common.blobs import write_atomically
 from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.ready import Ready
 from evopolicy_coordinator import certs_cli, process, router_config
 from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.process import Options, Ready
+from evopolicy_coordinator.process import Options
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.add_typer(certs_cli.app, name="certs")

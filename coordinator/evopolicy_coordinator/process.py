@@ -15,8 +15,9 @@ import structlog
 
 from evopolicy_common import credentials, transport
 from evopolicy_common.blobs import BlobStore
-from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.ready import Ready
+from evopolicy_common.simulators import SIMULATORS
 from evopolicy_coordinator.answers import Answers
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.intake import Intake
@@ -28,9 +29,6 @@ from evopolicy_coordinator.state import ROLES, StateFolder, reachable, resolve_l
 from evopolicy_coordinator.store import Store
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
-
-SIMULATORS = ("gymnasium", "gymnasium_robotics", "mujoco", "Box2D", "minigrid", "highway_env", "pygame")
-"""What policies may not import: the workers' sandboxes do not show it to them."""
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,17 +45,6 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     allowed_packages: tuple[str, ...] = ()
     """What workers let policies import beside numpy; told in `/info`."""
     core: CoreSettings = CoreSettings()
-
-
-class Ready(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a coordinator that serves can be reached; what `--ready-file` holds."""
-
-    cluster: str
-    endpoints: tuple[str, ...]
-    """As processes of this machine dial them; those of `tls/`, which need certificates, come last."""
-    credentials: dict[Role, str]
-    """Paths of this machine's credentials files by role."""
-    state: str
 
 
 async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-import signal
-from collections.abc import AsyncIterator, Awaitable, Callable
-from functools import partial
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
@@ -21,18 +19,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common import credentials, transport
-from evopolicy_common.cli import fail, fail_on_our_errors
+from evopolicy_common.cli import end_on_sigterm, fail, fail_on_our_errors
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.local_cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
-from evopolicy_coordinator.own_cluster import own_cluster
 from evopolicy_coordinator.verify_run import Report, Verifier
 from evopolicy_coordinator.verify_source import read_run, sample
 
 DIFFERS, USAGE, UNCHECKED = 1, 2, 3
 _SHOWN = 20
-
-_Start = Callable[[], Awaitable[asyncio.Task[None] | None]]
-"""Starts a worker, and gives the task that ends when the worker does."""
 
 app = typer.Typer(name="verify", add_completion=False, rich_markup_mode=None)
 
@@ -142,9 +137,9 @@ def verify(
 
 
 async def _verify(options: _Options, console: Console) -> Report:
-    _end_on_sigterm()
+    end_on_sigterm()
     run = read_run(options.run)
-    async with _link(options, run.record.env) as (link, start_worker):
+    async with _link(options) as (link, cluster):
         with Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -190,48 +185,27 @@ async def _verify(options: _Options, console: Console) -> Report:
                         await verifier.play_policy(played, indexes)
                 await verifier.check_fingerprint()
 
-            failed = await start_worker()
-            await _unless_failed(asyncio.create_task(work()), failed)
+            if cluster is not None:
+                await cluster.start_workers([run.record.env], slots=options.slots)
+            failed = None if cluster is None else cluster.failed
+            await unless_failed(asyncio.create_task(work()), failed)
     return verifier.report
 
 
 @contextlib.asynccontextmanager
-async def _link(options: _Options, env: str) -> AsyncIterator[tuple[transport.Link, _Start]]:
-    """A link to the cluster, and what starts its worker where that is ours to do."""
+async def _link(options: _Options) -> AsyncIterator[tuple[transport.Link, LocalCluster | None]]:
+    """A link to the cluster; with `--local` the cluster too, which has no workers yet."""
     async with contextlib.AsyncExitStack() as stack:
-        file = options.file
-        starter: _Start = _no_worker
+        file, cluster = options.file, None
         if options.local:
-            cluster = await stack.enter_async_context(own_cluster(state=options.state, data=options.data))
+            if options.state is not None and not options.state.is_dir():
+                raise ConfigError(f"--state {options.state}: there is no such state folder")
+            cluster = await stack.enter_async_context(
+                local_cluster("verify", state=options.state, data=options.data)
+            )
             file = cluster.operator_file
-            starter = partial(cluster.start_worker, env, options.slots)
         found = credentials.find("operator", options.connect, file)
-        yield await stack.enter_async_context(transport.connect(found)), starter
-
-
-async def _no_worker() -> None:
-    """The cluster has its own."""
-
-
-async def _unless_failed(work: asyncio.Task[None], failed: asyncio.Task[None] | None) -> None:
-    """Waits for `work`; when the worker of our own ends first, its error."""
-    tasks = {work} if failed is None else {work, failed}
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        if failed is not None and failed.done() and not work.done():
-            failed.result()
-        await work
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _end_on_sigterm() -> None:
-    main = asyncio.current_task()
-    assert main is not None
-    with contextlib.suppress(RuntimeError, ValueError):  # not on the main thread: there are no signals here
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
+        yield await stack.enter_async_context(transport.connect(found)), cluster
 
 
 def _print(report: Report, console: Console) -> None:

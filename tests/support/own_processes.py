@@ -1,4 +1,4 @@
-"""Code that ends "everything below this process", called inside a test process whose other fixtures have children too."""
+"""A test process's children: whether they live, and how code that ends "everything below this process" spares some."""
 
 from __future__ import annotations
 
@@ -7,9 +7,18 @@ import ctypes
 import functools
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from unittest.mock import patch
 
 from evopolicy_gateway import processes
+
+
+def alive(pid: int) -> bool:
+    """Whether there is such a process; a zombie is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @contextlib.contextmanager

@@ -27,6 +27,7 @@ CALLS = frozenset({"timeout", "wait_for", "settimeout", "join"})
 DOCUMENT = ROOT / "docs" / "reliability.md"
 PACE, SIZE = "pace", "size"
 
+LOCAL = "tests/unit/common/test_local_cluster.py::"
 LEASES = "tests/unit/coordinator/core/test_core_leases.py::"
 SCHEDULER = "tests/unit/coordinator/core/test_core_scheduler.py::"
 SHELL = "tests/unit/coordinator/test_coordinator_timeouts.py::"
@@ -90,10 +91,6 @@ TIMEOUTS: dict[str, str] = {
     "coordinator/upkeep.py:UNNAMED_S": "tests/integration/coordinator/test_coordinator_upkeep.py::"
     "test_a_blob_that_nothing_names_goes_once_it_is_old",
     "coordinator/watchdog.py:GAP_S": "tests/unit/coordinator/test_watchdog.py::test_gap_is_counted_and_its_place_named",
-    "coordinator/own_cluster.py:START_PATIENCE_S": SHELL
-    + "test_a_coordinator_of_ones_own_that_does_not_start_is_told_and_ended",
-    "coordinator/own_cluster.py:END_GRACE_S": SHELL
-    + "test_a_coordinator_of_ones_own_that_does_not_start_is_told_and_ended",
     # The worker.
     "worker/policy_process.py:_GRACE_S": WORKER
     + "test_a_policy_that_does_not_let_go_of_its_output_is_not_waited_for",
@@ -163,9 +160,9 @@ TIMEOUTS: dict[str, str] = {
     + "test_an_agent_that_does_nothing_is_ended_by_its_wall_limit",
     "gateway/suite/suite_file.py:claim_ttl_s": "tests/unit/coordinator/test_claims.py::"
     "test_a_held_claim_is_not_given_to_another_until_its_time_is_up",
-    "gateway/local_cluster.py:START_PATIENCE_S": GATEWAY
+    "common/local_cluster.py:START_PATIENCE_S": LOCAL
     + "test_a_local_coordinator_that_does_not_start_is_told_and_killed",
-    "gateway/local_cluster.py:END_GRACE_S": GATEWAY
+    "common/local_cluster.py:END_GRACE_S": LOCAL
     + "test_a_local_coordinator_that_does_not_start_is_told_and_killed",
     "gateway/play.py:LAST_WORDS_S": COMMAND
     + "test_an_agent_that_stays_when_its_budget_is_spent_is_ended_even_if_it_ignores_being_asked",
@@ -176,6 +173,8 @@ TIMEOUTS: dict[str, str] = {
 """Where it is, and the test that lets it pass."""
 
 NO_TIMEOUTS: dict[str, str] = {
+    "common/local_cluster.py:_RESTART_PAUSE_S": PACE,
+    "common/ready.py:_LOOK_S": PACE,
     "common/requests.py:FIRST_PAUSE_S": PACE,
     "common/requests.py:LONGEST_PAUSE_S": PACE,
     "coordinator/claims.py:MAX_TTL_S": SIZE,
@@ -215,7 +214,6 @@ NO_TIMEOUTS: dict[str, str] = {
     "gateway/harnesses/cli_agent.py:_IN_FLIGHT_PAUSE_S": PACE,
     "gateway/harnesses/clock.py:_LOOK_S": PACE,
     "gateway/harnesses/trouble.py:MAX_BACKOFF_S": SIZE,
-    "gateway/local_cluster.py:_RESTART_PAUSE_S": PACE,
     "gateway/operations.py:WAIT_S": PACE,
     "gateway/operations.py:_UNAVAILABLE_PAUSE_S": PACE,
     "gateway/play.py:_QUICK_DEATH_S": SIZE,

@@ -8,10 +8,8 @@ error. The main thread plays; the monitor's thread hears commands meanwhile.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import queue
-import signal
 import sys
 import threading
 import time
@@ -19,13 +17,13 @@ from pathlib import Path
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError
 from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.child_pipes import take_pipes
 from evopolicy_worker.episodes import CancelledJobError, Player, Progress, fault_of
 from evopolicy_worker.monitor import Monitor
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
 
 _PROGRESS_S = 0.25
-_PR_SET_PDEATHSIG = 1
 
 
 class Channel:
@@ -136,12 +134,7 @@ class EnvProcess:
 
 def main() -> None:
     """The process's entry."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    commands, answers = os.dup(0), os.dup(1)
-    with open(os.devnull) as nothing:
-        os.dup2(nothing.fileno(), 0)
-    os.dup2(2, 1)
+    commands, answers = take_pipes()
     channel = Channel(commands, answers)
     received: list[messages.Command] = []
     while not received:

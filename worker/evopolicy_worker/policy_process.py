@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
+from evopolicy_common.simulators import SIMULATORS
 from evopolicy_worker import frames
 from evopolicy_worker.monitor import Monitor, Watch
 from evopolicy_worker.sandbox.jail import Jail
@@ -25,32 +26,13 @@ from evopolicy_worker.sandbox.zygote import DEATH_TIMEOUT_S, Child, Exit, Zygote
 MAX_DESCRIPTORS = 256
 MAX_FILES = 4096
 """Files and folders that a policy may make beside its bundle's."""
-DENIED = frozenset(
+_DENIED = frozenset(
     {
-        *(
-            "gymnasium",
-            "gymnasium_robotics",
-            "gym",
-            "mujoco",
-            "mujoco_py",
-            "Box2D",
-            "minigrid",
-            "highway_env",
-        ),
-        *(
-            "pygame",
-            "ale_py",
-            "miniworld",
-            "mo_gymnasium",
-            "metaworld",
-            "browsergym",
-            "miniwob",
-            "pettingzoo",
-        ),
+        *SIMULATORS,
         *("evopolicy_common", "evopolicy_worker", "evopolicy_coordinator", "evopolicy_gateway", "zenoh"),
     }
 )
-"""What a policy is told it may not import: simulators and our own code; the sandbox does not show them."""
+"""What a policy that asks for it is told it may not import: simulators and our own code, which it does not see."""
 _GRACE_S = 1.0
 _SEAL_S = 60.0
 """For what is our own work before the bundle is imported."""
@@ -355,7 +337,7 @@ class PolicyProcess:
             message = f"{message} [{text}]"
         if stage == "import" and report.missing:
             top = report.missing.partition(".")[0]
-            if top in DENIED:
+            if top in _DENIED:
                 category = "denied_import"
                 message = f"{message}: policies may not import {top}; they see observations only"
         return self._failed(category, message, report.traceback, limit, used)

@@ -12,10 +12,8 @@ Rules:
 
 from __future__ import annotations
 
-import ctypes
 import io
 import os
-import signal
 import sys
 from typing import BinaryIO
 
@@ -26,6 +24,7 @@ from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.trajectory import decode
 from evopolicy_worker import environments
+from evopolicy_worker.child_pipes import take_pipes
 from evopolicy_worker.environments import Environment, Frame
 from evopolicy_worker.slot_messages import LENGTH
 
@@ -36,7 +35,6 @@ MIN_RATE, MAX_RATE = 4, 30
 """Frames a second."""
 EPISODE_S = 10
 """An episode of full length should last about so long, where the rates allow it."""
-_PR_SET_PDEATHSIG = 1
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,12 +137,7 @@ def serve(env_id: str, orders: BinaryIO, answers: BinaryIO) -> None:
 
 def main() -> None:
     """The process's entry."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    orders, answers = os.dup(0), os.dup(1)
-    with open(os.devnull) as nothing:
-        os.dup2(nothing.fileno(), 0)
-    os.dup2(2, 1)
+    orders, answers = take_pipes()
     with os.fdopen(orders, "rb") as reader, os.fdopen(answers, "wb") as writer:
         serve(sys.argv[1], reader, writer)
         # Not by way of exit handlers, of which a graphics driver's may hang or crash.

@@ -8,8 +8,8 @@ import signal
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
+from evopolicy_common.leash import leashed
 from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
-from evopolicy_gateway.leash import leashed
 
 _CHUNK = 64 << 10
 _LAST_WORDS_S = 1.0

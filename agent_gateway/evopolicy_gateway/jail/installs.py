@@ -14,17 +14,13 @@ import sysconfig
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from evopolicy_common.simulators import SIMULATORS
+
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
 """Shown in every jail."""
 
-SIMULATORS = frozenset(
-    (
-        *("gymnasium", "gym", "gymnasium_robotics", "mujoco", "mujoco_py", "highway_env", "minigrid"),
-        *("Box2D", "box2d", "pettingzoo", "dm_control", "shimmy", "ale_py", "pybullet", "pybullet_envs"),
-        *("evopolicy_worker", "evopolicy_coordinator"),
-    )
-)
-"""Packages that no agent gets to see: with them it could train outside its budget."""
+_HIDDEN = frozenset((*SIMULATORS, "evopolicy_worker", "evopolicy_coordinator"))
+"""Packages that no agent gets to see, in whatever installation they are."""
 
 _INSTALLATION_MARKS = ("pyvenv.cfg", "lib", "libexec", "node_modules")
 _SITE_FOLDERS = ("site-packages", "dist-packages")
@@ -67,8 +63,8 @@ def needs_of(command: Sequence[str], search: str | None) -> Needs:
     return needs
 
 
-def simulators_below(folder: str) -> Iterator[str]:
-    """Files and folders of simulator packages in the Python installations at and right below `folder`."""
+def hidden_below(folder: str) -> Iterator[str]:
+    """Files and folders of packages that no agent gets to see in the Python installations at and right below `folder`."""
     root = Path(folder)
     sites: list[Path] = []
     for base in ("", "lib/", "lib64/", "local/lib/", "versions/*/lib/", "envs/*/lib/", "*/lib/"):
@@ -82,7 +78,7 @@ def simulators_below(folder: str) -> Iterator[str]:
         except OSError:
             continue
         for name in names:
-            if name.partition(".")[0] in SIMULATORS and not name.endswith((".dist-info", ".egg-info")):
+            if name.partition(".")[0] in _HIDDEN and not name.endswith((".dist-info", ".egg-info")):
                 yield str(site / name)
 
 

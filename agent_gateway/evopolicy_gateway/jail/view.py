@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_gateway.jail.installs import SYSTEM, Needs, our_packages, simulators_below
+from evopolicy_gateway.jail.installs import SYSTEM, Needs, hidden_below, our_packages
 
 DOORWAY = "/run/evopolicy/doorway.py"
 
@@ -108,7 +108,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         covered: dict[str, None] = {}
         for folder in (*SYSTEM, *shown):
             if os.path.isdir(folder) and not (folder in SYSTEM and os.path.islink(folder)):
-                covered |= dict.fromkeys(simulators_below(folder))
+                covered |= dict.fromkeys(hidden_below(folder))
         for folder in shown:
             real = Path(os.path.realpath(folder))
             for secret in self.hidden:

@@ -20,9 +20,10 @@ from rich.console import Console
 
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
 from evopolicy_gateway import options
-from evopolicy_gateway.runs import Cluster, connected, unless_failed
+from evopolicy_gateway.runs import Cluster, connected
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import asyncio
-import signal
 import sqlite3
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import test_service
 from test_service import Asked, World
 
 from evopolicy_common import keys
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import operator
-from evopolicy_coordinator import own_cluster, service, store, upkeep
+from evopolicy_coordinator import service, store, upkeep
 from evopolicy_coordinator.store import Store
 
 SOON_S = 0.2
-STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
 
 
 def test_a_query_that_nobody_waits_for_any_more_is_let_go(
@@ -55,30 +50,3 @@ def test_a_database_that_another_keeps_locked_is_told(
     ours.write_claim("suite", "name", b"")
     other.close()
     ours.close()
-
-
-def test_a_coordinator_of_ones_own_that_does_not_start_is_told_and_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither does it end when asked to."""
-    monkeypatch.setattr(own_cluster, "START_PATIENCE_S", SOON_S)
-    monkeypatch.setattr(own_cluster, "END_GRACE_S", SOON_S)
-    started: list[asyncio.subprocess.Process] = []
-
-    async def start(program: Any, log: Path) -> asyncio.subprocess.Process:
-        child = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", STUBBORN, stdout=asyncio.subprocess.PIPE
-        )
-        assert child.stdout is not None
-        await child.stdout.readline()
-        started.append(child)
-        return child
-
-    async def main() -> None:
-        with pytest.raises(ConfigError, match="did not start"):
-            async with own_cluster.own_cluster(state=tmp_path):
-                pass
-
-    monkeypatch.setattr(own_cluster, "_start", start)
-    asyncio.run(main())
-    assert started[0].returncode == -signal.SIGKILL

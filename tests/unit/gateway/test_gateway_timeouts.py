@@ -22,7 +22,7 @@ from gateway_double import served
 from starlette.responses import PlainTextResponse
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway import http, local_cluster, play, server
+from evopolicy_gateway import http, play, server
 from evopolicy_gateway.agents.client import Client, ProtocolError
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.harnesses import agent_process, base, cli_agent, command, turn
@@ -265,30 +265,6 @@ def test_a_request_that_does_not_end_does_not_hold_up_the_services_end(
 
 
 # The operator's side.
-
-
-def test_a_local_coordinator_that_does_not_start_is_told_and_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(local_cluster, "START_PATIENCE_S", 2.0)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
-    monkeypatch.setattr(local_cluster, "_module", lambda name: [sys.executable, "-c", STUBBORN])
-    started: list[Child] = []
-    start = Child.start
-
-    async def noted(program: Any, log: Path, **more: Any) -> Child:
-        started.append(await start(program, log, **more))
-        return started[-1]
-
-    monkeypatch.setattr(Child, "start", noted)
-
-    async def main() -> None:
-        with pytest.raises(ConfigError, match="did not start"):
-            async with local_cluster.local_cluster(["toy/line"], slots=1, state=tmp_path / "s"):
-                pass
-
-    asyncio.run(main())
-    assert [child.exit_code for child in started] == [-signal.SIGKILL]
 
 
 def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:

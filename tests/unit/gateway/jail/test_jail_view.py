@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_gateway.jail.installs import needs_of, simulators_below
+from evopolicy_gateway.jail.installs import hidden_below, needs_of
 from evopolicy_gateway.jail.view import View
 
 
@@ -78,7 +78,7 @@ def test_simulators_are_found_wherever_a_python_keeps_its_packages(tmp_path: Pat
     for name in ("gymnasium", "numpy", "mujoco", "gymnasium-1.0.dist-info"):
         (site / name).mkdir(parents=True)
     (site / "Box2D.so").touch()
-    found = {Path(path).name for path in simulators_below(str(tmp_path))}
+    found = {Path(path).name for path in hidden_below(str(tmp_path))}
     assert found == {"gymnasium", "mujoco", "Box2D.so"}
 
 

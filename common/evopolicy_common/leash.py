@@ -23,9 +23,14 @@ def leashed(program: Sequence[str], death_signal: signal.Signals = signal.SIGTER
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(death_signal)), *program]
 
 
-def main(arguments: list[str]) -> None:
-    parent, death_signal, program = int(arguments[0]), int(arguments[1]), arguments[2:]
+def end_with_parent(death_signal: signal.Signals) -> None:
+    """The kernel sends this process `death_signal` when the thread that started it ends; also after an exec."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, death_signal, 0, 0, 0)
+
+
+def main(arguments: list[str]) -> None:
+    parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
+    end_with_parent(death_signal)
     if os.getppid() != parent:
         raise SystemExit(1)  # it died before we asked to be told
     try:

@@ -1,0 +1,120 @@
+"""The processes of a local cluster start, die, refuse and stay: what the command that brought it up makes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common import local_cluster
+from evopolicy_common.child_process import ChildProcess
+from evopolicy_common.errors import ConfigError
+
+SOON_S = 0.2
+STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+SERVES = """
+import json, os, sys, time
+target = sys.argv[sys.argv.index("--ready-file") + 1]
+ready = {"cluster": "c", "endpoints": [], "state": "s", "credentials": {"operator": "of", "worker": "wf"}}
+with open(target + ".new", "w") as file:
+    json.dump(ready, file)
+os.rename(target + ".new", target)
+time.sleep(1000)
+"""
+DIES_FIRST = """
+import os, sys
+mark = sys.argv[sys.argv.index("--state") + 1] + "/died"
+if not os.path.exists(mark):
+    open(mark, "w").close()
+    sys.exit(1)
+"""
+
+
+def programs(monkeypatch: pytest.MonkeyPatch, coordinator: str, worker: str = STUBBORN) -> None:
+    """These in place of the coordinator's and the worker's."""
+    code = {"evopolicy_coordinator.cli": coordinator, "evopolicy_worker.cli": worker}
+    monkeypatch.setattr(local_cluster, "_module", lambda name: [sys.executable, "-c", code[name]])
+    monkeypatch.setattr(local_cluster, "_RESTART_PAUSE_S", 0.0)
+
+
+def bring_up(state: Path) -> str:
+    """What the command ends with: the error of a cluster that cannot be kept up, or no word of one that serves."""
+
+    async def main() -> str:
+        async with local_cluster.local_cluster("test", state=state) as cluster:
+            assert cluster.operator_file == Path("of")
+            await cluster.start_workers(["toy/line"], slots=1)
+            await local_cluster.unless_failed(asyncio.create_task(asyncio.sleep(1000)), cluster.failed)
+        return ""
+
+    with pytest.raises(ConfigError) as raised:
+        asyncio.run(main())
+    assert [path.name for path in state.glob("*.json")] == []
+    return str(raised.value)
+
+
+def test_a_local_coordinator_that_does_not_start_is_told_and_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs(monkeypatch, STUBBORN)
+    monkeypatch.setattr(local_cluster, "START_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    started: list[ChildProcess] = []
+    start = ChildProcess.start
+
+    async def once_it_is_stubborn(program: Sequence[str], log: Path) -> ChildProcess:
+        child = await start(program, log, talks=True)
+        assert child._process.stdout is not None
+        await child._process.stdout.readline()
+        started.append(child)
+        return child
+
+    monkeypatch.setattr(ChildProcess, "start", once_it_is_stubborn)
+    assert "did not start" in bring_up(tmp_path)
+    assert [child.exit_code for child in started] == [-signal.SIGKILL]
+
+
+def test_a_coordinator_that_died_is_started_again_and_refused_options_end_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuses = "import sys; print('error: --slots 1: what for?', file=sys.stderr); sys.exit(2)"
+    programs(monkeypatch, DIES_FIRST + SERVES, refuses)
+    assert bring_up(tmp_path) == "--slots 1: what for?"
+    assert (tmp_path / "died").exists()
+
+
+def test_a_worker_that_dies_again_and_again_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs(monkeypatch, SERVES, "raise SystemExit('no room')")
+    assert bring_up(tmp_path) == "worker ends again and again: no room"
+
+
+def test_workers_divide_the_slots_of_an_audited_cluster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs(monkeypatch, SERVES)
+    started: dict[str, list[str]] = {}
+    start = ChildProcess.start
+
+    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
+        started[log.stem] = list(program[3:])
+        return await start(program, log, **more)
+
+    monkeypatch.setattr(ChildProcess, "start", noted)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", data=Path("d"), audit=0.5) as cluster:
+            await cluster.start_workers(["toy/line", "toy/maze"], slots=5)
+
+    monkeypatch.chdir(tmp_path)
+    asyncio.run(main())
+    assert started["test-coordinator"][4:] == ["--data", str(tmp_path / "d"), "--audit", "0.5"]
+    assert started["test-worker"][-6:] == ["--env", "toy/line", "--env", "toy/maze", "--slots", "3"]
+    assert started["test-worker-2"][-2:] == ["--slots", "2"]
