@@ -8,6 +8,7 @@ for its row. All kinds of faults: `pytest tests/faults --fault-seeds 1`, more in
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from fault_matrix import Case, cases
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
+SUPPORT = Path(__file__).parents[1] / "support"
 PARTS = 2
 """Clusters at once: most of a run with a fault is waiting."""
 
@@ -35,6 +37,7 @@ class Matrix:
             ],
             stdout=subprocess.PIPE,
             text=True,
+            env={**os.environ, "PYTHONPATH": str(SUPPORT)},
         )
         self._rows: dict[tuple[str, str, int], dict[str, Any]] = {}
 

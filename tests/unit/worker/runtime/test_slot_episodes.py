@@ -310,3 +310,39 @@ def test_threads_and_numpy_work_in_the_sandbox(slots: Slots) -> None:
     """
     outcome = slots.play(policy)
     assert (outcome.failure, outcome.stdout) == (None, b"50 True ('UTC', 'UTC')\n")
+
+
+LOOKING_UP = """
+    import sys
+
+    class Policy:
+        def __init__(self, *spaces):
+            frame = sys._getframe(1)
+            while frame is not None:
+                for name, value in sorted(frame.f_locals.items()):
+                    plain = isinstance(value, (int, float, str, bytes, list, tuple, dict, type(None)))
+                    if not name.startswith("__"):
+                        print(frame.f_code.co_name, name, value if plain else type(value).__name__)
+                frame = frame.f_back
+
+        def reset(self, episode_index):
+            pass
+
+        def act(self, obs):
+            return [0.0]
+"""
+
+
+def test_what_stands_above_a_policy_tells_nothing_of_those_before(slots: Slots) -> None:
+    """How long the last one took, or that there was one."""
+    slot = slots.new()
+    slots.run(slot.start())
+    try:
+        seen = []
+        for _ in range(3):
+            seen.append(slots.play(LOOKING_UP, slot=slot).stdout)
+            slots.play(HONEST, slot=slot)
+    finally:
+        slots.run(slot.close())
+    assert b"env_meta" in seen[0]
+    assert len(set(seen)) == 1

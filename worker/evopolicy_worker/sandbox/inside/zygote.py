@@ -21,7 +21,7 @@ import socket
 import struct
 import sys
 import traceback
-from typing import Any, NoReturn
+from typing import Any
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
 MS_NOSUID, MS_NODEV, MS_BIND, MS_REC, MS_PRIVATE = 2, 4, 4096, 16384, 1 << 18
@@ -56,7 +56,13 @@ def main() -> None:
     except BaseException as error:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
         raise
-    zygote(control, config)
+    fds = zygote(control, config)
+    # Only a policy's process comes here. It must never go on as the zygote, whatever happens.
+    del control
+    try:
+        policy_process(config, fds)
+    finally:
+        os._exit(70)
 
 
 def enter_user_namespace(control: socket.socket) -> None:
@@ -117,7 +123,11 @@ def warm(modules: list[str]) -> None:
     gc.freeze()
 
 
-def zygote(control: socket.socket, config: dict[str, Any]) -> NoReturn:
+def zygote(control: socket.socket, config: dict[str, Any]) -> list[int]:
+    """Serves the worker until it hangs up; returns in every child, with its descriptors.
+
+    A policy can look into the frames of its callers: in this one it would find how long the policies before it took.
+    """
     myself = os.pidfd_open(os.getpid()) if config["namespaces"] else -1
     control.send(b'{"ready": true}')
     while True:
@@ -136,11 +146,7 @@ def zygote(control: socket.socket, config: dict[str, Any]) -> NoReturn:
             control.send(json.dumps({"error": f"fork: {error}"}).encode())
             continue
         if child == 0:
-            # Never back into the zygote's loop, whatever happens.
-            try:
-                policy_process(config, fds)
-            finally:
-                os._exit(70)
+            return fds
         for fd in fds:
             os.close(fd)
         fd = os.pidfd_open(child)
@@ -180,6 +186,7 @@ def policy_process(config: dict[str, Any], fds: list[int]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     arrange_descriptors(fds)
+    fds.clear()
     try:
         if config["namespaces"]:
             check(libc.unshare(CLONE_NEWNS | CLONE_NEWIPC), "unshare mounts, ipc")
