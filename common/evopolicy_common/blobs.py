@@ -13,7 +13,7 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from evopolicy_common.errors import StorageError
@@ -136,13 +136,22 @@ class BlobStore:
         except OSError as error:
             raise StorageError(f"blob {digest} is not in {self._root}") from error
 
-    def append_chunk(self, sender: str, digest: str, size: int, offset: int, data: bytes) -> int:
+    def append_chunk(
+        self,
+        sender: str,
+        digest: str,
+        size: int,
+        offset: int,
+        data: bytes,
+        on_whole: Callable[[], None] | None = None,
+    ) -> int:
         """Adds one chunk of a blob that `sender` is uploading and returns how many bytes are there now.
 
         A chunk that does not continue what is there changes nothing: the answer tells where to go on. The last one
         checks the digest and puts the blob in place; StorageError when the bytes are another blob's.
+        `on_whole` is called once the sender has sent all bytes of the blob; with it, what is here already counts for nothing.
         """
-        if self.has(digest):
+        if on_whole is None and self.has(digest):
             # Young again: who collects what nobody names leaves the young alone.
             with contextlib.suppress(OSError):
                 os.utime(self.path(digest))
@@ -165,6 +174,8 @@ class BlobStore:
             raise StorageError(f"cannot write blob {digest}: {error.strerror or error}") from error
         if have == size:
             self._finish(part, digest)
+            if on_whole is not None:
+                on_whole()
         return have
 
     def drop_unfinished(self) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from zlib import crc32
 
@@ -30,6 +31,7 @@ from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.events import AuditEvent
 from evopolicy_coordinator.store import Reader
+from evopolicy_coordinator.uploads import Uploads
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -46,9 +48,10 @@ Answer = Callable[[Message | None], None]
 class Answers:
     """Reads pages and blobs. Every method returns at once; the answer is given later, from a thread."""
 
-    def __init__(self, database: Path, blobs: BlobStore) -> None:
+    def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
         self._database = database
         self._blobs = blobs
+        self._uploads = uploads
         self._local = threading.local()
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
         self._audits = ThreadPoolExecutor(1, thread_name_prefix="audits")
@@ -62,9 +65,14 @@ class Answers:
         """Reads and compares recordings, one audit after another; `tell` is called from the thread."""
         self._audits.submit(self._audit, effect, tell)
 
-    def put(self, sender: str, message: BlobPut, max_bytes: int, answer: Answer) -> None:
-        """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check."""
-        self._lane(message.digest).submit(self._answer, lambda: self._put(sender, message, max_bytes), answer)
+    def put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int, answer: Answer) -> None:
+        """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check.
+
+        With `run`, whose gateway it is, what others have stored is not told: all bytes are wanted, and noted then.
+        """
+        self._lane(message.digest).submit(
+            self._answer, lambda: self._put(sender, run, message, max_bytes), answer
+        )
 
     def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
         """Sends one chunk of a blob; with `run`, only of one that this run's train feedback names."""
@@ -167,16 +175,19 @@ class Answers:
             finished=not page.rows,
         )
 
-    def _put(self, sender: str, message: BlobPut, max_bytes: int) -> Message:
+    def _put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int) -> Message:
         if not is_digest(message.digest):
             return Refused(status="bad_blob", message=f"{message.digest[:80]!r} is no SHA-256 digest")
         if not 0 <= message.size <= max_bytes:
             return Refused(
                 status="bad_blob", message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
             )
+        on_whole = None
+        if run is not None and not self._uploads.has_sent(run, message.digest):
+            on_whole = partial(self._uploads.note, run, message.digest)
         try:
             have = self._blobs.append_chunk(
-                sender, message.digest, message.size, message.offset, message.data
+                sender, message.digest, message.size, message.offset, message.data, on_whole
             )
         except StorageError as error:
             if error.__cause__ is not None:  # the disk's fault, not the sender's

@@ -31,6 +31,7 @@ from evopolicy_coordinator.machines import Machines
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import Identity
 from evopolicy_coordinator.store import stored_blobs
+from evopolicy_coordinator.uploads import Uploads
 
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
@@ -56,7 +57,6 @@ class Rights(Protocol):
 
     def capability(self, run: str) -> str | None:
         """The token of a run's gateway; None for an unknown run."""
-        ...
 
 
 class Parsed(msgspec.Struct, frozen=True):
@@ -77,6 +77,7 @@ class Intake:
         identity: Identity,
         blobs: BlobStore,
         source: SplitSource,
+        uploads: Uploads,
         *,
         allowed_imports: tuple[str, ...],
         denied_imports: tuple[str, ...],
@@ -86,6 +87,7 @@ class Intake:
         self._identity = identity
         self._blobs = blobs
         self._source = source
+        self._uploads = uploads
         self._allowed_imports = allowed_imports
         self._denied_imports = denied_imports
         self._machines = machines
@@ -222,7 +224,7 @@ class Intake:
 
     def submit_requested(self, m: gateway.Submit, request: int, stimulus: str) -> AnyEvent:
         _check_idempotency_key(m.key)
-        self._check_bundle(m.bundle)
+        self._check_bundle(m.bundle, m.run)
         if (m.bundle is None) == (m.bundle_error is None):
             raise RefusedError("bad_message", "a submit has either a bundle or a bundle_error")
         return events.SubmitRequested(
@@ -408,8 +410,10 @@ class Intake:
         if place.policy_scope == "submit" and m.bundle is not None and place.indexes != tuple(range(whole)):
             raise RefusedError("bad_message", "with policy scope submit only whole submits are played again")
 
-    def _check_bundle(self, digest: str | None) -> None:
-        if digest is not None and not (is_digest(digest) and self._blobs.has(digest)):
+    def _check_bundle(self, digest: str | None, run: str | None = None) -> None:
+        """Whether it is stored; with `run`, also whether that run's gateway has brought it."""
+        brought = digest is None or run is None or self._uploads.has_sent(run, digest)
+        if digest is not None and not (brought and is_digest(digest) and self._blobs.has(digest)):
             raise RefusedError(
                 "missing_bundle", f"bundle {digest[:64]!r} is not stored here; upload it first"
             )

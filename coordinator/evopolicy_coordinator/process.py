@@ -27,6 +27,7 @@ from evopolicy_coordinator.service import Service
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret
 from evopolicy_coordinator.state import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.uploads import Uploads
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -63,15 +64,18 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         opened.callback(store.close)
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
+        uploads = Uploads()
         intake = Intake(
             state.identity,
             blobs,
             source,
+            uploads,
             allowed_imports=("numpy", *options.allowed_packages),
             denied_imports=SIMULATORS,
             machines=machines,
         )
-        service = Service(state.identity.cluster, store, Answers(state.database, blobs), intake, options.core)
+        answers = Answers(state.database, blobs, uploads)
+        service = Service(state.identity.cluster, store, answers, intake, options.core)
         try:
             await service.start()
             door = remote_door(

@@ -288,7 +288,9 @@ class Service:
             run = core.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 raise RefusedError("closed", f"run {parsed.asker} is closed and takes no more bundles")
-        self._answers.put(f"{parsed.room}/{parsed.asker}", message, most, answer_to(query, parsed.asker))
+        run_id = parsed.asker if parsed.room == "gw" else None
+        answer = answer_to(query, parsed.asker)
+        self._answers.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":

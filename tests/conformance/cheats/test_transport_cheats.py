@@ -25,7 +25,7 @@ from coordinator_harness import (
 
 from evopolicy_common import codec, keys
 from evopolicy_common.errors import RefusedError
-from evopolicy_common.messages import gateway
+from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.run_record import decode_run_record
 
@@ -179,6 +179,39 @@ def test_a_key_that_is_used_again_with_another_bundle_is_refused_and_the_first_o
             assert [submit.bundle for submit in finished.submits] == [weak.digest]
             assert finished.budget_used == 1
             assert strong.digest not in {job.bundle for job in w.jobs}
+
+    in_time(scenario())
+
+
+def test_what_another_run_has_brought_cannot_be_played_or_even_found_by_its_digest(
+    coordinator: Coordinator,
+) -> None:
+    async def scenario() -> None:
+        async with (
+            two_runs(coordinator, "stolen") as (owner, thief, client),
+            working(coordinator, "w-5") as w,
+        ):
+            rival, unknown = bundle_of("# a rival's policy"), bundle_of("# nobody's")
+            await owner.submit(rival, (0,), "key")
+            ((episode,), _) = await owner.results(0)
+            refusals = []
+            for digest in (rival.digest, episode.trajectory.digest, unknown.digest):
+                with pytest.raises(RefusedError) as refused:
+                    await thief.submit_digest(digest, (0,), digest[:8])
+                refusals.append((refused.value.status, refused.value.message.replace(digest, "")))
+                guess = worker.BlobPut(
+                    sender=thief.run, token=thief.token, digest=digest, size=99, offset=0, data=b""
+                )
+                assert (await thief.ask.once("blob", guess, worker.BlobAck)).have == 0
+            assert len(set(refusals)) == 1
+            assert refusals[0][0] == "missing_bundle"
+            assert (await thief.state()).remaining_budget == 16
+            # Who has the policy itself may play it, as anybody may.
+            await thief.submit(rival, (0,), "its own")
+            await thief.results(0)
+            await thief.close()
+            assert (await client.finished(thief.run)).budget_used == 1
+            assert {job.bundle for job in w.jobs} <= {rival.digest, None}
 
     in_time(scenario())
 

@@ -16,10 +16,12 @@ from evopolicy_common.blobs import BlobStore
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_coordinator import uploads as uploads_module
 from evopolicy_coordinator.answers import MAX_PAGE_BYTES, Answers
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.uploads import Uploads
 
 TRAIN = records.train_group("r-1", 0)
 
@@ -30,7 +32,8 @@ class Desk:
     def __init__(self, root: Path) -> None:
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
-        self.answers = Answers(root / "db", self.blobs)
+        self.uploads = Uploads()
+        self.answers = Answers(root / "db", self.blobs, self.uploads)
         self._answered: queue.Queue[Message | None] = queue.Queue()
 
     def page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Any:
@@ -40,8 +43,8 @@ class Desk:
     def results(self, cursor: int, upto: int | None) -> Any:
         return self.page(ReadResults(request=1, run="r-1", submit_index=0, cursor=cursor, upto=upto))
 
-    def put(self, message: BlobPut, most: int = 1 << 20) -> Any:
-        self.answers.put("sender", message, most, self._answered.put)
+    def put(self, message: BlobPut, most: int = 1 << 20, run: str | None = None) -> Any:
+        self.answers.put(f"gw/{run}" if run else "sender", run, message, most, self._answered.put)
         return self._answered.get(timeout=10)
 
     def get(self, run: str | None, digest: str, offset: int = 0) -> Any:
@@ -138,6 +141,38 @@ def test_upload_given_up_halfway_is_forgotten_at_the_next_start_and_begun_again(
     desk.blobs.drop_unfinished()
     assert desk.put(put(data, offset=50, data=data[50:])) == BlobAck(have=0)
     assert desk.put(put(data)) == BlobAck(have=len(data))
+
+
+def test_a_gateway_is_not_told_whether_others_have_stored_a_blob(desk: Desk) -> None:
+    data = b"another run's bundle"
+    digest, size, half = blob(data).digest, len(data), len(data) // 2
+    unknown = put(b"x" * size, data=b"x")
+    desk.blobs.put(data)
+    # Asked about a blob that is here exactly as about one that is not.
+    for guess in ({"data": b""}, {"offset": 3, "data": b""}, {"offset": size, "data": b""}):
+        told = desk.put(put(data, **guess), run="r-1")
+        assert told == desk.put(msgspec.structs.replace(unknown, **guess), run="r-1") == BlobAck(have=0)
+    for claim in ({"size": 0, "data": b""}, {"size": 4, "data": b"fake"}):
+        assert desk.put(put(data, **claim), run="r-1").status == "bad_blob"
+        assert not desk.uploads.has_sent("r-1", digest)
+    assert desk.put(put(data, data=data[:half]), run="r-1") == BlobAck(have=half)
+    assert desk.put(put(data, size=half, offset=3, data=b""), run="r-1") == BlobAck(have=half)
+    assert not desk.uploads.has_sent("r-1", digest)
+    assert desk.put(put(data, offset=half, data=data[half:]), run="r-1") == BlobAck(have=size)
+    assert desk.uploads.has_sent("r-1", digest)
+    assert not desk.uploads.has_sent("r-2", digest)
+    # What it has sent once it need not send again.
+    assert desk.put(put(data, data=b""), run="r-1") == BlobAck(have=size)
+
+
+def test_what_a_run_has_sent_is_remembered_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads_module, "MAX_RUNS", 2)
+    monkeypatch.setattr(uploads_module, "MAX_OF_A_RUN", 2)
+    uploads = Uploads()
+    for run, digest in (("a", "1"), ("a", "2"), ("a", "1"), ("a", "3"), ("b", "1"), ("a", "3"), ("c", "1")):
+        uploads.note(run, digest)
+    kept = {(run, digest) for run in "abc" for digest in "123" if uploads.has_sent(run, digest)}
+    assert kept == {("a", "1"), ("a", "3"), ("c", "1")}
 
 
 @pytest.mark.parametrize(

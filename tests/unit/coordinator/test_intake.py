@@ -22,6 +22,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.intake import Intake
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import ROLES, Identity
+from evopolicy_coordinator.uploads import Uploads
 
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
@@ -41,13 +42,22 @@ def blobs(tmp_path: Path) -> BlobStore:
 
 
 @pytest.fixture
-def intake(blobs: BlobStore) -> Intake:
-    return make_intake(blobs)
+def uploads() -> Uploads:
+    return Uploads()
 
 
-def make_intake(blobs: BlobStore) -> Intake:
+@pytest.fixture
+def intake(blobs: BlobStore, uploads: Uploads) -> Intake:
+    return make_intake(blobs, uploads)
+
+
+def make_intake(blobs: BlobStore, uploads: Uploads | None = None) -> Intake:
     source = SplitSource(data=None, secret=b"s" * 32)
-    return Intake(IDENTITY, blobs, source, allowed_imports=("numpy",), denied_imports=("gymnasium",))
+    return Intake(
+        *(IDENTITY, blobs, source, uploads or Uploads()),
+        allowed_imports=("numpy",),
+        denied_imports=("gymnasium",),
+    )
 
 
 def event(intake: Intake, key: str, message: Message) -> Any:
@@ -141,13 +151,17 @@ def test_evaluation_plays_the_cases_named(intake: Intake) -> None:
 
 
 def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
-    intake: Intake, blobs: BlobStore
+    intake: Intake, blobs: BlobStore, uploads: Uploads
 ) -> None:
     failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
     assert event(intake, SUBMIT, submit(bundle_error=failure)).bundle_error == failure
     assert refused(intake, SUBMIT, submit(bundle="a" * 64)).status == "missing_bundle"
     assert refused(intake, SUBMIT, submit(bundle="../../identity.json")).status == "missing_bundle"
     stored = blobs.put(b"bundle")
+    # Stored by another run, it is as if it were not here.
+    uploads.note("another", stored)
+    assert refused(intake, SUBMIT, submit(bundle=stored)).status == "missing_bundle"
+    uploads.note("r", stored)
     assert event(intake, SUBMIT, submit(bundle=stored)).bundle == stored
     assert refused(intake, SUBMIT, submit()).status == "bad_message"
     assert refused(intake, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"

@@ -26,6 +26,7 @@ from evopolicy_coordinator.service import Service
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import ROLES, Identity
 from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.uploads import Uploads
 
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
@@ -71,9 +72,10 @@ class World:
         self.root = root
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
-        self.answers = Answers(root / "db", self.blobs)
+        self.uploads = Uploads()
+        self.answers = Answers(root / "db", self.blobs, self.uploads)
         source = SplitSource(data=None, secret=b"s" * 32)
-        intake = Intake(IDENTITY, self.blobs, source, allowed_imports=(), denied_imports=())
+        intake = Intake(IDENTITY, self.blobs, source, self.uploads, allowed_imports=(), denied_imports=())
         self.service = Service("c", self.store, self.answers, intake, CoreSettings())
         self.writes = 0
         self.full = False
@@ -302,12 +304,14 @@ def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease
         request = worker.LeaseRequest(worker="w", session=session, n=1, wait_s=10.0)
         stale, fresh = (Asked(keys.worker_key("c", "lease"), request) for _ in range(2))
         stale.arrived -= 12.0
+        bundle = world.blobs.put(b"a bundle")
+        world.uploads.note(created.run, bundle)
         submit = gateway.Submit(
             run=created.run,
             token=created.capability,
             key="k",
             env_instances=(0,),
-            bundle=world.blobs.put(b"a bundle"),
+            bundle=bundle,
             bundle_error=None,
         )
         world.ask(Asked(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
