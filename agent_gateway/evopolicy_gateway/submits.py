@@ -320,7 +320,9 @@ class Desk:
                 status, summary = await self._write_feedback(ticket)
                 break
             except (OSError, StorageError) as error:
-                ticket.waits_for = f"the gateway cannot write feedback: {error}"
+                # Not the error itself, which names paths: an agent reads this.
+                why = error.strerror if isinstance(error, OSError) else None
+                ticket.waits_for = f"the gateway cannot write feedback: {why or 'its disk refuses'}"
                 log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
                 self._on_change()
                 await asyncio.sleep(DISK_PAUSE_S)

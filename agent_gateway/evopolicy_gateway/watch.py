@@ -50,7 +50,7 @@ class Lines:
         self._seen: dict[str, tuple[object, ...]] = {}
 
     def note(self, run: str, text: str) -> None:
-        self._console.print(f"{run}: {text}", markup=False, highlight=False, soft_wrap=True)
+        self._console.print(harmless(f"{run}: {text}"), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, run: str, progress: Progress) -> None:
         if progress.last_submit_id is not None and self._changed(f"{run} submit", progress.last_submit_id):
@@ -64,11 +64,11 @@ class Lines:
             self.note(run, f"waiting for {progress.waits_for}")
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        self.note(run, f"turn {turn}: {_first_line(text)}")
+        self.note(run, f"turn {turn}: {first_line(text)}")
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         if doing.paused_s:
-            self.note(run, f"{_first_line(doing.action)} (for {doing.paused_s:.0f} s)")
+            self.note(run, f"{first_line(doing.action)} (for {doing.paused_s:.0f} s)")
 
     def phase(self, run: str, progress: RunProgress) -> None:
         if self._changed(f"{run} phase", progress.phase) and progress.phase != "finished":
@@ -96,7 +96,7 @@ class LiveTable:
 
     def note(self, run: str, text: str) -> None:
         self._row(run)
-        self._console.print(f"{run}: {text}", markup=False, highlight=False)
+        self._console.print(harmless(f"{run}: {text}"), markup=False, highlight=False)
 
     def progress(self, run: str, progress: Progress) -> None:
         row = self._row(run)
@@ -108,11 +108,11 @@ class LiveTable:
         row.progress = progress
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        self._row(run).said = _first_line(text)
+        self._row(run).said = first_line(text)
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         if doing.action:
-            self._row(run).said = _first_line(doing.action)
+            self._row(run).said = first_line(doing.action)
 
     def phase(self, run: str, progress: RunProgress) -> None:
         self._row(run).phase = progress
@@ -179,5 +179,13 @@ def _bar(part: int, whole: int, width: int = 12) -> str:
     return "━" * filled + "╌" * (width - filled)
 
 
-def _first_line(text: str) -> str:
-    return (text.strip().splitlines() or [""])[0][:120]
+def first_line(text: str) -> str:
+    """The start of a text's first line, harmless."""
+    return harmless((text.strip().splitlines() or [""])[0][:120])
+
+
+def harmless(text: str) -> str:
+    """Without what steers a terminal: an agent's words must not clear the operator's screen, nor write over what it says."""
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else "\N{REPLACEMENT CHARACTER}" for letter in text
+    )

@@ -7,6 +7,7 @@ files only; unpacking accepts plain relative paths only.
 
 from __future__ import annotations
 
+import itertools
 import os
 import stat
 from pathlib import Path, PurePosixPath
@@ -17,6 +18,8 @@ from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import BundleError
 
 MAX_FILES = 2000
+MAX_ENTRIES = 5000
+"""Files and folders that are looked at, those that are left out too: empty folders without end would hold up a snapshot."""
 MAX_BYTES = 64 << 20
 """Sum of the files' sizes, bytes."""
 MAX_DEPTH = 16
@@ -104,12 +107,16 @@ class _Reader:
     def __init__(self) -> None:
         self.files: list[BundleFile] = []
         self._left = MAX_BYTES
+        self._entries_left = MAX_ENTRIES
 
     def collect(self, fd: int, base: PurePosixPath) -> None:
         if len(base.parts) > MAX_DEPTH:
             raise BundleError(f"{base}: folders nest deeper than {MAX_DEPTH}; flatten them")
         with os.scandir(fd) as entries:
-            names = sorted(entry.name for entry in entries)
+            names = sorted(entry.name for entry in itertools.islice(entries, self._entries_left + 1))
+        self._entries_left -= len(names)
+        if self._entries_left < 0:
+            raise BundleError(f"system/ holds more than {MAX_ENTRIES} files and folders; remove some")
         for name in names:
             path = base / name
             _check_path(_text(path))

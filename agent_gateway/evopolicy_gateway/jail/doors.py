@@ -116,10 +116,9 @@ class _UnreachableError(OSError):
 
 
 async def _refuse(writer: asyncio.StreamWriter, status: str, why: str) -> None:
-    body = f"{why}\n"
-    writer.write(
-        f"HTTP/1.1 {status}\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
-    )
+    body = f"{why}\n".encode()
+    head = f"HTTP/1.1 {status}\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+    writer.write(head.encode() + body)
     await writer.drain()
 
 

@@ -19,7 +19,7 @@ from rich.text import Text
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
-from evopolicy_gateway.watch import PHASES
+from evopolicy_gateway.watch import PHASES, first_line, harmless
 
 _SHOWN_ROWS = 24
 
@@ -78,6 +78,10 @@ class SuiteView:
             self._said[f"{name} host"] = host
             self.event("elsewhere", name, host=host)
 
+    def waits(self, name: str) -> None:
+        """It was ended here, and may go on."""
+        self.rows[name].state, self.rows[name].action = "waiting", ""
+
     def say(self, text: str) -> None:
         """Something about the sweep as a whole."""
         self.event("note", "", text=text)
@@ -103,12 +107,12 @@ class SuiteView:
             )
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        self.rows[run].action = _line(text)
-        self.event("turn", run, turn=turn, text=_line(text))
+        self.rows[run].action = first_line(text)
+        self.event("turn", run, turn=turn, text=first_line(text))
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         row = self.rows[run]
-        row.action = _line(doing.action) or row.action
+        row.action = first_line(doing.action) or row.action
         row.tokens = doing.tokens or row.tokens
         self.on_doing(run, doing)
         if doing.paused_s:
@@ -117,7 +121,7 @@ class SuiteView:
                 run,
                 provider=doing.provider,
                 seconds=round(doing.paused_s),
-                why=_line(doing.action),
+                why=first_line(doing.action),
             )
 
     def phase(self, run: str, progress: RunProgress) -> None:
@@ -183,7 +187,7 @@ class LinesView(SuiteView):
             self._print(self.totals())
 
     def _print(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(harmless(text), markup=False, highlight=False, soft_wrap=True)
 
 
 class TableView(LinesView):
@@ -316,7 +320,3 @@ def _duration(seconds: float) -> str:
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
-
-
-def _line(text: str) -> str:
-    return (text.strip().splitlines() or [""])[0][:120]

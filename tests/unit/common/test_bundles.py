@@ -96,6 +96,22 @@ def test_thousands_of_files_are_refused(tmp_path: Path) -> None:
         bundles.snapshot(folder)
 
 
+def test_thousands_of_empty_folders_and_of_left_out_files_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundles, "MAX_ENTRIES", 20)
+    many = make(tmp_path / "many", {f"f{i}.pyc": b"" for i in range(21)})
+    nested = make(tmp_path / "nested", {"policy.py": b"a"})
+    for i in range(7):
+        (nested / f"d{i}" / "e" / "f").mkdir(parents=True)
+    for folder in (many, nested):
+        with pytest.raises(BundleError, match="more than 20"):
+            bundles.snapshot(folder)
+    (nested / "d0" / "e" / "f").rmdir()
+    (nested / "d1" / "e" / "f").rmdir()
+    assert len(bundles.snapshot(nested).files) == 1
+
+
 def test_deep_nesting_is_refused(tmp_path: Path) -> None:
     folder = make(tmp_path / "s", {"/".join(["d"] * (bundles.MAX_DEPTH + 2)) + "/f": b""})
     with pytest.raises(BundleError, match="nest"):

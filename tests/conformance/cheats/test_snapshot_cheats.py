@@ -1,0 +1,62 @@
+"""An agent that swaps what is snapshot, while it is: no submit ever holds what the agent could not read itself."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from cheated import SECRET, Cheated
+
+from evopolicy_common.run_record import decode_run_record
+
+AGENT = Path(__file__).parent / "swapping_agent.py"
+N_RACES = 8
+REFUSED = (
+    ("missing_policy", "policy.py is a symbolic link"),
+    ("import_error", "deep is a symbolic link"),
+    ("missing_policy", "system/ is not a folder"),
+    ("import_error", "loop is a symbolic link"),
+    ("import_error", "is a hard link"),
+    ("import_error", "pipe is a named pipe"),
+    ("import_error", "more than 5000 files and folders"),
+)
+
+
+class Swapped:
+    def __init__(self, cheated: Cheated, *options: str) -> None:
+        name = "swapped" + "".join(options)
+        self.code, self.said, self.folder = cheated.play(
+            f"command:{sys.executable} {AGENT}", name, "--budget", "20", *options
+        )
+        assert self.code == 0, self.said
+        report = (self.folder / "workspace" / "report.json").read_text()
+        self.told: list[tuple[str, str]] = [tuple(each) for each in json.loads(report)]
+
+
+@pytest.fixture(scope="module", params=[(), ("--jail", "none")], ids=["jailed", "unjailed"])
+def swapped(request: pytest.FixtureRequest, cheated: Cheated) -> Swapped:
+    return Swapped(cheated, *request.param)
+
+
+def test_no_submit_holds_what_its_agent_has_not_written(swapped: Swapped) -> None:
+    first = swapped.folder / "checkpoints" / "submit_000" / "system" / "policy.py"
+    written = {first.read_bytes(), b"# mine\n"}
+    taken = [path for path in (swapped.folder / "checkpoints").glob("*/system/**/*") if not path.is_dir()]
+    assert {path.read_bytes() for path in taken} == written
+    assert not any(path.is_symlink() for path in taken)
+    for path in (swapped.folder / "workspace" / "feedback").rglob("*"):
+        assert path.is_dir() or SECRET.encode() not in path.read_bytes(), path
+
+
+def test_what_is_a_link_a_pipe_or_too_much_is_charged_and_named(swapped: Swapped) -> None:
+    honest, raced, spoiled = swapped.told[0], swapped.told[1 : 1 + N_RACES], swapped.told[1 + N_RACES : -1]
+    assert honest[0] == swapped.told[-1][0] == "ok"
+    assert {status for status, _ in raced} <= {"ok", "missing_policy", "import_error"}
+    assert [status for status, _ in spoiled] == [status for status, _ in REFUSED]
+    for (_, told), (_, named) in zip(spoiled, REFUSED, strict=True):
+        assert named in told
+        assert str(swapped.folder) not in told
+    record = decode_run_record((swapped.folder / "run.json").read_bytes())
+    assert (record.outcome.status, record.outcome.budget_used) == ("completed", len(swapped.told))
