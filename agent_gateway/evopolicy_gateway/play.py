@@ -159,6 +159,11 @@ class RunPlay:
         self._keeper: Child | None = None
         self.last: Progress | None = None
 
+    @property
+    def agent_at_work(self) -> bool:
+        """The agent's side is open and nobody has asked to close it."""
+        return self._keeper is not None and self._order is None and not self._closed.is_set()
+
     async def play(self) -> RunRecord:
         """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
         plan = self._plan

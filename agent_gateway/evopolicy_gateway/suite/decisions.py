@@ -8,8 +8,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import msgspec
 
@@ -20,6 +20,7 @@ from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 Kind = Literal["keep", "new", "resume", "finish", "restart"]
 Changed = Literal["refuse", "keep", "rerun"]
 
+_SHOWN_CHANGES = 4
 _WORDS: dict[Kind, str] = {
     "keep": "kept",
     "new": "new",
@@ -51,13 +52,8 @@ class Decision(msgspec.Struct, frozen=True, kw_only=True):
     kind: Kind
     attempt: int
     why: str = ""
-
-    @property
-    def changed(self) -> bool:
-        return self.why == CHANGED
-
-
-CHANGED = "the file has other settings for it now"
+    changed: bool = False
+    """The file has other settings for it than it was played with."""
 
 
 def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision:
@@ -66,10 +62,13 @@ def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision
     attempt = 1 if entry is None else entry.attempt
     exists = found.status is not None or found.opened or (entry is not None and entry.state != "pending")
     differs = entry is not None and exists and entry.digest != run.digest
+    how = "" if entry is None or not differs else _changed(entry.settings, run.defining)
     if differs and changed != "keep":
-        return Decision(run=run, kind="restart", attempt=attempt + 1, why=CHANGED)
-    if found.status in FINISHED or (entry is not None and entry.state in FINISHED and not found.opened):
-        return Decision(run=run, kind="keep", attempt=attempt, why=CHANGED if differs else "")
+        return Decision(run=run, kind="restart", attempt=attempt + 1, why=how, changed=True)
+    settled = entry is not None and entry.state in FINISHED
+    elsewhere = entry is not None and not entry.directory
+    if found.status in FINISHED or (settled and (elsewhere or not found.opened)):
+        return Decision(run=run, kind="keep", attempt=attempt, why=how, changed=differs)
     if found.status is not None:
         why = (entry.error if entry is not None else None) or "it ended in an error"
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
@@ -86,6 +85,30 @@ def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision
         return Decision(run=run, kind="resume", attempt=attempt)
     why = "its agent keeps no session that could be continued"
     return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
+
+
+def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    said = "the file has other settings for it now"
+    if not before:
+        return said
+    old, new = dict(_leaves("", before)), dict(_leaves("", msgspec.to_builtins(now)))
+    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    told = [f"{name} is {_told(new.get(name))}, was {_told(old.get(name))}" for name in names]
+    shown = ", ".join(told[:_SHOWN_CHANGES])
+    return f"{said}: {shown}" + (f" and {len(told) - _SHOWN_CHANGES} more" if told[_SHOWN_CHANGES:] else "")
+
+
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Settings by their dotted names, as the suite's file has them."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(name if path in ("", "settings") else f"{path}.{name}", inner)
+    else:
+        yield path, value
+
+
+def _told(value: Any) -> str:
+    return "not set" if value is None else msgspec.json.encode(value).decode()
 
 
 def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:

@@ -142,6 +142,8 @@ async def _suite(order: Order) -> int:
     entries = [index.runs[name] for name in names if name in index.runs]
     if not order.as_json:
         console.print(results_table(entries))
+        if (told := suite_index.told(index)) is not None:
+            console.print(told, markup=False)
         console.print(f"index: {order.root / suite_index.FILE_NAME}", markup=False, soft_wrap=True)
     states = {entry.state for entry in entries}
     if len(entries) < len(names) or not states <= FINISHED:
@@ -169,8 +171,10 @@ def _keep(order: Order, index: Index, decision: Decision) -> None:
     entry = index.runs.get(run.name)
     if folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
         record = decode_run_record(folder.run_json.read_bytes())
-        digest = entry.digest if entry is not None else run.digest
-        index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, digest=digest)
+        known = {"digest": run.digest, "settings": msgspec.to_builtins(run.defining)}
+        if entry is not None:
+            known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}
+        index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, **known)
 
 
 @contextlib.contextmanager

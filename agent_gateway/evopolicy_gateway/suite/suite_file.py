@@ -10,7 +10,7 @@ import fnmatch
 import hashlib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -28,6 +28,10 @@ from evopolicy_gateway.layout import RunFolder, run_folder
 
 Positive = Annotated[int, Meta(ge=1)]
 WALL_S = 12 * 3600.0
+_OPERATIONAL = frozenset(
+    ("retries", "backoff_s", "silence_s", "pause_s", "max_pause_s", "pass_environment", "prices")
+)
+"""Settings of a coding agent that change nothing of what a run measures."""
 
 
 class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -87,7 +91,7 @@ class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What all runs of this host may use together; once it is used, no further run is begun."""
+    """What all runs of this host may use together; once it is used no further run is begun, and coding agents are stopped."""
 
     max_tokens: Positive | None = None
     max_cost: Annotated[float, Meta(gt=0)] | None = None
@@ -126,24 +130,26 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
     jail: JailSettings = JailSettings()
 
     @property
-    def digest(self) -> str:
-        """Of everything that defines the run; the attempt and operational settings do not."""
-        operational = {
-            "retries",
-            "backoff_s",
-            "silence_s",
-            "pause_s",
-            "max_pause_s",
-            "pass_environment",
-            "prices",
-        }
+    def defining(self) -> dict[str, Any]:
+        """Everything that makes it this run and no other; the attempt and operational settings do not."""
         config = None if self.config is None else msgspec.to_builtins(self.config)
         if config is not None:
-            config = {name: value for name, value in config.items() if name not in operational}
+            config = {name: value for name, value in config.items() if name not in _OPERATIONAL}
         settings = msgspec.to_builtins(msgspec.structs.replace(self.settings, attempt=1))
         del settings["replays"]  # recorded once all is over, it changes nothing of the run
-        whole = [self.harness, config, settings, self.wall_s]
-        return hashlib.sha256(msgspec.json.encode(whole, order="sorted")).hexdigest()[:16]
+        found = {"agent": self.harness, "config": config, "settings": settings, "agent_wall_s": self.wall_s}
+        # What a jail shows (`read`) is where programs lie, which differs from host to host.
+        reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
+        if reached or self.jail.mode != JailSettings().mode:
+            found["jail"] = {"mode": self.jail.mode, **reached}
+        return found
+
+    @property
+    def digest(self) -> str:
+        """Of all that defines it."""
+        return hashlib.sha256(msgspec.json.encode(list(self.defining.values()), order="sorted")).hexdigest()[
+            :16
+        ]
 
     def folder(self, root: Path) -> RunFolder:
         return run_folder(root, self.settings.entry, self.settings.env, self.settings.exp_id)

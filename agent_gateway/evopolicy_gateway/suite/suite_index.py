@@ -35,6 +35,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     repeat: int
     digest: str
     """Of the settings that it is or was played with."""
+    settings: dict[str, Any] = {}
+    """Those settings."""
     state: State = "pending"
     attempt: int = 1
     directory: str = ""
@@ -47,6 +49,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     n_submits: int = 0
     budget_used: int = 0
     tokens: dict[str, Any] | None = None
+    earlier: dict[str, Any] | None = None
+    """Tokens of the attempts before this one."""
     error: str | None = None
     wall_s: float = 0.0
     finished_at: str = ""
@@ -113,3 +117,25 @@ def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path
         finished_at=record.timing.finished_at,
         **more,
     )
+
+
+def used(index: Index) -> tuple[int, float]:
+    """Tokens and dollars of all runs, with their earlier attempts."""
+    kinds = ("input_noncached", "cache_read", "cache_creation", "output")
+    told = [one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None]
+    return sum(int(one.get(kind, 0)) for one in told for kind in kinds), sum(
+        float(one.get("cost") or 0.0) for one in told
+    )
+
+
+def added(one: dict[str, Any] | None, other: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Tokens of both."""
+    if one is None or other is None:
+        return one or other
+    return {name: (one.get(name) or 0) + (other.get(name) or 0) for name in {**one, **other}}
+
+
+def told(index: Index) -> str | None:
+    """What all runs have used, in a line; None for nothing."""
+    tokens, cost = used(index)
+    return f"used in all: {tokens:,} tokens" + (f", {cost:.2f} dollars" if cost else "") if tokens else None

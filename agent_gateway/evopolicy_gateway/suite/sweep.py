@@ -6,6 +6,7 @@ Rules:
 - Cancelled, it leaves runs open and gives no claim back: the same host goes on with them, and another takes them over
   once their time is up.
 - A provider that is away holds back further runs with it; those that go on wait by themselves.
+- A cap that is used up holds back all further runs, and leaves those of coding agents open as a cancelled sweep does.
 """
 
 from __future__ import annotations
@@ -70,6 +71,9 @@ class Sweep:
         self._plays: dict[str, RunPlay] = {}
         self._not_before: dict[str, float] = {}
         self._paused_until: dict[str, float] = {}
+        self._ending: set[str] = set()
+        """Runs that have been cancelled and are not done with it."""
+        self._saved = 0.0
         view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
@@ -80,11 +84,12 @@ class Sweep:
         try:
             while todo or self._active:
                 for decision in self._startable(todo, by_name):
-                    if await self._begin(decision):
+                    if await self._begin(decision, by_name):
                         todo.remove(decision)
+                self._stop_at_the_cap(by_name)
                 waiting = list(self._active.values())
-                if not waiting and todo and self._used_up() is not None:
-                    self._view.say(f"{len(todo)} runs are not begun: {self._used_up()}")
+                if not waiting and todo and (why := self._used_up()) is not None:
+                    self._view.say(f"{len(todo)} runs are left as they are: {why}")
                     return
                 if waiting:
                     await asyncio.wait(waiting, timeout=_LOOK_S, return_when=asyncio.FIRST_COMPLETED)
@@ -93,9 +98,11 @@ class Sweep:
                 for name, task in list(self._active.items()):
                     if task.done():
                         del self._active[name]
+                        self._ending.discard(name)
                         if task.cancelled():
-                            # Another host has it: its result is asked for in time.
+                            # Another host has it, whose result is asked for in time; or a cap is used up.
                             self._not_before[name] = time.monotonic() + _ASK_AGAIN_S
+                            self._view.waits(name)
                             todo.append(by_name[name])
                         else:
                             task.result()
@@ -131,7 +138,22 @@ class Sweep:
             active.append(run)
         return found
 
-    async def _begin(self, decision: Decision) -> bool:
+    def _stop_at_the_cap(self, by_name: dict[str, Decision]) -> None:
+        """Interrupts what still uses tokens once a cap of the sweep is used up."""
+        why = self._used_up()
+        for name, task in self._active.items() if why is not None else ():
+            play = self._plays.get(name)
+            if by_name[name].run.config is not None and play is not None and play.agent_at_work:
+                self._end(name, task, f"interrupted: {why}; it goes on where it was once the cap is raised")
+
+    def _end(self, name: str, task: asyncio.Task[None], why: str) -> None:
+        """Ends a run here and leaves it open; once, as a second time would break the ending off."""
+        if name not in self._ending:
+            self._ending.add(name)
+            self._view.note(name, why)
+            task.cancel()
+
+    async def _begin(self, decision: Decision, by_name: dict[str, Decision]) -> bool:
         """Claims the run and starts it; False when another host has it at the moment."""
         run = decision.run
         claim = await self._ask(run)
@@ -144,9 +166,11 @@ class Sweep:
             self._not_before[run.name] = time.monotonic() + _ASK_AGAIN_S
             self._view.elsewhere(run.name, claim.holder.partition(":")[0])
             return False
-        if claim.previous and claim.run:
+        if claim.previous:
             self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
-            await self._forget(claim.run)
+            if claim.run:
+                await self._forget(claim.run)
+            decision = by_name[run.name] = _anew(decision)
         self._active[run.name] = asyncio.create_task(self._play(decision))
         return True
 
@@ -163,6 +187,8 @@ class Sweep:
             attempt=decision.attempt,
             directory=str(folder.root.relative_to(self._root)),
             host=self._host,
+            settings=msgspec.to_builtins(run.defining),
+            **self._used_before(run.name, decision),
         )
         self._put(entry)
         self._view.started(run.name, decision.attempt)
@@ -178,9 +204,12 @@ class Sweep:
                 digest=run.digest,
                 host=self._host,
                 run=self._run_of(run),
+                settings=entry.settings,
+                earlier=entry.earlier,
             )
         except EvopolicyError as error:
-            done = msgspec.structs.replace(entry, state="error", error=str(error))
+            known = self._index.runs[run.name].tokens
+            done = msgspec.structs.replace(entry, state="error", error=str(error), tokens=known)
         finally:
             self._plays.pop(run.name, None)
         self._put(done)
@@ -214,15 +243,24 @@ class Sweep:
         return await (play.resume() if decision.kind in ("resume", "finish") else play.play())
 
     async def _renew(self, by_name: dict[str, Decision]) -> None:
-        """Keeps the claims of what goes on here."""
+        """Keeps the claims of what goes on here, and tells soon which run of the cluster is played for each."""
+        every_s = self._suite.parallel.claim_ttl_s / 4
+        told: dict[str, tuple[str, float]] = {}
         while True:
-            await asyncio.sleep(self._suite.parallel.claim_ttl_s / 4)
+            await asyncio.sleep(min(_LOOK_S, every_s))
             for name, task in list(self._active.items()):
+                run = by_name[name].run
+                known, at = told.get(name, ("", 0.0))
+                fresh = self._run_of(run) == known and time.monotonic() - at < every_s
+                if fresh or name in self._ending:
+                    continue
                 with contextlib.suppress(EvopolicyError):
-                    claim = await self._ask(by_name[name].run)
-                    if not claim.granted and claim.result is None and not task.done():
-                        self._view.note(name, f"another host has it now ({claim.holder}): ended here")
-                        task.cancel()
+                    told[name] = (self._run_of(run), time.monotonic())
+                    claim = await self._ask(run)
+                    if not claim.granted and claim.holder != self._holder and not task.done():
+                        # That host has ended our run at the cluster.
+                        by_name[name] = _anew(by_name[name])
+                        self._end(name, task, f"another host has it now ({claim.holder}): ended here")
 
     async def _ask(
         self, run: SuiteRun, ttl_s: float | None = None, result: dict[str, Any] | None = None
@@ -261,17 +299,27 @@ class Sweep:
         play = self._plays.get(run.name)
         return "" if play is None else play.run
 
+    def _used_before(self, name: str, decision: Decision) -> dict[str, Any]:
+        """What a run that is gone on with, or the attempts before it, have used."""
+        entry = self._index.runs.get(name)
+        if entry is None:
+            return {}
+        if decision.kind in ("resume", "finish"):
+            return {"tokens": entry.tokens, "earlier": entry.earlier}
+        return {"earlier": suite_index.added(entry.earlier, entry.tokens)}
+
     def _on_doing(self, name: str, doing: AgentDoing) -> None:
         entry = self._index.runs.get(name)
         if entry is not None and doing.tokens is not None:
-            # Written with the next change: a sweep's cap reads it from memory.
             self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
+            if time.monotonic() - self._saved >= _LOOK_S:
+                self._save()
         if doing.provider:
             self._paused_until[doing.provider] = time.monotonic() + doing.paused_s
 
     def _used_up(self) -> str | None:
         caps = self._suite.caps
-        tokens, cost = used(self._index)
+        tokens, cost = suite_index.used(self._index)
         if caps.max_tokens is not None and tokens >= caps.max_tokens:
             return f"{tokens} of {caps.max_tokens} tokens are used"
         if caps.max_cost is not None and cost >= caps.max_cost:
@@ -280,16 +328,16 @@ class Sweep:
 
     def _put(self, entry: Entry) -> None:
         self._index.runs[entry.name] = entry
+        self._save()
+
+    def _save(self) -> None:
         suite_index.save(self._root, self._index)
+        self._saved = time.monotonic()
 
 
-def used(index: Index) -> tuple[int, float]:
-    """Tokens and dollars of all runs."""
-    kinds = ("input_noncached", "cache_read", "cache_creation", "output")
-    told = [entry.tokens for entry in index.runs.values() if entry.tokens is not None]
-    return sum(int(one.get(kind, 0)) for one in told for kind in kinds), sum(
-        float(one.get("cost") or 0.0) for one in told
-    )
+def _anew(decision: Decision) -> Decision:
+    """What becomes of a run that another host has had meanwhile."""
+    return msgspec.structs.replace(decision, kind="restart", attempt=decision.attempt + 1)
 
 
 async def look(run: SuiteRun, root: Path, started_in: Path, index: Index, operations: Operations) -> Found:

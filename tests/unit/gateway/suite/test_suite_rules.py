@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import msgspec
 import pytest
 from rich.console import Console
 
@@ -14,9 +15,8 @@ from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Found, check_changes, decide, told
 from evopolicy_gateway.suite.suite_file import SuiteRun, expand, read
-from evopolicy_gateway.suite.suite_index import Entry, Index
+from evopolicy_gateway.suite.suite_index import Entry, Index, used
 from evopolicy_gateway.suite.suite_view import TableView
-from evopolicy_gateway.suite.sweep import used
 
 FILE = """
 name = "s"
@@ -40,6 +40,9 @@ agents = ["GPT"]
 repeats = 1
 heldout = 4
 """
+
+
+JAIL = '[agents.jail]\nhosts = ["h"]\n'
 
 
 def suite_in(tmp_path: Path, text: str = FILE) -> list[SuiteRun]:
@@ -134,6 +137,7 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
         (Found(status="completed", entry=entry(run, state="completed")), "keep", 1),
         (Found(status="no_ok_submit"), "keep", 1),
         (Found(entry=entry(run, state="completed", host="other")), "keep", 1),
+        (Found(entry=entry(run, state="completed", host="other"), opened=True, phase="finished"), "keep", 1),
         (Found(status="error", entry=entry(run, state="error", attempt=2)), "restart", 3),
         (Found(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
         (Found(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
@@ -160,6 +164,39 @@ def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     assert lines[0] == "1 runs: 1 begun again as a new attempt"
     assert "the file has other settings" in lines[1]
     assert "no longer in the file" in lines[2]
+
+
+def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
+    before = {run.name: run for run in suite_in(tmp_path)}
+    text = FILE.replace("budget = 16", "budget = 32\nvalidation = 4\nlimits = { act_wall_s = 2.0 }")
+    text = text.replace('"gpt-5.5"', '"gpt-6"\neffort = "high"').replace(
+        "[agents.run]", JAIL + "[agents.run]"
+    )
+    for run in suite_in(tmp_path, text):
+        was = before[run.name]
+        known = entry(was, state="completed", settings=msgspec.to_builtins(was.defining))
+        decision = decide(run, Found(status="completed", entry=known), "rerun")
+        if run.agent == "evolve":
+            assert decision.kind == "keep"
+            continue
+        changes = decision.why.partition("now: ")[2]
+        assert changes.startswith(
+            'config.model is "gpt-6", was "gpt-5.5", config.effort is "high", was not set'
+        )
+        assert changes.endswith("budget is 32, was 16 and 4 more")
+    only_budget = suite_in(tmp_path, FILE.replace("budget = 16", "budget = 32"))[1]
+    known = entry(
+        was := before[only_budget.name], settings=msgspec.to_builtins(was.defining), state="completed"
+    )
+    why = decide(only_budget, Found(status="completed", entry=known), "keep").why
+    assert why == "the file has other settings for it now: budget is 32, was 16"
+
+
+def test_what_a_jail_lets_through_makes_another_run_and_where_programs_lie_does_not(tmp_path: Path) -> None:
+    before = suite_in(tmp_path)[1].digest
+    shown = FILE.replace("[agents.run]", '[agents.jail]\nread = ["/opt"]\n[agents.run]')
+    assert suite_in(tmp_path, shown)[1].digest == before
+    assert suite_in(tmp_path, FILE.replace("[agents.run]", JAIL + "[agents.run]"))[1].digest != before
 
 
 def test_the_index_is_another_sweeps_or_is_read_back(tmp_path: Path) -> None:

@@ -1,0 +1,359 @@
+"""A sweep's own rules, with runs and a cluster that are played here: limits, pauses, caps, claims, what was used."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from evopolicy_common.credentials import Credentials
+from evopolicy_common.messages.operator import ClaimState, RunFinished
+from evopolicy_common.run_record import RunRecord
+from evopolicy_gateway.control import AgentDoing
+from evopolicy_gateway.play import Plan
+from evopolicy_gateway.record import run_record
+from evopolicy_gateway.suite import suite_index, sweep
+from evopolicy_gateway.suite.decisions import Decision, Found, decide
+from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun, expand, read
+from evopolicy_gateway.suite.suite_index import Entry, Index
+from evopolicy_gateway.suite.suite_view import SuiteView
+
+PATIENCE_S = 30.0
+HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
+CODEX = '[[agents]]\nname = "{}"\n[agents.config]\nharness = "codex"\n'
+EVOLVE = '[[agents]]\nname = "{}"\nagent = "evolve"\n'
+TOKENS = {"input_noncached": 100, "cache_read": 20, "cache_creation": 0, "output": 30, "cost": 0.25}
+
+
+class Cluster:
+    """The part of `Operations` that a sweep uses itself. `answer`: what a claim is answered; granted as it stands."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, str, dict[str, Any] | None]] = []
+        """Run's name, the cluster's id of it, and its result, as claims told them."""
+        self.cancelled: list[str] = []
+        self.answer: Callable[[str], ClaimState | None] = lambda name: None
+
+    async def claim(
+        self, suite: str, name: str, holder: str, ttl_s: float, run: str, result: dict[str, Any] | None
+    ) -> ClaimState:
+        plain = name.partition("@")[0]
+        self.told.append((plain, run, result))
+        return self.answer(plain) or ClaimState(granted=True, holder=holder, run="")
+
+    async def cancel(self, run: str) -> None:
+        self.cancelled.append(run)
+
+
+class Stage:
+    """A sweep over runs that do what a test says."""
+
+    def __init__(self, root: Path, text: str, monkeypatch: pytest.MonkeyPatch, index: Index | None = None):
+        path = root / "s.toml"
+        path.write_text(text)
+        self.suite: SuiteFile = read(str(path))
+        self.runs: list[SuiteRun] = expand(self.suite, root)
+        self.root = root / "runs"
+        self.index = index or Index(suite="s")
+        self.cluster = Cluster()
+        self.view = SuiteView([run.name for run in self.runs], 2)
+        self.said: list[str] = []
+        self.view.event = lambda kind, run, **more: self.said.append(f"{kind} {run} {more}")  # type: ignore[method-assign]
+        self.begun: list[str] = []
+        self.going: set[str] = set()
+        self.most: set[frozenset[str]] = set()
+        """Every set of runs that went on together."""
+        self.attempts: dict[str, int] = {}
+        self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
+        stage = self
+
+        class Play:
+            """In place of `RunPlay`: the run is open at once, and does what the stage says."""
+
+            def __init__(
+                self,
+                plan: Plan,
+                operations: object,
+                gateway: object,
+                watch: object,
+                *,
+                name: str,
+                key: str,
+                stays_open: bool,
+            ) -> None:
+                self.plan, self.name, self.run, self.agent_at_work = plan, name, f"run of {name}", True
+                assert stays_open
+
+            async def play(self) -> RunRecord:
+                stage.begun.append(self.name)
+                stage.going.add(self.name)
+                stage.most.add(frozenset(stage.going))
+                stage.attempts[self.name] = self.plan.settings.attempt
+                try:
+                    await stage.act(self.name)
+                finally:
+                    stage.going.discard(self.name)
+                return run_record(self.plan, finished(self.plan), None, [], None, 0.0)
+
+            resume = play
+
+        monkeypatch.setattr(sweep, "RunPlay", Play)
+
+    def doing(self, name: str, **more: Any) -> None:
+        self.view.doing(name, AgentDoing(**more))
+
+    def play(self) -> Index:
+        """Plays the sweep; the index as it is on disk afterwards."""
+        played = sweep.Sweep(
+            self.suite,
+            self.root,
+            self.root.parent,
+            self.index,
+            self.cluster,  # type: ignore[arg-type]
+            Credentials(
+                role="gateway", endpoints=("tcp/h:1",), cluster="c", user="u", password="p", token="t"
+            ),
+            self.view,
+        )
+        decided = [decide(run, Found(entry=self.index.runs.get(run.name))) for run in self.runs]
+
+        async def main() -> None:
+            async with asyncio.timeout(PATIENCE_S):
+                await played.play(decided)
+
+        asyncio.run(main())
+        return suite_index.load(self.root, "s")
+
+
+def finished(plan: Plan) -> RunFinished:
+    return RunFinished(
+        run="r",
+        settings=plan.settings,
+        status="completed",
+        error=None,
+        close_reason="budget_spent",
+        agent={},
+        final_score=1.0,
+        best_submit_index=0,
+        val_scores={0: 1.0},
+        heldout_returns=(1.0,),
+        validation_ineligible={},
+        policy_failures={},
+        random_heldout_returns=(0.0,),
+        episode_budget=8,
+        budget_used=8,
+        split_hashes={},
+        split_secret=True,
+        env_version="1",
+        deterministic=True,
+        fingerprint=None,
+        created_at=1.0,
+        closed_at=2.0,
+        finished_at=3.0,
+        submits=(),
+        wall_s={},
+    )
+
+
+async def until(what: Callable[[], bool]) -> None:
+    while not what():
+        await asyncio.sleep(0.01)
+
+
+def test_limits_per_machine_agent_and_provider_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = "[defaults]\nrepeats = 3\n[parallel]\nmachine = 4\nagent = 2\nproviders = { openai = 1 }\n"
+    agents = (
+        CODEX.format("a") + CODEX.format("b") + EVOLVE.format("c") + EVOLVE.format("d") + "parallel = 1\n"
+    )
+    stage = Stage(tmp_path, HEAD + limits + agents, monkeypatch)
+    index = stage.play()
+    assert {entry.state for entry in index.runs.values()} == {"completed"}
+    assert len(stage.begun) == len(set(stage.begun)) == 12
+    together = [sorted(name[0] for name in names) for names in stage.most]
+    assert max(map(len, together)) == 4
+    assert max(sum(agent in "ab" for agent in one) for one in together) == 1
+    assert max(one.count("c") for one in together) == 2
+    assert max(one.count("d") for one in together) == 1
+
+
+def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agents = CODEX.format("a") + EVOLVE.format("c") + CODEX.format("b")
+    stage = Stage(tmp_path, HEAD + "[parallel]\nmachine = 2\n" + agents, monkeypatch)
+    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    seen: list[list[str]] = []
+
+    async def act(name: str) -> None:
+        if name.startswith("a"):
+            stage.doing(name, action="paused: usage limit", provider="openai", paused_s=3600.0)
+            await until(lambda: "c/toy/line/0" in stage.index.runs and not stage.going - {name})
+            await asyncio.sleep(0.1)
+            seen.append(list(stage.begun))
+            stage.doing(name, action="tries again", provider="openai")
+            await until(lambda: len(stage.begun) == 3)
+
+    stage.act = act
+    index = stage.play()
+    assert seen == [["a/toy/line/0", "c/toy/line/0"]]
+    assert index.runs["b/toy/line/0"].state == "completed"
+    assert any("paused a/toy/line/0" in said and "'seconds': 3600" in said for said in stage.said)
+
+
+@pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2"])
+def test_a_cap_of_the_sweep_leaves_coding_agents_open_and_begins_no_further_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str
+) -> None:
+    agents = CODEX.format("a") + EVOLVE.format("c") + EVOLVE.format("d")
+    stage = Stage(tmp_path, HEAD + f"[parallel]\nmachine = 2\n[caps]\n{cap}\n" + agents, monkeypatch)
+    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    ended: list[str] = []
+
+    async def act(name: str) -> None:
+        if name.startswith("a"):
+            stage.doing(name, action="$ ls", tokens=TOKENS)
+            try:
+                await asyncio.Event().wait()
+            finally:
+                # Ending takes its time, and is not broken off by being asked again.
+                await asyncio.sleep(0.1)
+                ended.append(name)
+        else:
+            await until(lambda: bool(ended))
+
+    stage.act = act
+    index = stage.play()
+    assert ended == ["a/toy/line/0"]
+    assert stage.begun == ["a/toy/line/0", "c/toy/line/0"]
+    assert (index.runs["a/toy/line/0"].state, index.runs["a/toy/line/0"].tokens) == ("running", TOKENS)
+    assert index.runs["c/toy/line/0"].state == "completed"
+    assert "d/toy/line/0" not in index.runs
+    assert len([said for said in stage.said if "interrupted: " in said]) == 1
+    assert "2 runs are left as they are" in stage.said[-1]
+
+
+def test_what_an_earlier_attempt_used_counts_towards_the_cap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = HEAD + "[caps]\nmax_cost = 0.7\n" + CODEX.format("a") + CODEX.format("b")
+    stage = Stage(tmp_path, text, monkeypatch)
+    a, b = stage.runs
+    for run in (a, b):
+        stage.index.runs[run.name] = Entry(
+            name=run.name,
+            agent=run.agent,
+            env=run.settings.env,
+            repeat=0,
+            digest=run.digest,
+            state="error",
+            tokens=TOKENS,
+        )
+
+    async def act(name: str) -> None:
+        if name == a.name:
+            stage.doing(name, tokens=TOKENS)
+            assert suite_index.used(stage.index)[1] == 0.75
+
+    stage.act = act
+    index = stage.play()
+    assert index.runs[a.name].earlier == TOKENS
+    assert index.runs[a.name].attempt == 2
+    assert suite_index.used(index)[0] >= 2 * 150
+
+
+def test_a_run_is_told_to_the_cluster_as_soon_as_it_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
+    stage = Stage(tmp_path, text, monkeypatch)
+    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    name = stage.runs[0].name
+
+    async def act(_: str) -> None:
+        # A host that dies before it has told cannot have its run ended by those that take over.
+        await until(lambda: (name, f"run of {name}", None) in stage.cluster.told)
+
+    stage.act = act
+    index = stage.play()
+    result = stage.cluster.told[-1][2]
+    assert result is not None
+    assert (result["run"], result["state"]) == (f"run of {name}", "completed")
+    assert index.runs[name].settings["settings"]["budget"] is None
+
+
+def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
+    run = stage.runs[0]
+    left = run.folder(stage.root).workspace
+    left.mkdir(parents=True)
+    answers = [ClaimState(granted=True, holder="me", run="r-7", previous="other:1")]
+    stage.cluster.answer = lambda _: answers.pop() if answers else None
+    index = stage.play()
+    assert stage.cluster.cancelled == ["r-7"]
+    assert stage.attempts == {run.name: 2}
+    assert index.runs[run.name].attempt == 2
+    assert (stage.root / ".attempts" / "a" / "toy_line" / "s-0.1" / "workspace").is_dir()
+    assert any("taken over from other" in said for said in stage.said)
+
+
+def test_a_claim_that_another_host_has_meanwhile_ends_the_run_here_and_its_result_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"), monkeypatch)
+    for name in ("_LOOK_S", "_ASK_AGAIN_S"):
+        monkeypatch.setattr(sweep, name, 0.01)
+    run = stage.runs[0]
+    theirs = Entry(
+        name=run.name,
+        agent="a",
+        env="toy/line",
+        repeat=0,
+        digest=run.digest,
+        state="completed",
+        directory="a/toy_line/s-0",
+        host="other",
+        score=3.0,
+    )
+    asked: list[str] = []
+
+    def answer(name: str) -> ClaimState | None:
+        asked.append(name)
+        if len(asked) == 1:
+            return None
+        if len(asked) < 6:
+            return ClaimState(granted=False, holder="other:1", run="r-8")
+        return ClaimState(granted=False, holder="other:1", run="r-8", result=msgspec.to_builtins(theirs))
+
+    async def never(_: str) -> None:
+        await asyncio.Event().wait()
+
+    stage.cluster.answer, stage.act = answer, never
+    index = stage.play()
+    assert stage.begun == [run.name]
+    entry = index.runs[run.name]
+    assert (entry.state, entry.score, entry.host, entry.directory) == ("completed", 3.0, "other", "")
+    # Started again, with the folder of the run that was ended here still open: nothing is left to do.
+    found = Found(entry=entry, opened=True, phase="finished")
+    assert decide(run, found) == Decision(run=run, kind="keep", attempt=1)
+
+
+def test_our_own_failure_gives_the_claim_back_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + CODEX.format("a"), monkeypatch)
+
+    async def fails(name: str) -> None:
+        stage.doing(name, tokens=TOKENS)
+        raise sweep.EvopolicyError("the gateway cannot serve")
+
+    stage.act = fails
+    index = stage.play()
+    (entry,) = index.runs.values()
+    assert (entry.state, entry.error, entry.tokens) == ("error", "the gateway cannot serve", TOKENS)
+    assert stage.cluster.told[-1][2] is None
