@@ -1,0 +1,61 @@
+"""A policy that leaves data for its agent outside the protocol, or for its own next episode: nobody finds any of it.
+
+What it prints in train episodes is in the feedback, as the protocol has it: that is how these tests know what it tried.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cheated import Cheated
+
+from evopolicy_common.run_record import decode_run_record
+
+HERE = Path(__file__).parent
+N_TRAIN = 3
+
+
+class Left:
+    def __init__(self, cheated: Cheated) -> None:
+        policy = HERE / "leaving_policy.py"
+        words = f"command:{sys.executable} {HERE / 'listening_agent.py'} {policy}"
+        # Without a jail the agent and what plays its policy share the machine's folders, ports and names.
+        code, said, self.folder = cheated.play(words, "left", "--jail", "none")
+        assert code == 0, said
+        self.report: dict[str, Any] = json.loads((self.folder / "workspace" / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def left(cheated: Cheated) -> Left:
+    return Left(cheated)
+
+
+def test_the_policy_left_something_in_every_train_episode(left: Left) -> None:
+    assert len(left.report["said"]) == N_TRAIN
+    assert all(said["left"] for said in left.report["said"])
+
+
+def test_its_next_episode_finds_nothing(left: Left) -> None:
+    assert [said["before"] for said in left.report["said"]] == [[]] * N_TRAIN
+
+
+def test_its_agent_finds_nothing_and_is_not_called(left: Left) -> None:
+    assert left.report["files"] == []
+    assert left.report["called"] == []
+    assert [said["reached"] for said in left.report["said"]] == [[]] * N_TRAIN
+
+
+def test_what_it_says_in_hidden_episodes_is_kept_nowhere_in_the_run(left: Left) -> None:
+    marks = {said["mark"].encode() for said in left.report["said"]}
+    assert len(marks) == N_TRAIN
+    for path in left.folder.rglob("*"):
+        if path.is_file():
+            told = [part.partition(b"-of-an-episode")[0] for part in path.read_bytes().split(b"mark-")[1:]]
+            hexadecimal = [b"mark-" + word + b"-of-an-episode" for word in told if word.isalnum()]
+            assert set(hexadecimal) <= marks, path
+    outcome = decode_run_record((left.folder / "run.json").read_bytes()).outcome
+    assert (outcome.status, outcome.budget_used, len(outcome.heldout_returns)) == ("completed", N_TRAIN, 2)
