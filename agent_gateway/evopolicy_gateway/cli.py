@@ -23,8 +23,9 @@ from evopolicy_gateway import door, harnesses, options, processes, trials
 from evopolicy_gateway.door import Door
 from evopolicy_gateway.gateway import folder_of
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.options import RunOptions
+from evopolicy_gateway.option_groups import spread
 from evopolicy_gateway.play import Plan
+from evopolicy_gateway.run_options import DoorOptions, JailOptions, RunOptions
 from evopolicy_gateway.runs import Cluster, exit_code, play_all
 from evopolicy_gateway.runs import report as report_runs
 from evopolicy_gateway.suite.suite_cli import suite as play_suite
@@ -41,69 +42,20 @@ def evopolicy() -> None:
     """Evaluates agents that evolve policies: opens runs, plays them, and tells what they came to."""
 
 
-Entry = Annotated[str | None, typer.Option(help="Name of the leaderboard entry; default: the agent's.")]
-Model = Annotated[str | None, typer.Option(help="Name of the model behind the agent; default: the entry's.")]
-ExpId = Annotated[str | None, typer.Option(help="Name of this experiment; default: the time.")]
-Repeat = Annotated[int, typer.Option(min=0, help="Which repeat of the same agent and environment this is.")]
-Budget = Annotated[int | None, typer.Option(min=1, help="Train episodes; default: the suite's.")]
-MinEpisodes = Annotated[int | None, typer.Option(min=1, help="Fewest episodes of a submit.")]
-MaxEpisodes = Annotated[int | None, typer.Option(min=1, help="Most episodes of a submit.")]
-Validation = Annotated[int | None, typer.Option(min=1, help="Hidden validation cases.")]
-Heldout = Annotated[int | None, typer.Option(min=1, help="Hidden held-out cases.")]
-Scope = Annotated[str, typer.Option(help="episode: a fresh Policy each; submit: one through a submit.")]
-Observations = Annotated[str, typer.Option(help="arrays, or lists as in v2.0-draft.")]
-TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
-Video = Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")]
-Replays = Annotated[
-    str | None,
-    typer.Option(help="Videos of the score's held-out episodes: off, first, all; default: as --video."),
-]
-Wall = Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")]
-Runs = Annotated[Path, typer.Option(help="Folder of run directories.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with the run of that --exp-id, whose command was killed.")
-]
-Parallel = Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")]
-WALL_S = 12 * 3600.0
-
-
 @app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
+@spread
 def run(
+    *,
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
-    agent: options.AgentName,
     connect: options.Connect = None,
     credentials_file: options.CredentialsFile = None,
     local: Annotated[
         bool,
         typer.Option("--local", help="Bring up a coordinator and a worker here, as `evopolicy local` does."),
     ] = False,
-    budget: Budget = None,
-    model: Model = None,
-    entry: Entry = None,
-    exp_id: ExpId = None,
-    repeat: Repeat = 0,
-    min_episodes: MinEpisodes = None,
-    max_episodes: MaxEpisodes = None,
-    validation: Validation = None,
-    heldout: Heldout = None,
-    policy_scope: Scope = "episode",
-    observations: Observations = "arrays",
-    tier: TierName = "bwrap",
-    video: Video = "off",
-    replays: Replays = None,
-    limit: options.Limits = None,
-    agent_wall_s: Wall = WALL_S,
-    jail: options.JailMode = "bwrap",
-    jail_bind: options.JailBind = None,
-    jail_bind_rw: options.JailBindWritable = None,
-    jail_env: options.JailVariable = None,
-    allow_host: options.AllowHost = None,
-    http: options.Http = None,
-    http_url: options.HttpUrl = None,
-    runs: Runs = Path("runs"),
-    overwrite: Overwrite = False,
-    resume: Resume = False,
+    given: RunOptions,
+    jail: JailOptions,
+    served: DoorOptions,
     slots: options.Slots = 2,
     as_json: options.Json = False,
 ) -> None:
@@ -113,31 +65,8 @@ def run(
             raise ConfigError(
                 "--local brings up a cluster of its own; it does not go with --connect or --credentials"
             )
-        given = RunOptions(
-            agent=agent,
-            entry=entry or harnesses.entry_name(agent),
-            model=model,
-            exp_id=exp_id,
-            repeat=repeat,
-            budget=budget,
-            min_episodes=min_episodes,
-            max_episodes=max_episodes,
-            validation=validation,
-            heldout=heldout,
-            policy_scope=policy_scope,
-            observations=observations,
-            tier=tier,
-            video=video,
-            replays=replays,
-            limits=limit or (),
-        )
-        served = options.door_from(http, http_url)
-        if agent == door.AGENT:
-            held = options.no_jail_of_ours(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        else:
-            held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        env_ids = [options.one_environment(env)]
-        plans = _plans(given, env_ids, runs, agent_wall_s, (overwrite, resume), held, served)
+        held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
+        plans = _plans(given, [options.one_environment(env)], held, served.door())
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
             where = Cluster(local_slots=slots)
@@ -145,6 +74,7 @@ def run(
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
+@spread
 def local(
     env: Annotated[
         list[str],
@@ -153,32 +83,9 @@ def local(
             show_default=False,
         ),
     ],
-    agent: options.AgentName,
-    budget: Budget = None,
-    model: Model = None,
-    entry: Entry = None,
-    exp_id: ExpId = None,
-    repeat: Repeat = 0,
-    min_episodes: MinEpisodes = None,
-    max_episodes: MaxEpisodes = None,
-    validation: Validation = None,
-    heldout: Heldout = None,
-    policy_scope: Scope = "episode",
-    observations: Observations = "arrays",
-    tier: TierName = "bwrap",
-    video: Video = "off",
-    replays: Replays = None,
-    limit: options.Limits = None,
-    agent_wall_s: Wall = WALL_S,
-    jail: options.JailMode = "bwrap",
-    jail_bind: options.JailBind = None,
-    jail_bind_rw: options.JailBindWritable = None,
-    jail_env: options.JailVariable = None,
-    allow_host: options.AllowHost = None,
-    runs: Runs = Path("runs"),
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    parallel: Parallel = 1,
+    given: RunOptions,
+    jail: JailOptions,
+    parallel: Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")] = 1,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
     data: options.DataFolder = None,
@@ -187,31 +94,12 @@ def local(
 ) -> None:
     """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
     with fail_on_our_errors():
-        given = RunOptions(
-            agent=agent,
-            entry=entry or harnesses.entry_name(agent),
-            model=model,
-            exp_id=exp_id,
-            repeat=repeat,
-            budget=budget,
-            min_episodes=min_episodes,
-            max_episodes=max_episodes,
-            validation=validation,
-            heldout=heldout,
-            policy_scope=policy_scope,
-            observations=observations,
-            tier=tier,
-            video=video,
-            replays=replays,
-            limits=limit or (),
-        )
-        held = options.jail_of(jail, jail_bind, jail_bind_rw, jail_env, allow_host)
-        plans = _plans(given, catalogue.resolve(env), runs, agent_wall_s, (overwrite, resume), held)
+        plans = _plans(given, catalogue.resolve(env), jail.settings())
         where = Cluster(local_slots=slots, state=state, data=data, audit=audit)
         _play(plans, where, parallel, as_json)
 
 
-@app.command("try", epilog="Example: evopolicy try examples/policies/acrobot --env gym/acrobot --cases 0-3")
+@app.command("try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3")
 def try_policy(
     policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
@@ -221,7 +109,7 @@ def try_policy(
     ),
     connect: options.Connect = None,
     credentials_file: options.CredentialsFile = None,
-    tier: TierName = "bwrap",
+    tier: options.TierName = "bwrap",
     limit: options.Limits = None,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
@@ -302,20 +190,10 @@ app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_
 
 
 def _plans(
-    given: RunOptions,
-    env_ids: list[str],
-    runs: Path,
-    wall_limit_s: float,
-    replaced: tuple[bool, bool],
-    jail: JailSettings,
-    served: Door | None = None,
+    given: RunOptions, env_ids: list[str], jail: JailSettings, served: Door | None = None
 ) -> list[Plan]:
-    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started.
-
-    `replaced`: what becomes of a run of that name, as `--overwrite` and `--resume` say.
-    """
-    overwrite, resume = replaced
-    if resume and (overwrite or given.exp_id is None):
+    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
+    if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
     started_in = Path.cwd()
     harnesses.make(given.agent, started_in)
@@ -324,11 +202,11 @@ def _plans(
         Plan(
             settings=given.settings(env_id, exp_id),
             agent=given.agent,
-            runs=runs,
+            runs=given.runs,
             started_in=started_in,
-            wall_limit_s=wall_limit_s,
-            overwrite=overwrite,
-            resume=resume,
+            wall_limit_s=given.agent_wall_s,
+            overwrite=given.overwrite,
+            resume=given.resume,
             jail=jail,
             door=served,
         )

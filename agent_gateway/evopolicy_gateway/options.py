@@ -13,12 +13,7 @@ from rich.console import Console
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import ResourceLimits, Tier
-from evopolicy_common.messages.gateway import VideoOption
-from evopolicy_common.messages.operator import RunSettings
-from evopolicy_gateway.door import Door, door_of
-from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
 Connect = Annotated[
@@ -34,13 +29,6 @@ CredentialsFile = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
 Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.")]
-AgentName = Annotated[
-    str,
-    typer.Option(
-        help="evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, file:AGENT.toml, remote",
-        show_default=False,
-    ),
-]
 Limits = Annotated[
     list[str] | None,
     typer.Option(
@@ -53,43 +41,10 @@ DataFolder = Annotated[
         help="Folder of split files (`evopolicy data make`); default: derived from the state's secret."
     ),
 ]
-JailMode = Annotated[
-    str,
-    typer.Option(
-        "--jail",
-        help="Around the agent: bwrap, open-network (jailed, with this machine's network), none. Recorded in run.json.",
-    ),
-]
-JailBind = Annotated[
-    list[str] | None,
-    typer.Option("--jail-bind", help="File or folder that the agent sees, read-only; may be repeated."),
-]
-JailBindWritable = Annotated[
-    list[str] | None, typer.Option("--jail-bind-rw", help="File or folder that it may also change.")
-]
-JailVariable = Annotated[
-    list[str] | None,
-    typer.Option("--jail-env", help="Variable that is passed on to it, such as an API key's."),
-]
-AllowHost = Annotated[
-    list[str] | None,
-    typer.Option(help="HOST or HOST:PORT that it reaches besides its harness's own; may be repeated."),
-]
-Http = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT",
-        help="With --agent remote: the address of this machine on which the agent is served; every request needs the token.",
-    ),
-]
-HttpUrl = Annotated[
-    str | None,
-    typer.Option(help="How the agent reaches it where that is another URL, such as that of a TLS front."),
-]
 StateFolder = Annotated[
     Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
 ]
-
+TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
 Audit = Annotated[
     float,
     typer.Option(
@@ -101,82 +56,6 @@ Audit = Annotated[
 ]
 
 
-class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run` and `local` take for each run, as given."""
-
-    agent: str
-    entry: str
-    model: str | None
-    exp_id: str | None
-    repeat: int
-    budget: int | None
-    min_episodes: int | None
-    max_episodes: int | None
-    validation: int | None
-    heldout: int | None
-    policy_scope: str
-    observations: str
-    tier: str
-    video: str
-    replays: str | None = None
-    limits: Sequence[str]
-
-    def settings(self, env: str, exp_id: str) -> RunSettings:
-        """The settings of one run. ConfigError naming the option that is wrong."""
-        return RunSettings(
-            env=env,
-            entry=self.entry,
-            model=self.model or self.entry,
-            exp_id=exp_id,
-            repeat=self.repeat,
-            budget=self.budget,
-            min_episodes_per_submit=self.min_episodes,
-            max_episodes_per_submit=self.max_episodes,
-            n_validation=self.validation,
-            n_heldout=self.heldout,
-            policy_scope=_one_of("--policy-scope", self.policy_scope, PolicyScope),  # type: ignore[arg-type]
-            observations=_one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
-            sandbox_tier=tier_of(self.tier),
-            video=_one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
-            replays=None if self.replays is None else _one_of("--replays", self.replays, VideoOption),  # type: ignore[arg-type]
-            limits=limits_of(self.limits),
-        )
-
-
-def jail_of(
-    mode: str,
-    read: Sequence[str] | None,
-    write: Sequence[str] | None,
-    variables: Sequence[str] | None,
-    hosts: Sequence[str] | None,
-) -> JailSettings:
-    """The jail that the options ask for. ConfigError naming the one that is wrong, or what this machine lacks."""
-    started_in = Path.cwd()
-    settings = JailSettings(
-        mode=_one_of("--jail", mode, Mode),  # type: ignore[arg-type]
-        read=tuple(absolute(path, started_in) for path in read or ()),
-        write=tuple(absolute(path, started_in) for path in write or ()),
-        environment=tuple(variables or ()),
-        hosts=tuple(hosts or ()),
-    )
-    settings.check()
-    return settings
-
-
-def no_jail_of_ours(mode: str, *widened: Sequence[str] | None) -> JailSettings:
-    """The jail of an agent that somebody else starts: none of ours. ConfigError when one is asked for."""
-    if mode == "open-network" or any(widened):
-        raise ConfigError("--agent remote is not started here, so --jail and its options do not go with it")
-    return JailSettings(mode="none")
-
-
-def door_from(http: str | None, url: str | None) -> Door | None:
-    """Where a remote agent is served. ConfigError naming the option that is wrong."""
-    if http is None and url is not None:
-        raise ConfigError("--http-url tells how --http HOST:PORT is reached; it needs that")
-    return None if http is None else door_of(http, url)
-
-
 def console(*, stderr: bool) -> Console:
     """For people: as wide as their terminal, and wide enough for a table where there is none."""
     found = Console(stderr=stderr)
@@ -184,7 +63,7 @@ def console(*, stderr: bool) -> Console:
 
 
 def tier_of(text: str) -> Tier:
-    return _one_of("--tier", text, Tier)  # type: ignore[return-value]
+    return one_of("--tier", text, Tier)  # type: ignore[return-value]
 
 
 def default_exp_id() -> str:
@@ -232,7 +111,8 @@ def cases_of(text: str) -> tuple[int, ...]:
     return ids
 
 
-def _one_of(option: str, text: str, kind: object) -> str:
+def one_of(option: str, text: str, kind: object) -> str:
+    """`text`, which is one of the values of the Literal `kind`. ConfigError naming `option` when it is not."""
     allowed = get_args(kind)
     if text not in allowed:
         raise ConfigError(f"{option} {text!r}: there are {', '.join(allowed)}")

@@ -155,7 +155,7 @@ TIMEOUTS: dict[str, str] = {
     "gateway/server.py:CLOSE_GRACE_S": GATEWAY
     + "test_a_request_that_does_not_end_does_not_hold_up_the_services_end",
     # The operator's commands.
-    "gateway/cli.py:WALL_S": COMMAND + "test_an_agent_that_does_nothing_is_ended_by_its_wall_limit",
+    "gateway/run_options.py:WALL_S": COMMAND + "test_an_agent_that_does_nothing_is_ended_by_its_wall_limit",
     "gateway/suite/suite_file.py:WALL_S": COMMAND
     + "test_an_agent_that_does_nothing_is_ended_by_its_wall_limit",
     "gateway/suite/suite_file.py:claim_ttl_s": "tests/unit/coordinator/test_claims.py::"

@@ -21,28 +21,14 @@ from evopolicy_gateway import control
 from evopolicy_gateway.control import Progress
 from evopolicy_gateway.journal import Rejected
 from evopolicy_gateway.layout import Staged
-from evopolicy_gateway.options import RunOptions, cases_of, limits_of, one_environment
+from evopolicy_gateway.options import cases_of, limits_of, one_environment
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.record import run_record
+from evopolicy_gateway.run_options import RunOptions
 from evopolicy_gateway.runs import RunResult, exit_code, report
 from evopolicy_gateway.watch import watching
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
-
-
-def options(**fields: Any) -> RunOptions:
-    usual: dict[str, Any] = {
-        **dict.fromkeys(RunOptions.__struct_fields__),
-        "agent": "evolve",
-        "entry": "evolve",
-        "repeat": 0,
-        "policy_scope": "episode",
-        "observations": "arrays",
-        "tier": "bwrap",
-        "video": "off",
-        "limits": (),
-    }
-    return RunOptions(**usual | fields)
 
 
 def plan(tmp_path: Path, **fields: Any) -> Plan:
@@ -184,7 +170,7 @@ def test_wrong_option_values_name_the_option() -> None:
         one_environment("core16")
     for field, text in (("policy_scope", "run"), ("observations", "x"), ("tier", "docker"), ("video", "on")):
         with pytest.raises(ConfigError, match=f"--{field.replace('_', '-')} '{text}'"):
-            options(**{field: text}).settings("toy/line", "t")
+            RunOptions(agent="evolve", **{field: text}).settings("toy/line", "t")
 
 
 def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
