@@ -114,12 +114,12 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Show it anew every second until Ctrl-C.")] = False,
 ) -> None:
-    """Workers, runs, and what waits longer than it should, and for what."""
-    if watch and as_json:
-        typer.echo("error: --watch and --json do not go together", err=True)
-        raise typer.Exit(2)
+    """Workers, runs, and what waits longer than it should, and for what.
+
+    --watch --json prints a JSON object a line, every second.
+    """
     if watch:
-        _asking(connect, file, _watch)
+        _asking(connect, file, _watch_lines if as_json else _watch)
         return
     reply = _asking(connect, file, Operator.status)
     if as_json:
@@ -134,6 +134,12 @@ async def _watch(operator: Operator) -> None:
             started = time.monotonic()
             live.update(render(await operator.status()), refresh=True)
             await asyncio.sleep(max(0.0, 1.0 - (time.monotonic() - started)))
+
+
+async def _watch_lines(operator: Operator) -> None:
+    while True:
+        print(msgspec.json.encode(await operator.status()).decode(), flush=True)
+        await asyncio.sleep(1.0)
 
 
 @workers_app.command(epilog="Example: evopolicy workers drain lab-3f2a")
@@ -196,9 +202,10 @@ def render(reply: StatusReply) -> RenderableType:
     slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
     head = (
         f"cluster {reply.cluster} · evopolicy {reply.version} · up {_age(reply.uptime_s)} · {slots} slots ·"
-        f" {reply.episodes_done} episodes, {reply.episodes_per_s:.1f}/s over the last minute"
+        f" {sum(run.queued for run in reply.runs)} queued, {sum(run.running for run in reply.runs)} running,"
+        f" {reply.episodes_done} episodes done, {reply.episodes_per_s:.1f}/s over the last minute"
     )
-    parts: list[RenderableType] = [Text(head), _workers(reply), _runs(reply)]
+    parts: list[RenderableType] = [Text(head), _workers(reply), *_classes(reply), _runs(reply)]
     if reply.audit_share or reply.audits:
         stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
         parts.append(
@@ -226,6 +233,12 @@ def _workers(reply: StatusReply) -> Table:
             f"{_age(worker.last_seen_s)} ago",
         )
     return table
+
+
+def _classes(reply: StatusReply) -> Iterator[Text]:
+    """What the workers' classes stand for: only workers of one class share a run."""
+    for name, versions in sorted({worker.fingerprint: worker.versions for worker in reply.workers}.items()):
+        yield Text(f"class {name}: " + ", ".join(f"{what} {version}" for what, version in versions.items()))
 
 
 def _runs(reply: StatusReply) -> Table:

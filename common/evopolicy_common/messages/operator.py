@@ -298,6 +298,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     environments: tuple[str, ...]
     fingerprint: str
     """Short class of the worker's fingerprint: equal for workers that may share a run."""
+    versions: dict[str, str]
+    """What the class is made of: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
     held: int
     running: int
     last_seen_s: float

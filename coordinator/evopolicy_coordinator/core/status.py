@@ -9,6 +9,7 @@ from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 from evopolicy_common.messages.operator import RunStatus, WorkerStatus
+from evopolicy_common.messages.worker import Fingerprint
 
 from . import audit
 from .finalisation import progress
@@ -109,6 +110,7 @@ def _worker(core: Core, worker: Worker, now: float) -> WorkerStatus:
         tiers=tuple(sorted(profile.key[1])),
         environments=tuple(sorted(profile.descriptions)),
         fingerprint=profile.fingerprint_class,
+        versions={**_versions(profile.fingerprint), "cpu": profile.fingerprint.cpu},
         held=len(live),
         running=sum(lease.running for lease in live),
         last_seen_s=max(0.0, now - worker.last_seen),
@@ -139,14 +141,18 @@ def _mismatch(run: Run, profile: Profile) -> str:
     began, here = run.state.fingerprint, profile.fingerprint
     if began is None:
         return text
-    theirs = {**began.packages, "python": began.python, "evopolicy-worker": began.code_version}
-    ours = {**here.packages, "python": here.python, "evopolicy-worker": here.code_version}
+    theirs, ours = _versions(began), _versions(here)
     differing = [
         f"{name} {theirs.get(name, 'none')} there, {ours.get(name, 'none')} here"
         for name in sorted(theirs.keys() | ours.keys())
         if theirs.get(name) != ours.get(name)
     ]
     return f"{text} ({'; '.join(differing)})" if differing else text
+
+
+def _versions(fingerprint: Fingerprint) -> dict[str, str]:
+    own = {"evopolicy-worker": fingerprint.code_version, "python": fingerprint.python}
+    return {**own, **fingerprint.packages}
 
 
 def _run(core: Core, run: Run) -> RunStatus:

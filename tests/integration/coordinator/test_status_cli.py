@@ -60,10 +60,15 @@ def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> N
                     await gateway.results(0)
                     result = await called(coordinator, "status")
                     assert result.exit_code == 0
-                    for shown in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
-                        assert shown in result.stdout
+                    for text in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
+                        assert text in result.stdout
                     reply = json.loads((await called(coordinator, "status", "--json")).stdout)
                     assert reply["cluster"] == "local"
+                    (shown,) = [one for one in reply["workers"] if one["worker"] == "w-shown"]
+                    assert shown["versions"]["evopolicy-worker"] == FINGERPRINT.code_version
+                    for name, version in shown["versions"].items():
+                        assert f"{name} {version}" in " ".join(result.stdout.split())
+                    assert "0 queued, 0 running" in result.stdout
                     assert created.run in [run["run"] for run in reply["runs"]]
 
     asyncio.run(asyncio.wait_for(scenario(), 60))
@@ -143,7 +148,7 @@ def test_refusals_are_told_in_a_line_and_exit_1(coordinator: Coordinator) -> Non
 
 
 def test_wrong_usage_exits_2(coordinator: Coordinator, tmp_path: Path) -> None:
-    assert call(coordinator, "status", "--watch", "--json").exit_code == 2
+    assert call(coordinator, "status", "--watched").exit_code == 2
     result = CliRunner().invoke(status_app, ["--credentials", str(tmp_path / "none.json")])
     assert result.exit_code == 2
     assert "none.json" in result.stderr
@@ -171,6 +176,21 @@ def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> 
         watching.kill()
         watching.wait()
         os.close(controller)
+
+
+def test_watch_as_json_prints_an_object_a_line(coordinator: Coordinator) -> None:
+    code = "from evopolicy_coordinator.status_cli import status_app; status_app()"
+    file = coordinator.ready["credentials"]["operator"]
+    watching = subprocess.Popen(
+        [sys.executable, "-c", code, "--watch", "--json", "--credentials", file], stdout=subprocess.PIPE
+    )
+    with watching:
+        assert watching.stdout is not None
+        first, second = (json.loads(watching.stdout.readline()) for _ in range(2))
+        watching.send_signal(signal.SIGINT)
+    assert first["cluster"] == second["cluster"] == "local"
+    assert first["uptime_s"] < second["uptime_s"]
+    assert watching.returncode == 130
 
 
 @pytest.mark.parametrize(
