@@ -108,11 +108,12 @@ class JobState:
     queued: bool = False
     lease: Lease | None = None
     failures: int = 0
-    """Infrastructure failures so far."""
-    strikes: int = 0
+    """Infrastructure failures so far, in this incarnation."""
     avoid: str | None = None
+    """The worker that it last failed on: not given to it before `avoid_until`, while there is another."""
     avoid_until: float = 0.0
     alone: bool = False
+    """It is a suspect: played with nothing beside it."""
     reserved: str | None = None
     """The worker that is being emptied for it (of a suspect)."""
     preemptions: int = 0

@@ -108,7 +108,7 @@ class LeaseBook:
         group.n_leased += 1
         group.flow.n_leased += 1
         self.n_live += 1
-        self.list_hidden(lease, worker)
+        self.list_hidden(lease, worker, turn)
         if group.first_leased_at is None:
             group.first_leased_at = now
             self._core.group_started(group, turn)
@@ -117,8 +117,7 @@ class LeaseBook:
         self._core.timers.arm_once(("worker", worker.name), now + self._core.settings.lease_ttl_s)
         return lease
 
-    @staticmethod
-    def list_hidden(lease: Lease, worker: Worker) -> None:
+    def list_hidden(self, lease: Lease, worker: Worker, turn: Turn) -> None:
         """List a live lease among those that train jobs may preempt, by its job's priority."""
         if lease.hidden_in is not None:
             lease.hidden_in.pop(lease, None)
@@ -126,6 +125,7 @@ class LeaseBook:
         if lease.job.priority != TRAIN:
             lease.hidden_in = worker.profile.hidden[lease.job.priority]
             lease.hidden_in[lease] = None
+            self._core.scheduler.hidden_leased(worker, turn)
 
     # ---- hearing ----
 

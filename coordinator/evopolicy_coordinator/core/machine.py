@@ -253,7 +253,7 @@ class Core:
 
     def place(self, flow: Flow, fingerprint_class: str, turn: Turn) -> None:
         self.unpinned.pop(flow.id, None)
-        turn.dirty[self.queue.place(flow, fingerprint_class, None)] = None
+        turn.dirty[self.queue.place(flow, fingerprint_class)] = None
 
     def open_group(self, group: JobGroup, turn: Turn) -> None:
         """Queue what is not done of a group. While loading, jobs wait to be adopted first."""
@@ -309,7 +309,7 @@ class Core:
             if queued:
                 self.scheduler.queue(job, turn)
             elif job.lease is not None:
-                self.book.list_hidden(job.lease, self.fleet.workers[job.lease.worker])
+                self.book.list_hidden(job.lease, self.fleet.workers[job.lease.worker], turn)
 
     # ---- what the modules tell each other ----
 

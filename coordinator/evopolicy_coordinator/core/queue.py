@@ -71,9 +71,6 @@ class Flow:
     def observe(self, wall_s: float) -> None:
         self.episode_s = wall_s if self.episode_s is None else 0.8 * self.episode_s + 0.2 * wall_s
 
-    def waiting(self) -> bool:
-        return any(self.n_ready)
-
 
 @dataclass(slots=True, eq=False)
 class Lane:
@@ -161,7 +158,7 @@ class Queue:
         for lane in self.lanes.values():
             self._join(profile, lane)
 
-    def place(self, flow: Flow, pin: str, description: EnvironmentDescription | None) -> Lane:
+    def place(self, flow: Flow, pin: str) -> Lane:
         """Put a flow into the lane of class `pin`, with whatever of it waits."""
         old = flow.lane
         if old is not None:
@@ -175,8 +172,6 @@ class Queue:
             for profile in self.profiles.values():
                 self._join(profile, lane)
         flow.pin, flow.lane = pin, lane
-        if description is not None:
-            flow.description = description
         for priority in range(N_PRIORITIES):
             flow.in_heap[priority] = False
             if flow.n_ready[priority]:

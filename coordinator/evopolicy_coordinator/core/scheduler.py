@@ -61,6 +61,13 @@ class Scheduler:
         """A worker let go of a lease: its waiting poll may be answerable now."""
         self._emptied[worker.name] = None
 
+    def hidden_leased(self, worker: Worker, turn: Turn) -> None:
+        """A worker has a hidden job: train jobs that wait already (they avoided it, or the hidden job was adopted from
+        its heartbeat) may stop it with nothing else happening."""
+        for lane in worker.profile.busy:
+            if lane.n_ready[TRAIN]:
+                self._core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
+
     # ---- polls ----
 
     def poll(self, worker: Worker, event: LeaseRequested, turn: Turn) -> None:

@@ -185,6 +185,22 @@ def test_a_train_job_stops_hidden_ones_on_the_worker_it_failed_on_once_it_may_go
     assert rig.beat(session, hidden).cancelled == (hidden.lease_id,)
 
 
+def test_a_train_job_that_waits_already_stops_a_hidden_one_that_is_adopted_from_a_heartbeat() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session, 1))
+    (hidden,) = rig.poll(session, 1)
+    rig.load()
+    rig.submit(5, key="k1")
+    rig.pass_time(3.0)  # with nothing there to be stopped
+    session = rig.register(slots=1)
+    assert rig.beat(session, hidden).cancelled == ()
+    rig.pass_time(1.5)
+    assert rig.beat(session, hidden).cancelled == (hidden.lease_id,)
+
+
 def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
     rig = Rig(preemptions_max=2)
     session = rig.register(slots=1)
