@@ -16,7 +16,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import fail, fail_on_our_errors, run_app
+from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_difference import differences
 from evopolicy_gateway import door, harnesses, options, processes, trials
@@ -47,8 +47,8 @@ def evopolicy() -> None:
 def run(
     *,
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
-    connect: options.Connect = None,
-    credentials_file: options.CredentialsFile = None,
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
     local: Annotated[
         bool,
         typer.Option("--local", help="Bring up a coordinator and a worker here, as `evopolicy local` does."),
@@ -99,7 +99,9 @@ def local(
         _play(plans, where, parallel, as_json)
 
 
-@app.command("try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3")
+@app.command(
+    "try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3"
+)
 def try_policy(
     policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
@@ -107,8 +109,8 @@ def try_policy(
     out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
         "tries"
     ),
-    connect: options.Connect = None,
-    credentials_file: options.CredentialsFile = None,
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
     tier: options.TierName = "bwrap",
     limit: options.Limits = None,
     slots: options.Slots = 2,
@@ -141,8 +143,8 @@ def play_random(
     ],
     split: Annotated[str, typer.Option(help="train, validation or heldout.")] = "heldout",
     cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
-    connect: options.Connect = None,
-    credentials_file: options.CredentialsFile = None,
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
     data: options.DataFolder = None,

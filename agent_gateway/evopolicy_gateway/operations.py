@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from evopolicy_common import codec, credentials, keys
+from evopolicy_common import credentials
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.bundles import Bundle
 from evopolicy_common.credentials import Credentials
@@ -25,14 +24,13 @@ from evopolicy_common.messages.operator import (
     EvaluationPage,
     EvaluationPoll,
     EvaluationStarted,
-    OperatorReply,
     RecordedRequest,
     RunCreated,
     RunProgress,
     RunSettings,
     WaitRun,
 )
-from evopolicy_common.requests import Requester
+from evopolicy_common.requests import operator_requests
 from evopolicy_common.transport import Link
 
 WAIT_S = 5.0
@@ -47,9 +45,7 @@ class Operations:
 
     def __init__(self, link: Link) -> None:
         self._token = link.credentials.token
-        self._requests: Requester[OperatorReply] = Requester(
-            link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
-        )
+        self._requests = operator_requests(link)
 
     async def create(self, settings: RunSettings, key: str) -> RunCreated:
         """Opens a run; the same key gives the same run."""

@@ -16,17 +16,6 @@ from evopolicy_common.errors import ConfigError, RequestError
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(help="Endpoint of the coordinator, such as tls/10.0.0.5:7447; may be repeated."),
-]
-CredentialsFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--credentials",
-        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
-    ),
-]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
 Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.")]
 Limits = Annotated[

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evopolicy_common.columns import leaves
 from evopolicy_common.messages.environment import ObsStorage
 
 MIN_PICTURE_SIDE = 16
@@ -40,33 +40,22 @@ def npz_bytes(arrays: dict[str, NDArray[Any]]) -> bytes:
 def named_columns(columns: Any) -> dict[str, NDArray[Any]]:
     """The leaves of `Trajectory.obs` by name, first axis the step; texts become arrays of unicode.
 
-    A leaf is named by its path: keys and positions joined by `/`; the only leaf of a plain array is named "".
+    A leaf is named by its path, see `columns.leaves`.
     """
-    return {path: _array(leaf) for path, leaf in _leaves(columns, "")}
+    return {path: _array(leaf) for path, leaf in leaves(columns)}
 
 
 def storage_for(columns: Any) -> ObsStorage:
     """Where these columns belong: beside the rows where there is a picture among them."""
-    leaves = dict(_leaves(columns, ""))
-    if not any(_is_pictures(leaf) for leaf in leaves.values()):
+    found = dict(leaves(columns))
+    if not any(_is_pictures(leaf) for leaf in found.values()):
         return "inline"
-    return "npy" if list(leaves) == [""] else "npz"
+    return "npy" if list(found) == [""] else "npz"
 
 
 def _is_pictures(leaf: Any) -> bool:
     shape = leaf.shape[1:] if isinstance(leaf, np.ndarray) and leaf.dtype == np.uint8 else ()
     return len(shape) == 3 and min(shape[:2]) >= MIN_PICTURE_SIDE
-
-
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _leaves(item, f"{path}/{key}" if path else str(key))
-    elif isinstance(value, tuple):
-        for index, item in enumerate(value):
-            yield from _leaves(item, f"{path}/{index}" if path else str(index))
-    else:
-        yield path, value
 
 
 def _array(leaf: Any) -> NDArray[Any]:

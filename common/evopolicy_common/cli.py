@@ -1,4 +1,4 @@
-"""What all commands share: logging to stderr, and wrong options and errors of ours as one line with exit code 2."""
+"""What all commands share: how a cluster is named, logging to stderr, and errors of ours as one line and an exit code."""
 
 from __future__ import annotations
 
@@ -8,12 +8,28 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator
-from typing import Any, NoReturn, TextIO, cast
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TextIO, cast
 
 import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Endpoint of the coordinator, such as tls/10.0.0.5:7447; may be repeated. Default: this machine's own."
+    ),
+]
+CredentialsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--credentials",
+        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
+    ),
+]
+"""How an operator's command finds its cluster."""
 
 USAGE_ERROR = 2
 FAILURE = 1

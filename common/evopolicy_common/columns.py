@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -162,6 +163,18 @@ class Tuples(Column):
 
     def values(self) -> Any:
         return tuple(part.values() for part in self.parts)
+
+
+def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of `Column.values()` by their path: keys and positions joined by `/`; that of a single leaf is empty."""
+    if isinstance(values, dict):
+        for key, item in values.items():
+            yield from leaves(item, f"{path}/{key}" if path else str(key))
+    elif isinstance(values, tuple):
+        for index, item in enumerate(values):
+            yield from leaves(item, f"{path}/{index}" if path else str(index))
+    else:
+        yield path, values
 
 
 def _require_equal(n: int, parts: list[Column]) -> None:

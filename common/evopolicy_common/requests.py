@@ -10,14 +10,16 @@ import asyncio
 import random
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Generic, TypeVar
 
 import msgspec
 import structlog
 
-from evopolicy_common import codec
+from evopolicy_common import codec, keys
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
+from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.transport import Link
 
@@ -111,6 +113,11 @@ class Requester(Generic[Reply]):
         if len(data) != chunk.size or digest_of(bytes(data)) != digest:
             raise ProtocolError(f"blob {digest} arrived damaged ({len(data)} of {chunk.size} bytes)")
         return bytes(data)
+
+
+def operator_requests(link: Link) -> Requester[OperatorReply]:
+    """An operator's requests to the cluster of that link."""
+    return Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
 
 
 def expect(reply: object, wanted: type[Wanted]) -> Wanted:

@@ -92,14 +92,7 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
     left, right = recordings
     if (left.record, left.observations) != (right.record, right.observations):
         return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
-    told = verify_compare.first_difference(left, right)
-    if told is not None:
-        return told
-    for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
-        one, other = getattr(ours, name), getattr(theirs, name)
-        if not verify_compare.same(one, other):
-            return f"{name.replace('_', ' ')} {one!r} and {other!r}"
-    return None
+    return verify_compare.first_difference(left, right) or verify_compare.outcome_difference(ours, theirs)
 
 
 def action_log(actions: list[Any]) -> bytes:

@@ -19,18 +19,17 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from evopolicy_common import codec, credentials, keys, transport
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common import credentials, transport
+from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.messages.operator import (
     CancelRun,
     Done,
-    OperatorReply,
     RepinRun,
     SetWorker,
     StatusReply,
     StatusRequest,
 )
-from evopolicy_common.requests import Requester
+from evopolicy_common.requests import operator_requests
 
 T = TypeVar("T")
 
@@ -52,28 +51,13 @@ runs_app = typer.Typer(
     rich_markup_mode=None,
 )
 
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(help="Endpoint of the coordinator; default: the one of this machine's state folder."),
-]
-CredentialsFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--credentials",
-        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
-    ),
-]
-
 
 class Operator:
     """Asks an operator's requests."""
 
     def __init__(self, link: transport.Link) -> None:
         self.token = link.credentials.token
-        cluster = link.credentials.cluster
-        self._ask: Requester[OperatorReply] = Requester(
-            link, lambda verb: keys.operator_key(cluster, verb), codec.operator_replies
-        )
+        self._ask = operator_requests(link)
 
     async def status(self) -> StatusReply:
         return await self._ask.until_answered(

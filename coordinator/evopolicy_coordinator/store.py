@@ -11,8 +11,9 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -118,15 +119,20 @@ class Store:
         _guard(self._path, lambda: self._write(rows))
 
     def _write(self, rows: Iterable[Row]) -> None:
-        db = self._db
-        try:
-            db.execute("BEGIN IMMEDIATE")
+        with self._transaction():
             for row in rows:
-                _WRITERS[type(row)](db, row)
-            db.execute("COMMIT")
+                _WRITERS[type(row)](self._db, row)
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """Durable at the end of the `with`; undone when it ends with an error."""
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            yield
+            self._db.execute("COMMIT")
         except BaseException:
-            if db.in_transaction:
-                db.execute("ROLLBACK")
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
             raise
 
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
@@ -142,20 +148,13 @@ class Store:
         return _guard(self._path, self._load)
 
     def _load(self) -> Snapshot:
-        db = self._db
-        try:
-            db.execute("BEGIN IMMEDIATE")
-            db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
-            db.execute("COMMIT")
-        except BaseException:
-            if db.in_transaction:
-                db.execute("ROLLBACK")
-            raise
-        db.execute("BEGIN")
+        with self._transaction():
+            self._db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
+        self._db.execute("BEGIN")
         try:
             return self._snapshot()
         finally:
-            db.execute("ROLLBACK")
+            self._db.execute("ROLLBACK")
 
     def _snapshot(self) -> Snapshot:
         db = self._db

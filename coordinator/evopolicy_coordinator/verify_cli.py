@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common import credentials, transport
-from evopolicy_common.cli import end_on_sigterm, fail, fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.local_cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
@@ -65,17 +65,8 @@ def verify(
     seed: Annotated[
         int | None, typer.Option(help="Of the draw; default: another one each time.", show_default=False)
     ] = None,
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(help="Endpoint of the coordinator; default: the one of this machine's state folder."),
-    ] = None,
-    file: Annotated[
-        Path | None,
-        typer.Option(
-            "--credentials",
-            help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
-        ),
-    ] = None,
+    connect: Connect = None,
+    file: CredentialsFile = None,
     local: Annotated[
         bool, typer.Option("--local", help="Bring up a coordinator and a worker for this command.")
     ] = False,

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from evopolicy_common.columns import leaves
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.trajectory import Trajectory
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
@@ -43,6 +44,15 @@ def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
             return f"step {t}: the infos differ"
     if recorded.n != replayed.n:
         return f"{recorded.n} and {replayed.n} steps"
+    return None
+
+
+def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
+    """Which of an episode's own numbers differ, as `length 3 and 4`; the policy's side (failure, output, times) is left out."""
+    for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
+        one, other = getattr(ours, name), getattr(theirs, name)
+        if not same(one, other):
+            return f"{name.replace('_', ' ')} {one!r} and {other!r}"
     return None
 
 
@@ -154,7 +164,7 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
     """Of observations that are stored beside the rows."""
     if episode.obs is None or not rows or rows[0].get("obs") is not None:
         return None
-    leaves = dict(_leaves(episode.obs, ""))
+    columns = dict(leaves(episode.obs))
     path = next(
         (folder / name for name in ("observations.npy", "observations.npz") if (folder / name).exists()), None
     )
@@ -166,25 +176,13 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
     else:
         with stored:
             found = {name: stored[name] for name in stored.files}
-    if found.keys() != leaves.keys():
+    if found.keys() != columns.keys():
         return f"{path.name}: holds other columns"
-    for name, leaf in leaves.items():
+    for name, leaf in columns.items():
         column = leaf if isinstance(leaf, np.ndarray) else np.array(leaf, dtype=found[name].dtype)
         if not same(np.ascontiguousarray(column), np.ascontiguousarray(found[name])):
             return f"{path.name}: column {name or 'of observations'} differs"
     return None
-
-
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Columns by their path, as the files name them."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _leaves(item, f"{path}/{key}" if path else str(key))
-    elif isinstance(value, tuple):
-        for index, item in enumerate(value):
-            yield from _leaves(item, f"{path}/{index}" if path else str(index))
-    else:
-        yield path, value
 
 
 def _unmarked(info: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common import bundles, codec, keys
+from evopolicy_common import bundles
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.messages.environment import Split
@@ -31,12 +31,11 @@ from evopolicy_common.messages.operator import (
     EvaluationPage,
     EvaluationPoll,
     EvaluationStarted,
-    OperatorReply,
     PlayedAs,
     RecordedRequest,
 )
 from evopolicy_common.messages.worker import Fingerprint
-from evopolicy_common.requests import Requester
+from evopolicy_common.requests import operator_requests
 from evopolicy_common.trajectory import Trajectory, decode
 from evopolicy_common.transport import Link
 from evopolicy_coordinator import verify_compare
@@ -106,10 +105,7 @@ class Verifier:
 
     def __init__(self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None) -> None:
         self._token = link.credentials.token
-        cluster = link.credentials.cluster
-        self._ask: Requester[OperatorReply] = Requester(
-            link, lambda verb: keys.operator_key(cluster, verb), codec.operator_replies
-        )
+        self._ask = operator_requests(link)
         self._run = run
         self._tell = tell
         self._tier: Tier = tier or run.record.sandbox_tier
@@ -405,13 +401,7 @@ def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: Epi
     if recording.stored is None or then is None:
         return None
     told = verify_compare.first_difference(decode(recording.stored), replayed)
-    if told is not None:
-        return told
-    for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
-        ours, theirs = getattr(then, name), getattr(outcome, name)
-        if not verify_compare.same(ours, theirs):
-            return f"{name} {ours!r} and {theirs!r}"
-    return None
+    return told or verify_compare.outcome_difference(then, outcome)
 
 
 def _flat(fingerprint: Fingerprint) -> dict[str, str]:

@@ -18,7 +18,7 @@ import msgspec
 import typer
 from rich.console import Console
 
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
@@ -50,8 +50,8 @@ def suite(
     file: Annotated[
         str, typer.Argument(help="TOML file, or a shipped one: smoke.toml, core16.toml, core16-paper.toml.")
     ],
-    connect: options.Connect = None,
-    credentials_file: options.CredentialsFile = None,
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
     local: Annotated[
         bool, typer.Option("--local", help="Bring up a coordinator and a worker here for the sweep.")
     ] = False,
