@@ -1,4 +1,5 @@
-"""A model API on loopback that plays a script: enough of OpenAI's Responses and Anthropic's Messages for the real CLIs.
+"""A model API on loopback that plays a script: enough of OpenAI's Responses and Chat Completions, Anthropic's Messages and
+Google's generateContent for the real CLIs.
 
 Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the turn.
 Requests without tools (titles, token counts) get a short text and move nothing.
@@ -86,9 +87,16 @@ class ModelApi:
             error = {"type": "error", "error": {"type": "overloaded_error", "message": step.text or "busy"}}
             handler._send(step.status, json.dumps(error).encode(), "application/json")
             return
-        events = _responses(step, request) if path.endswith("/responses") else _messages(step, request)
-        stream = "".join(f"event: {event['type']}\ndata: {json.dumps(event)}\n\n" for event in events)
-        handler._send(200, stream.encode(), "text/event-stream")
+        events = _speech(path)(step, request)
+        if path.endswith((":generateContent", ":countTokens")):
+            handler._send(200, json.dumps(next(iter(events))).encode(), "application/json")
+            return
+        stream = "".join(
+            (f"event: {event['type']}\n" if "type" in event else "") + f"data: {json.dumps(event)}\n\n"
+            for event in events
+        )
+        done = "data: [DONE]\n\n" if path.endswith("/completions") else ""
+        handler._send(200, (stream + done).encode(), "text/event-stream")
 
     def _next(self, request: dict[str, Any]) -> Step:
         with self._lock:
@@ -98,6 +106,59 @@ class ModelApi:
             self.played += 1
             at = self.played - 1
         return self.script[at] if at < len(self.script) else Step(text="Nothing more to do.")
+
+
+def _speech(path: str) -> Any:
+    """The protocol that is spoken below a path."""
+    for ending, speech in (("/responses", _responses), ("/completions", _chat), ("ontent", _contents)):
+        if path.endswith(ending):
+            return speech
+    return _messages
+
+
+def _chat(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    delta: dict[str, Any] = {"role": "assistant", "content": step.text}
+    if step.command is not None:
+        name = _offered([tool["function"]["name"] for tool in request["tools"]])
+        function = {"name": name, "arguments": json.dumps(_shell_arguments(step.command))}
+        call = {"index": 0, "id": f"call_{id(step)}", "type": "function", "function": function}
+        delta = {"role": "assistant", "content": None, "tool_calls": [call]}
+    whole = {"id": f"chat_{id(step)}", "object": "chat.completion.chunk", "model": request["model"]}
+    yield whole | {"choices": [{"index": 0, "delta": delta, "finish_reason": None}]}
+    reason = "stop" if step.command is None else "tool_calls"
+    yield whole | {"choices": [{"index": 0, "delta": {}, "finish_reason": reason}]}
+    usage = {
+        "prompt_tokens": INPUT,
+        "completion_tokens": OUTPUT,
+        "total_tokens": INPUT + OUTPUT,
+        "prompt_tokens_details": {"cached_tokens": CACHED},
+    }
+    yield whole | {"choices": [], "usage": usage}
+
+
+def _contents(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    part: dict[str, Any] = {"text": step.text}
+    if step.command is not None:
+        declared = [one["name"] for tool in request["tools"] for one in tool.get("functionDeclarations", ())]
+        part = {"functionCall": {"name": _offered(declared), "args": _shell_arguments(step.command)}}
+    usage = {
+        "promptTokenCount": INPUT,
+        "cachedContentTokenCount": CACHED,
+        "candidatesTokenCount": OUTPUT - REASONING,
+        "thoughtsTokenCount": REASONING,
+        "totalTokenCount": INPUT + OUTPUT,
+    }
+    candidate = {"content": {"role": "model", "parts": [part]}, "finishReason": "STOP", "index": 0}
+    yield {"candidates": [candidate], "usageMetadata": usage}
+
+
+def _offered(names: list[str]) -> str:
+    """The shell among the tools that Gemini CLI and its relatives offer."""
+    return next(name for name in names if name == "run_shell_command")
+
+
+def _shell_arguments(command: str) -> dict[str, Any]:
+    return {"command": command, "description": "edits and submits", "is_background": False}
 
 
 def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -25,6 +25,8 @@ class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     cache_creation: str = ""
     output: str = ""
     reasoning: str = ""
+    total: str = ""
+    """Of a stream whose `output` lacks the reasoning: what `total` is above `input` is output."""
     input_includes_cached: bool = False
     """The stream counts `cache_read` into `input`, as Codex does."""
     counts: Literal["turn", "session"] = "turn"
@@ -34,7 +36,7 @@ class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Events(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a CLI's JSON lines mean: dotted paths, where `*` stands for every element of a list.
 
-    The first path with a value counts, and an event without any is passed over.
+    `[name=value]` goes on only where the object has that value, such as `[type=result].error.message`. The first path with a value counts, and an event without any is passed over.
     """
 
     session: tuple[str, ...] = ()
@@ -48,9 +50,9 @@ class Events(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Cli(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How to speak with a CLI that there is no harness for. `{model}`, `{session}`, `{prompt}` are filled in.
+    """How to speak with a CLI that there is no harness for. `{model}`, `{effort}`, `{session}`, `{prompt}` are filled in.
 
-    An argument that needs a model is dropped with the one before it where none is set.
+    An argument that needs a model or an effort is dropped with the one before it where none is set.
     """
 
     first: tuple[str, ...]
@@ -114,6 +116,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ConfigError("retries and reprompts are counts, from 0")
         if self.max_cost is not None and self.prices is None:
             raise ConfigError("max_cost needs [prices], in US dollars per million tokens")
+        if self.cli is not None and self.effort and not any("{effort}" in word for word in self.cli.first):
+            raise ConfigError(f"effort = {self.effort!r}, and no argument in cli.first has {{effort}}")
         if self.cli is not None and self.cli.prompt == "argument":
             for name, words in (("first", self.cli.first), ("resume", self.cli.resume)):
                 if words and not any("{prompt}" in word for word in words):

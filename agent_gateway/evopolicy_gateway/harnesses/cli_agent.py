@@ -77,9 +77,15 @@ class CliAgent(Harness):
         arguments = dialect.arguments(begun, resume=resume, prompt=prompt, options=self._options)
         stage.log.note({"type": "prompt", "turn": state.turns, "session": begun, "message": prompt})
         reader = dialect.reader()
-        spent = Usage() if dialect.cumulative else state.usage
+        # A stream that counts its session tells what this session used before once more.
+        spent = state.usage_without(begun) if dialect.cumulative else state.usage
+        told = Usage()
 
         def capped(now: TurnReader) -> str | None:
+            nonlocal told
+            if now.usage.total > told.total:
+                told = now.usage
+                stage.on_doing(Doing(tokens=(spent + told).recorded(self._config.prices)))
             return self._capped(spent + now.usage)
 
         program = [*self._program, *arguments]

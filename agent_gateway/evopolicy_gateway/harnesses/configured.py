@@ -37,7 +37,12 @@ class ConfiguredCli(Dialect):
 
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
         template = self._cli.resume if resume else self._cli.first
-        known = {"{model}": self.config.model, "{session}": session, "{prompt}": prompt}
+        known = {
+            "{model}": self.config.model,
+            "{effort}": self.config.effort,
+            "{session}": session,
+            "{prompt}": prompt,
+        }
         words: list[str] = []
         for word in template:
             lacking = [name for name, value in known.items() if name in word and value is None]
@@ -80,16 +85,19 @@ class ConfiguredReader(TurnReader):
             name: next(
                 (value for value in values(event, getattr(paths, name)) if isinstance(value, int)), None
             )
-            for name in ("input", "cache_read", "cache_creation", "output", "reasoning")
+            for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total")
         }
         if all(value is None for value in found.values()):
             return
         cached = count(found["cache_read"])
+        output = count(found["output"])
+        if found["total"] is not None:
+            output = max(output, count(found["total"]) - count(found["input"]))
         told = Usage(
             input_noncached=max(0, count(found["input"]) - (cached if paths.input_includes_cached else 0)),
             cache_read=cached,
             cache_creation=count(found["cache_creation"]),
-            output=count(found["output"]),
+            output=output,
             reasoning=None if found["reasoning"] is None else count(found["reasoning"]),
         )
         self.usage = told if paths.counts == "session" else self.usage + told
@@ -98,6 +106,12 @@ class ConfiguredReader(TurnReader):
 def values(document: Any, path: str) -> Iterator[Any]:
     """Every value at a dotted path; nothing for an empty path."""
     if not path:
+        return
+    if path.startswith("["):
+        condition, _, rest = path[1:].partition("]")
+        name, _, wanted = condition.partition("=")
+        if isinstance(document, dict) and document.get(name) == wanted:
+            yield from values(document, rest.removeprefix("."))
         return
     head, _, rest = path.partition(".")
     if head == "*":

@@ -34,6 +34,10 @@ class SessionState(msgspec.Struct, kw_only=True):
         """Of the whole run."""
         return sum(self.used.values(), Usage())
 
+    def usage_without(self, session: str | None) -> Usage:
+        """Of all sessions but this one."""
+        return sum((usage for known, usage in self.used.items() if known != session), Usage())
+
     def take(self, session: str, usage: Usage, *, cumulative: bool) -> None:
         """Books what a turn used, once it is over."""
         if cumulative:

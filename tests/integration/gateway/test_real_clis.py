@@ -1,6 +1,7 @@
 """The real CLIs against a model API on loopback that makes them edit a file and submit. Opt-in, since they are large:
 
-    npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.197
+    npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.197 \\
+        @google/gemini-cli@0.61.0 @qwen-code/qwen-code@0.15.10
     EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin python -m pytest tests/integration/gateway/test_real_clis.py
 
 Nothing leaves the machine: the keys are made up, and the settings folders are the test's own.
@@ -11,12 +12,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 from cli_stage import play, settings
 from model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
 
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.agent_config import AgentConfig, read_agent
 
+AGENTS = Path(__file__).parents[3] / "examples" / "agents"
 CLIS = os.environ.get("EVOPOLICY_REAL_CLIS", "")
 
 pytestmark = pytest.mark.skipif(
@@ -93,3 +96,35 @@ def test_the_real_cli_with_a_wrong_key_ends_the_run(tmp_path: Path, harness: str
     assert played.ending is not None
     assert played.ending.reason == "agent_failed"
     assert "401" in played.ending.detail
+
+
+@pytest.mark.parametrize("name", ["gemini", "qwen"])
+def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("GEMINI_API_KEY", "OPENAI_API_KEY"):
+        monkeypatch.setenv(variable, "stub-0123456789abcdef")
+    # With a base URL of its own Gemini CLI has to be told in its settings that there is a key.
+    (tmp_path / ".gemini").mkdir()
+    (tmp_path / ".gemini/settings.json").write_text(
+        '{"security": {"auth": {"selectedType": "gemini-api-key"}}}'
+    )
+    told = read_agent(AGENTS / f"{name}.toml")
+    with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
+        variables = {
+            "GOOGLE_GEMINI_BASE_URL": api.base_url,
+            "OPENAI_BASE_URL": f"{api.base_url}/v1",
+            "PATH": f"{CLIS}:{os.environ['PATH']}",
+        }
+        config = msgspec.structs.replace(told, environment=variables, backoff_s=0.001)
+        played = play(
+            tmp_path, config, "", budget=4, GEMINI_API_KEY="stub-0123456789", OPENAI_API_KEY="stub-0123456789"
+        )
+    assert played.ending is not None
+    assert played.ending.reason == "agent_stopped", played.ending.detail
+    assert [text for _, text in played.turns] == ["first", "second"]
+    assert "first" in str(api.requests[-1])
+    tokens = played.ending.facts["tokens"]
+    assert tokens["input_noncached"] == 4 * (INPUT - CACHED)
+    assert tokens["cache_read"] == 4 * CACHED
+    assert tokens["output"] == 4 * OUTPUT

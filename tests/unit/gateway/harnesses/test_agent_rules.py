@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import pytest
 from cli_stage import FAKES, play, settings
 from hypothesis import given
@@ -15,9 +16,12 @@ from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
 from evopolicy_gateway.harnesses.clock import AgentClock
 from evopolicy_gateway.harnesses.codex import usage_of
-from evopolicy_gateway.harnesses.configured import ConfiguredCli, values
+from evopolicy_gateway.harnesses.configured import ConfiguredCli, ConfiguredReader, values
 from evopolicy_gateway.harnesses.redaction import Redaction
 from evopolicy_gateway.harnesses.trouble import MAX_BACKOFF_S, backoff_s, trouble_of
+from evopolicy_gateway.harnesses.usage import Usage
+
+EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
 
 
 @pytest.mark.parametrize(
@@ -157,6 +161,88 @@ def test_a_cli_without_a_harness_is_described_in_a_file(tmp_path: Path) -> None:
     facts = played.ending.facts
     assert (facts["harness"], facts["cli_version"]) == ("qwen", "1.2.3")
     assert facts["tokens"] == {"input_noncached": 12, "cache_read": 8, "cache_creation": 0, "output": 4}
+
+
+FAKE_KIMI = """#!/usr/bin/env python3
+import sys
+sys.path.insert(0, {fakes!r})
+from fake_stream import emit, scenario, submit
+if sys.argv[1:] == ["--version"]:
+    print("2.1.0")
+    sys.exit()
+name = scenario()
+if name == "error":
+    emit({{"type": "error", "code": "rate_limit", "message": "429 rate limited", "retryable": True}})
+    sys.exit(75)
+call = {{"type": "function", "id": "tc_1", "function": {{"name": "Bash", "arguments": '{{"command": "curl"}}'}}}}
+emit({{"role": "assistant", "content": "", "tool_calls": [call]}})
+emit({{"role": "tool", "tool_call_id": "tc_1", "content": str(submit(2)), "session_id": "not this one"}})
+emit({{"role": "assistant", "content": "made it better"}})
+emit({{"role": "meta", "type": "session.resume_hint", "session_id": "s-7", "content": "To resume"}})
+"""
+
+
+def test_the_example_file_of_kimi_speaks_its_documented_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KIMI_MODEL_API_KEY", "key-0123456789")
+    program = tmp_path / "fake-kimi"
+    program.write_text(FAKE_KIMI.format(fakes=str(FAKES)))
+    program.chmod(0o755)
+    config = msgspec.structs.replace(
+        read_agent(EXAMPLES / "kimi.toml"), program=(str(program),), backoff_s=0.001
+    )
+    played = play(tmp_path, config, "work,error,work", 4, KIMI_MODEL_API_KEY="key-0123456789")
+    assert played.ending is not None
+    assert (played.ending.reason, played.ending.turns, played.ending.retries) == ("agent_stopped", 2, 1)
+    assert [text for _, text in played.turns] == ["made it better"] * 2
+    assert any(doing.action == '{"command": "curl"}' for doing in played.doings)
+    assert played.starts[0][:2] == ["--prompt", played.prompts[0]["message"]]
+    assert played.starts[2][:2] == ["--session", "s-7"]
+    assert "tokens" not in played.ending.facts
+
+
+def test_the_example_files_of_other_clis_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("GEMINI_API_KEY", "OPENAI_API_KEY", "KIMI_MODEL_API_KEY"):
+        monkeypatch.setenv(name, "set")
+    docs = (EXAMPLES.parents[1] / "docs" / "agents.md").read_text()
+    files = sorted(EXAMPLES.glob("*.toml"))
+    assert [path.stem for path in files] == ["gemini", "kimi", "qwen"]
+    for path in files:
+        agent = make(f"file:{path}", EXAMPLES)
+        assert (agent.name, agent.resumable) == (path.stem, True)
+        assert f"examples/agents/{path.name}" in docs
+    assert (EXAMPLES / "qwen.toml").read_text().partition("\n#")[2].partition("\n")[2] in docs
+
+
+def test_an_event_counts_only_where_its_path_allows_it() -> None:
+    paths = TokenPaths(
+        input="u.in", cache_read="u.cached", output="u.out", total="u.all", input_includes_cached=True
+    )
+    events = Events(error=("[type=result].error.message",), text=("[role=assistant].content",), tokens=paths)
+    reader = ConfiguredReader(events)
+    reader.read({"type": "tool_result", "error": {"message": "no such file"}})
+    reader.read({"type": "message", "role": "user", "content": "the prompt"})
+    assert (reader.trouble, reader.text) == (None, "")
+    reader.read({"type": "message", "role": "assistant", "content": "done"})
+    # What is counted above input and output is reasoning.
+    reader.read({"type": "result", "u": {"in": 10, "cached": 4, "out": 2, "all": 15}})
+    assert (reader.text, reader.usage) == ("done", Usage(input_noncached=6, cache_read=4, output=5))
+    reader.read({"type": "result", "error": {"message": "429 too many requests"}})
+    assert reader.trouble is not None
+    assert list(values({"a": [{"k": "x", "v": 1}, {"k": "y", "v": 2}]}, "a.*.[k=y].v")) == [2]
+    for odd in ("[", "[a", "[a=", "]", "[k=x]", "a..b"):
+        assert list(values({"k": 1}, odd)) == []
+
+
+def test_an_effort_that_would_not_reach_the_cli_is_refused() -> None:
+    cli = Cli(first=("--think", "{effort}"))
+    config = AgentConfig(harness="x", program=("x",), effort="high", cli=cli)
+    assert ConfiguredCli(config).arguments(None, resume=False, prompt="", options="") == ["--think", "high"]
+    none = msgspec.structs.replace(config, effort=None)
+    assert ConfiguredCli(none).arguments(None, resume=False, prompt="", options="") == []
+    with pytest.raises(ConfigError, match="effort = 'high'"):
+        msgspec.structs.replace(config, cli=Cli(first=("go",))).check()
 
 
 def test_arguments_of_a_configured_cli_are_filled_in_once() -> None:
