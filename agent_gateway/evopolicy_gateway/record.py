@@ -217,6 +217,7 @@ def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
         data_valid_hash=finished.split_hashes.get("validation", ""),
         data_heldout_hash=finished.split_hashes.get("heldout", ""),
         fingerprint=known,
+        fingerprint_overrides=finished.fingerprint_overrides,
         data_secret=finished.split_secret,
         initial_policy_hash=staged.initial_policy_hash if staged else None,
         env_deterministic=finished.deterministic,

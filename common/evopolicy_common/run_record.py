@@ -193,7 +193,10 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     data_valid_hash: str
     data_heldout_hash: str
     fingerprint: dict[str, str]
-    """Library to version, as the workers that played it reported."""
+    """Library to version, as the workers that it began with reported."""
+    fingerprint_overrides: tuple[str, ...] = ()
+    """`CLASS → CLASS: why` for each time an operator let it go on with workers of other versions; empty where one class
+    played it all."""
     data_secret: bool = True
     """False when the splits came from a small public seed."""
     initial_policy_hash: str | None = None

@@ -93,6 +93,7 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     env_version: str
     deterministic: bool
     fingerprint: Fingerprint | None
+    """Of the worker that the run was pinned by."""
     created_at: float
     closed_at: float
     finished_at: float
@@ -104,6 +105,8 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """Repeated attempts of one job whose results differed."""
     audit: AuditRecord | None = None
     """None where nothing was to be audited and no forger is known."""
+    fingerprint_overrides: tuple[str, ...] = ()
+    """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -82,12 +82,16 @@ def refuse_mixtures(runs: Iterable[Run]) -> None:
 
 
 def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
-    """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words."""
+    """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words, and how an operator changed it."""
     items = [set(run.record.versions.fingerprint.items()) for run in runs]
     common = set.intersection(*items)
-    return lambda run: " ".join(
-        f"{k}={v}" for k, v in sorted(set(run.record.versions.fingerprint.items()) - common)
-    )
+
+    def beside(run: Run) -> str:
+        versions = run.record.versions
+        words = [f"{k}={v}" for k, v in sorted(set(versions.fingerprint.items()) - common)]
+        return " ".join([*words, *(f"then {each}" for each in versions.fingerprint_overrides)])
+
+    return beside
 
 
 def _in_question(env: str, runs: list[Run]) -> list[Mixture]:

@@ -275,6 +275,7 @@ def _result(
         infrastructure_retries=state.infrastructure_retries,
         nondeterministic_results=state.nondeterministic_results,
         audit=audit.record(core, run),
+        fingerprint_overrides=state.overrides,
     )
 
 

@@ -81,6 +81,7 @@ def finished(**fields: Any) -> RunFinished:
             ),
         ),
         "wall_s": {"queue": 0.5, "rollout": 3.0, "finalise": 2.5},
+        "fingerprint_overrides": ("a → b: the old workers are gone",),
     }
     return RunFinished(**usual | fields)
 
@@ -114,6 +115,7 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     assert [one.message for one in record.rejected_submits] == ["no"]
     assert record.experiment_dimensions.n_heldout == 2
     assert record.versions.fingerprint["numpy"] == "2.4"
+    assert record.versions.fingerprint_overrides == ("a → b: the old workers are gone",)
 
 
 @pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])

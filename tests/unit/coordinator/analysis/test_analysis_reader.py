@@ -207,6 +207,17 @@ def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, found:
     assert [mixture.what for mixture in mixtures(runs)] == [IN_QUESTION] * refused
 
 
+def test_a_run_that_workers_of_other_versions_went_on_with_is_not_like_the_others(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS)
+    run = write_run(tmp_path, VERSIONS, entry="Agent B")
+    record = json.loads((run / "run.json").read_text())
+    record["versions"]["fingerprint_overrides"] = ["a → b: the old workers are gone"]
+    (run / "run.json").write_text(json.dumps(record))
+    (mixture,) = mixtures(load_runs([tmp_path]).runs)
+    assert mixture.what == "fingerprint"
+    assert mixture.values == {"none": 1, "then a → b: the old workers are gone": 1}
+
+
 def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS)
     write_run(tmp_path, VERSIONS, entry="Agent B")
