@@ -22,6 +22,8 @@ from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 from evopolicy_gateway.watch import PHASES, first_line, harmless
 
 _SHOWN_ROWS = 24
+_STYLES = ("bold", "red", "dim", "dim", "")
+"""Of rows by `_order`: running, failed, with another host, waiting, ended."""
 
 
 class Row:
@@ -207,9 +209,12 @@ class TableView(LinesView):
         table = Table(box=None, pad_edge=False)
         for title in ("run", "budget", "submits", "best mean", "tokens", "state", "last action"):
             table.add_column(title, no_wrap=True, overflow="ellipsis", justify="left")
-        names = sorted(self.rows, key=lambda name: _order(self.rows[name]))
+        # Of those that ended, the last come first.
+        newest = sorted(self.rows, key=lambda name: _ended(self.rows[name]), reverse=True)
+        names = sorted(newest, key=lambda name: _order(self.rows[name]))
         for name in names[:_SHOWN_ROWS]:
-            table.add_row(*(Text(cell) for cell in (name, *_cells(self.rows[name]))))
+            style = _STYLES[_order(self.rows[name])]
+            table.add_row(*(Text(cell, style) for cell in (name, *_cells(self.rows[name]))))
         hidden = len(names) - _SHOWN_ROWS
         more = [Text(f"… and {hidden} more")] if hidden > 0 else []
         return Group(table, *more, Text(self.totals()))
@@ -274,6 +279,10 @@ def _order(row: Row) -> int:
     return kinds.get(row.state, 2 if row.state.startswith("on ") else 4)
 
 
+def _ended(row: Row) -> str:
+    return "" if row.entry is None else row.entry.finished_at
+
+
 def _cells(row: Row) -> tuple[str, ...]:
     progress, tokens = row.progress, _tokens(row.tokens)
     state = row.state.replace("_", " ")
@@ -282,15 +291,16 @@ def _cells(row: Row) -> tuple[str, ...]:
     elif row.state == "running" and progress is not None and progress.submit_id is not None:
         state = f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes}"
     if row.entry is not None and row.entry.score is not None:
-        state = f"score {_number(row.entry.score)}"
-    used = (
-        ""
-        if progress is None
-        else f"{progress.episode_budget - progress.remaining_budget}/{progress.episode_budget}"
-    )
+        state = f"score {_number(row.entry.score)} (random {_number(row.entry.random)})"
+    used = submits = ""
+    if progress is not None:
+        used = f"{progress.episode_budget - progress.remaining_budget}/{progress.episode_budget}"
+        submits = str(progress.n_submits)
+    elif row.entry is not None:
+        used, submits = str(row.entry.budget_used), str(row.entry.n_submits)
     return (
         used,
-        "" if progress is None else str(progress.n_submits),
+        submits,
         "" if progress is None else _number(progress.best_mean),
         _short(tokens) if tokens else "",
         state,

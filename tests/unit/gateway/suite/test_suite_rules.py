@@ -227,8 +227,18 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     out = io.StringIO()
     console = Console(file=out, width=160)
     view = TableView([run.name for run in runs], 2, console)
-    first, second = runs[0], runs[1]
-    view.kept(first.name, entry(first, state="completed", score=-1.25, wall_s=60.0))
+    first, second, third, failed = runs[:4]
+    known = entry(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")
+    view.kept(first.name, known)
+    later = {
+        "score": 2.5,
+        "random": 0.5,
+        "budget_used": 7,
+        "n_submits": 3,
+        "finished_at": "2026-01-02T00:00:00Z",
+    }
+    view.finished(third.name, entry(third, state="completed", wall_s=60.0, **later))
+    view.finished(failed.name, entry(failed, state="error", error="no key"))
     view.started(second.name, 1)
     view.progress(second.name, Progress(episode_budget=16, remaining_budget=10, n_submits=2, best_mean=-3.5))
     tokens = {"input_noncached": 1000, "cache_read": 500, "output": 0}
@@ -240,4 +250,9 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     assert "1.5k" in text
     assert "$ curl /submit" in text
     assert "score -1.25" in text
-    assert "1 of 7 runs done, 1 running, 1.5k tokens, about 3 min left" in text
+    assert "2 of 7 runs done, 1 running, 1 failed, 1.5k tokens, about 2 min left" in text
+    # What goes on, what failed, what waits, and what ended: the last first.
+    rows = [line for line in text.splitlines() if line.startswith(("evolve/", "GPT/")) and ":" not in line]
+    names = [line.split()[0] for line in rows]
+    assert names == [second.name, failed.name, *(run.name for run in runs[4:]), third.name, first.name]
+    assert rows[-2].split()[1:] == ["7", "3", "score", "2.5", "(random", "0.5)"]
