@@ -110,7 +110,9 @@ def _limits(run: RunOpened) -> str:
         ("CPU time in one episode", f"{limits.cpu_s:g} s"),
         ("memory beside Python and the allowed packages", _size(limits.memory_bytes)),
         ("threads (no processes may be started)", str(limits.processes)),
-        ("files written", _size(limits.file_bytes)),
+        ("files written", f"{_size(limits.file_bytes)}, {limits.files:,} files"),
+        ("open files", str(limits.open_files)),
+        ("one action, beyond 16 bytes for each of its numbers", _size(limits.action_bytes)),
         ("kept of stdout and of stderr", f"{_size(limits.output_bytes)} each"),
     ]
     if limits.submit_wall_s is not None:

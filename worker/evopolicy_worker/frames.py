@@ -25,6 +25,8 @@ REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
 MAX_REPLY_BYTES = (1 << 20) + (1 << 16)
 MAX_DEPTH = 24
+VALUE_BYTES = 16
+"""An action of so many bytes may hold one value for each such piece of them: Python's objects take more than bytes do."""
 
 Writer = Callable[[Any], list[Any]]
 """From an observation to the buffers of its payload, in order."""
@@ -143,6 +145,23 @@ def _text_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
     return step
 
 
+def elements(space: SpaceSchema) -> int:
+    """How many numbers and characters a value of this space has at most."""
+    if space["type"] == "Dict":
+        return sum(map(elements, space["spaces"].values()))
+    if space["type"] == "Tuple":
+        return sum(map(elements, space["spaces"]))
+    if space["type"] == "Text":
+        return int(space["max_length"])
+    if space["type"] == "Discrete":
+        return 1
+    if space["type"] == "MultiDiscrete":
+        return int(np.size(space["nvec"]))
+    if space["type"] == "MultiBinary":
+        return int(np.prod(space["n"], dtype=np.int64))
+    return int(np.prod(space["shape"], dtype=np.int64))
+
+
 def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
     """The first request: what the policy's process is to be, and its bundle."""
     head = json.dumps(init).encode()
@@ -150,8 +169,11 @@ def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
     return [REQUEST_HEADER.pack(length, INIT, len(head)), head, files]
 
 
-def action(tag: int, payload: bytes) -> Any:
-    """What `act` returned. BadReplyError for what is no action at all; whether it is valid is not decided here."""
+def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
+    """What `act` returned. BadReplyError for what is no action at all; whether it is valid is not decided here.
+
+    `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of.
+    """
     try:
         if tag == ARRAY:
             return _array(payload)
@@ -163,7 +185,8 @@ def action(tag: int, payload: bytes) -> Any:
             return _FLOAT.unpack(payload)[0]
         if tag == GENERIC:
             value = _decoder.decode(payload)
-            _check_depth(value, MAX_DEPTH)
+            if (n := _values(value, MAX_DEPTH)) > max_values:
+                raise ValueError(f"it holds {n:,} values; {max_values:,} are the limit")
             return value
     except (struct.error, msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError) as error:
         raise BadReplyError(f"what it sent as an action cannot be read: {error}") from error
@@ -198,13 +221,16 @@ def _ext_hook(code: int, data: memoryview) -> Any:
 _decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
-def _check_depth(value: Any, left: int) -> None:
+def _values(value: Any, left: int) -> int:
+    """How many values it is made of; ValueError when it nests deeper than `left`."""
     if left < 0:
         raise ValueError(f"it nests deeper than {MAX_DEPTH}")
+    n = 1
     if isinstance(value, dict):
+        n += len(value)
         value = value.values()
     elif not isinstance(value, list):
-        return
+        return n
     for item in value:
-        if isinstance(item, dict | list):
-            _check_depth(item, left - 1)
+        n += _values(item, left - 1) if isinstance(item, dict | list) else 1
+    return n

@@ -23,9 +23,6 @@ from evopolicy_worker.monitor import Monitor, Watch
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import DEATH_TIMEOUT_S, Child, Exit, Zygote, wait_dead
 
-MAX_DESCRIPTORS = 256
-MAX_FILES = 4096
-"""Files and folders that a policy may make beside its bundle's."""
 _DENIED = frozenset(
     {
         *SIMULATORS,
@@ -36,6 +33,8 @@ _DENIED = frozenset(
 _GRACE_S = 1.0
 _SEAL_S = 60.0
 """For what is our own work before the bundle is imported."""
+_ARRAY_HEAD_BYTES = 8 + 4 * 64
+"""Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
 _STAGES: dict[str, FailureCategory] = {
@@ -93,6 +92,7 @@ class PolicyProcess:
         self._watch = Watch(child, limits, count_threads=not self._enclosed)
         self._base_bytes = _address_space(child.host_pid)
         self._write: frames.Writer = list
+        self._action_bytes = 0
         self._exit: Exit | None = None
         self._finished: Ended | None = None
         self._closing = threading.Lock()
@@ -114,12 +114,13 @@ class PolicyProcess:
         Raises PolicyFailedError with a category of NO_POLICY.
         """
         limits = self._limits
+        self._action_bytes = limits.action_bytes + 16 * frames.elements(env_meta["action_space"])
         n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
         rlimits = {
             "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
             "RLIMIT_CPU": math.ceil(cpu_s) + 2,
             "RLIMIT_FSIZE": limits.file_bytes,
-            "RLIMIT_NOFILE": MAX_DESCRIPTORS,
+            "RLIMIT_NOFILE": limits.open_files,
             "RLIMIT_CORE": 0,
             "RLIMIT_MEMLOCK": 0,
             "RLIMIT_MSGQUEUE": 0,
@@ -131,7 +132,7 @@ class PolicyProcess:
         init = {
             "home": self._home,
             "home_bytes": limits.file_bytes + sum(-(-size // 4096) * 4096 for _, _, size in bundle.names),
-            "home_inodes": MAX_FILES + len(bundle.names) + n_folders,
+            "home_inodes": limits.files + len(bundle.names) + n_folders,
             "files": bundle.names,
             "limits": rlimits,
             "seed": seed.hex(),
@@ -139,6 +140,7 @@ class PolicyProcess:
             "action_space": env_meta["action_space"],
             "env_meta": env_meta,
             "observations": observations,
+            "action_bytes": self._action_bytes,
         }
         self._write = frames.compile_writer(env_meta["obs_space"])
         if self._child.host_pid:
@@ -179,8 +181,11 @@ class PolicyProcess:
             [frames.REQUEST_HEADER.pack(length, frames.ACT, 0), *parts], 16 + length
         )
         if tag <= frames.GENERIC:
+            if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
+                how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
+                raise self._broken(how)
             try:
-                return frames.action(tag, payload)
+                return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
         raise self._told(tag, payload, "act")
@@ -314,13 +319,13 @@ class PolicyProcess:
                 "file_limit",
                 limits.file_bytes,
                 limits.file_bytes,
-                f"files: {limits.file_bytes:,} bytes written are the limit, {MAX_FILES:,} files",
+                f"files: {limits.file_bytes:,} bytes written are the limit, {limits.files:,} files",
             ),
             "descriptors": (
                 "file_limit",
-                MAX_DESCRIPTORS,
-                MAX_DESCRIPTORS,
-                f"files: {MAX_DESCRIPTORS} open descriptors are the limit",
+                limits.open_files,
+                limits.open_files,
+                f"files: {limits.open_files} open descriptors are the limit",
             ),
             "processes": (
                 "process_limit",

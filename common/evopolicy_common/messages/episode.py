@@ -55,8 +55,15 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Threads of the policy process; it may start no process."""
     file_bytes: int = 64 << 20
     """What it may write to its copy of `system/` and `/tmp`, bytes together."""
+    files: int = 4096
+    """Files and folders that it may make there, beside its bundle's."""
+    open_files: int = 256
+    """Its open file descriptors, the five that it starts with among them."""
     output_bytes: int = 64 << 10
     """What is kept of each of stdout and stderr of an episode, bytes."""
+    action_bytes: int = 16 << 10
+    """What one action may take beyond 16 bytes for each number or character that the action space has, bytes; it may be
+    made of as many values as there are 16 bytes in that."""
     submit_wall_s: float | None = None
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 

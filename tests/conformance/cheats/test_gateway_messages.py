@@ -53,7 +53,10 @@ ALLOWED: dict[str, dict[str, str]] = {
         "memory_bytes": "int",
         "processes": "int",
         "file_bytes": "int",
+        "files": "int",
+        "open_files": "int",
         "output_bytes": "int",
+        "action_bytes": "int",
         "submit_wall_s": "float | none",
     },
     "RunState": {

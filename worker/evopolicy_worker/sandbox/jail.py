@@ -63,6 +63,7 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
     config: dict[str, object] = {
         "become_nobody": False,
         "namespaces": tier == "bwrap",
+        "devices": [device for device in _DEVICES if os.path.exists(device)],
         # An interpreter that is installed there must stay visible; the policy's TMPDIR is elsewhere in any case.
         "own_tmp": not any(path.startswith("/tmp/") for path in files.read),
         "packages": _PACKAGES,

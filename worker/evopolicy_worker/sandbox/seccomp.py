@@ -3,8 +3,11 @@
 Rules that this module owns:
 - What is not listed is refused (EPERM; ENOSYS for numbers younger than the lists, so that a C library falls back).
 - No process is ever made: `fork` and the like answer EAGAIN, as at a process limit. Threads are allowed.
-- No sockets, no signals to anyone else, no mounts, namespaces, keyrings, shared memory, file locks (two sandboxes that
-  see the same read-only file could talk through its locks), `memfd` (not counted against any limit) or CPU affinity.
+- No sockets, no signals to anyone else, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
+  limit) or CPU affinity.
+- Sandboxes show the same read-only files, and nothing of them may carry a message: no locks, no waiting for each other on a
+  mapped page (a futex that is not private to the process), no looking at or changing what of them is in memory. Nor is
+  there a view of the machine's memory and load.
 - The filter is for one process: its own pid is put in place of `PID_MARK` when it seals itself.
 """
 
@@ -40,6 +43,20 @@ _IOCTL = (
     0x5450,
     0x5451,
 )  # TCGETS, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX
+_MADVISE = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    8,
+    14,
+    15,
+    16,
+    17,
+)  # MADV_NORMAL, _RANDOM, _SEQUENTIAL, _WILLNEED, _DONTNEED, _FREE, _HUGEPAGE, _NOHUGEPAGE, _DONTDUMP, _DODUMP
+_FUTEX_PRIVATE = 128
+_FUTEX_WAIT, _FUTEX_WAIT_BITSET = 0, 9
 _PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
@@ -84,6 +101,26 @@ def policy_filter() -> bytes:
     if machine == "x86_64":
         program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
     blocks = {
+        # Its caller looks at the word again, as after any other wake; the C library's join of a thread asks so.
+        "futex": [
+            (_LOAD, 0, 0, _argument(1)),
+            (_AND, 0, 0, _FUTEX_PRIVATE),
+            (_JUMP_EQUAL, 0, 1, _FUTEX_PRIVATE),
+            _ALLOWED,
+            (_LOAD, 0, 0, _argument(1)),
+            (_AND, 0, 0, 0x7F),
+            (_JUMP_EQUAL, 1, 0, _FUTEX_WAIT),
+            (_JUMP_EQUAL, 0, 1, _FUTEX_WAIT_BITSET),
+            _refuse(errno.EAGAIN),
+            _refuse(errno.EINVAL),
+        ],
+        # Advice, which may be ignored.
+        "fadvise64": [_refuse(0)],
+        "readahead": [_refuse(0)],
+        "madvise": _one_of(2, _MADVISE, errno.EINVAL),
+        # The C library uses `preadv` where no flag is asked for.
+        "preadv2": [_refuse(errno.ENOSYS)],
+        "pwritev2": [_refuse(errno.ENOSYS)],
         "ioctl": _one_of(1, _IOCTL, errno.ENOTTY),
         "fcntl": _one_of(1, _FCNTL, errno.EPERM),
         "prctl": _one_of(0, _PRCTL, errno.EPERM),

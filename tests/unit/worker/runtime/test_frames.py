@@ -83,6 +83,7 @@ def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, pay
         b"\xdd\xff\xff\xff\xff",
         b"\xc7\x05\x01junk!",
         b"\x92\x01",
+        b"\xdc\x08\x00" + b"\x90" * 2048,
     ],
 )
 def test_impossible_arrays_and_nests_are_refused(payload: bytes) -> None:
@@ -106,6 +107,7 @@ def test_both_ends_agree_on_the_numbers() -> None:
         "GENERIC",
         "FAILED",
         "FAULT",
+        "VALUE_BYTES",
     ):
         assert getattr(frames, name) == getattr(player, name), name
     assert frames.REQUEST_HEADER.format == player.REQUEST_HEADER.format
@@ -115,13 +117,16 @@ def test_both_ends_agree_on_the_numbers() -> None:
 def test_an_action_that_cannot_be_sent_is_told() -> None:
     endless: list[Any] = []
     endless.append(endless)
-    for action in (endless, 1 << 5000, np.zeros(1 << 20), ["x" * (1 << 20)] * 3):
+    for action in (endless, 1 << 5000, np.zeros(1 << 20), ["x" * (1 << 20)] * 3, [1.0] * 4000, [[]] * 2000):
         with pytest.raises(ValueError, match="the action"):
             player.encoded(action)
 
 
-CHECKED = {"ioctl", "fcntl", "prctl", "prlimit64", "clone", "clone3", "fork", "vfork", "kill", "tgkill"}
-"""Calls that depend on their arguments."""
+CHECKED = {
+    *("ioctl", "fcntl", "prctl", "prlimit64", "clone", "clone3", "fork", "vfork", "kill", "tgkill"),
+    *("futex", "madvise", "fadvise64", "readahead", "preadv2", "pwritev2"),
+}
+"""Calls that depend on their arguments, or are refused in a way of their own."""
 
 
 def allowed(program: bytes, number: int, *arguments: int) -> int:
@@ -176,6 +181,26 @@ def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.Mo
     assert allowed(program, prctl, 4, 1) & 0xFFFF == 1
     assert allowed(program, mount) & 0xFFFF == 1
     assert allowed(program, 0x40000000) == seccomp._KILL_PROCESS
+
+
+def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
+    program = seccomp.policy_filter()
+    futex, madvise, fadvise, preadv2, flock, sysinfo = 202, 28, 221, 327, 73, 99
+    private, realtime = 128, 256
+    for command in (0, 1, 9, 10, 13):  # wait, wake, wait and wake by bits, wait for a PI lock and requeue
+        assert allowed(program, futex, 0, command | private) == seccomp._ALLOW
+        assert allowed(program, futex, 0, command | private | realtime) == seccomp._ALLOW
+    for wait in (0, 9, 9 | realtime):
+        assert allowed(program, futex, 0, wait) & 0xFFFF == 11  # look again: what a join of a thread does
+    for wake in (1, 3, 4, 5, 10, 13):
+        assert allowed(program, futex, 0, wake) & 0xFFFF == 22
+    assert allowed(program, madvise, 0, 0, 4) == seccomp._ALLOW  # given back by an allocator
+    assert allowed(program, madvise, 0, 0, 21) & 0xFFFF == 22  # out of memory for everybody
+    assert allowed(program, fadvise) == seccomp._ERRNO  # taken, and ignored
+    assert allowed(program, preadv2) & 0xFFFF == 38
+    for number in (flock, sysinfo):
+        assert allowed(program, number) & 0xFFFF == 1
 
 
 def test_on_an_unknown_processor_there_is_no_filter_and_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:

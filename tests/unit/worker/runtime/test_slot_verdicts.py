@@ -9,7 +9,7 @@ import pytest
 from slots import HONEST, QUICK, Slots, rows
 
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
-from evopolicy_worker import environments
+from evopolicy_worker import environments, frames
 from evopolicy_worker.episodes import random_actions
 
 SHELL = """
@@ -89,6 +89,15 @@ def played_on_with_random_actions(outcome: EpisodeOutcome, step: int) -> bool:
             "8 threads",
         ),
         (policy(act="os.fork()"), "process_limit", 3, "no process may be started"),
+        (policy(act="return [None] * 2000"), "act_error", 3, "2,001 values; 1,025 are the limit"),
+        (policy(act="return np.zeros(5000)"), "act_error", 3, "40,000 bytes; 16,400 are the limit"),
+        (policy(act="raise ValueError('\\ud800')"), "act_error", 3, "ValueError: \\ud800"),
+        (
+            policy(act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})"),
+            "act_error",
+            3,
+            "cannot be shown",
+        ),
         (policy(act="import subprocess; subprocess.run(['/bin/true'])"), "process_limit", 3, "no process"),
     ],
 )
@@ -169,6 +178,40 @@ def test_a_submit_that_yields_no_policy_has_an_outcome_for_every_episode(slots: 
     assert [outcome.index for outcome in outcomes] == [0, 1, 2]
     assert {outcome.failure.category for outcome in outcomes if outcome.failure} == {"import_error"}
     assert {outcome.length for outcome in outcomes} == {0}
+
+
+def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
+    few = limits(open_files=40, files=20, action_bytes=512)
+    sources = {
+        policy(act="self.f = [open('/dev/null') for _ in range(60)]"): ("file_limit", "40 open descriptors"),
+        policy(act="[open(f'f{k}', 'w') for k in range(60)]"): ("file_limit", "20 files"),
+        policy(act="return [0.0] * 99"): ("act_error", "more than 528 bytes"),
+    }
+    for source, (category, words) in sources.items():
+        assert slots.play(source, limits=limits(files=1000)).failure is None
+        failure = slots.play(source, limits=few).failure
+        assert failure is not None
+        assert failure.category == category
+        assert words in failure.message
+
+
+def test_a_forged_action_beyond_the_limit_ends_the_policy(slots: Slots) -> None:
+    forged = "os.write(4, (20000).to_bytes(4, 'little') + bytes([5, 0, 0, 0]) + bytes(20000)); time.sleep(60)"
+    failure = slots.play(policy(act=forged)).failure
+    assert failure is not None
+    assert (failure.category, "20,000 bytes; 16,400 are the limit" in failure.message) == ("killed", True)
+
+
+def test_what_a_policy_may_return_grows_with_the_action_space() -> None:
+    box = {"type": "Box", "shape": [3, 4], "dtype": "float32"}
+    spaces = {
+        "a": box,
+        "b": {"type": "Text", "min_length": 0, "max_length": 9},
+        "c": {"type": "Discrete", "n": 5},
+    }
+    rest = [{"type": "MultiDiscrete", "nvec": [4, 4]}, {"type": "MultiBinary", "n": [2, 3]}]
+    whole = {"type": "Tuple", "spaces": [{"type": "Dict", "spaces": spaces}, *rest]}
+    assert frames.elements(whole) == 12 + 9 + 1 + 2 + 6
 
 
 def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: Slots) -> None:

@@ -26,11 +26,14 @@ INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
-MAX_ACTION_BYTES = 1 << 20
 MAX_ACTION_DEPTH = 16
+VALUE_BYTES = 16
+"""As many bytes as an action may have, so many values may it hold at this size each."""
 MAX_TEXT = 16_000
 
 libc = ctypes.CDLL(None, use_errno=True)
+action_bytes = 16 << 10
+"""What one action may take, bytes; told with the policy."""
 
 Reader = Callable[[Any, Any], Any]
 """From the buffer (and where the next text begins, or the payload's length) to the observation or a part of it."""
@@ -38,6 +41,8 @@ Reader = Callable[[Any, Any], Any]
 
 def play(init: dict[str, Any]) -> NoReturn:
     """Builds the Policy and answers for it until told to end."""
+    global action_bytes
+    action_bytes = init["action_bytes"]
     seed_generators(bytes.fromhex(init["seed"]))
     os.environ.pop("PWD", None)
     os.environ["HOME"] = init["home"]
@@ -199,20 +204,24 @@ def encoded(action: Any) -> bytes:
     if kind is int and -(1 << 63) <= action < 1 << 63:
         return struct.pack("<IBxxxq", 8, INT, action)
     if kind is np.ndarray and action.dtype.kind in "biuf" and action.itemsize <= 8:
-        if action.nbytes > MAX_ACTION_BYTES:
-            raise ValueError(f"the action has {action.nbytes} bytes; {MAX_ACTION_BYTES} are the limit")
+        if action.nbytes > action_bytes:
+            raise ValueError(f"the action has {action.nbytes:,} bytes; {action_bytes:,} are the limit")
         data = array_data(action)
         return REPLY_HEADER.pack(len(data), ARRAY) + data
     if isinstance(action, np.integer) and kind is not np.uint64:
         return struct.pack("<IBxxxq", 8, INT, int(action))
     if kind is float:
         return struct.pack("<IBxxxd", 8, FLOAT, action)
-    if kind is list and 0 < len(action) < 10_000:
+    if kind is list and 0 < 8 * len(action) <= action_bytes:
         kinds = set(map(type, action))
         if kinds == {float}:
             return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
     out = bytearray()
-    pack(action, out, 0)
+    n = pack(action, out, 0)
+    if len(out) > action_bytes:
+        raise ValueError(f"the action has {len(out):,} bytes; {action_bytes:,} are the limit")
+    if n > action_bytes // VALUE_BYTES:
+        raise ValueError(f"the action holds {n:,} values; {action_bytes // VALUE_BYTES:,} are the limit")
     return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
 
 
@@ -231,12 +240,13 @@ def array_data(array: Any) -> bytes:
     return head + bytes(array.tobytes())
 
 
-def pack(value: Any, out: bytearray, depth: int) -> None:
-    """Appends `value` as msgpack; what has no form there goes as the name of its type."""
+def pack(value: Any, out: bytearray, depth: int) -> int:
+    """Appends `value` as msgpack; what has no form there goes as the name of its type. How many values it holds."""
+    n = 1
     if depth > MAX_ACTION_DEPTH:
         raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
-    if len(out) > MAX_ACTION_BYTES:
-        raise ValueError(f"the action has more than {MAX_ACTION_BYTES} bytes")
+    if len(out) > action_bytes:
+        raise ValueError(f"the action has more than {action_bytes:,} bytes, which are the limit")
     if isinstance(value, np.generic):
         value = np.asarray(value) if value.dtype.kind == "f" else value.item()
     if value is None:
@@ -260,12 +270,12 @@ def pack(value: Any, out: bytearray, depth: int) -> None:
     elif isinstance(value, list | tuple):
         out += struct.pack(">BI", 0xDD, len(value))
         for item in value:
-            pack(item, out, depth + 1)
+            n += pack(item, out, depth + 1)
     elif isinstance(value, dict):
         out += struct.pack(">BI", 0xDF, len(value))
         for key, item in value.items():
-            pack(str(key), out, depth + 1)
-            pack(item, out, depth + 1)
+            n += pack(str(key), out, depth + 1)
+            n += pack(item, out, depth + 1)
     elif hasattr(value, "__array__"):
         array = np.asarray(value)
         if array.dtype.kind == "f" and array.itemsize > 8:
@@ -273,9 +283,10 @@ def pack(value: Any, out: bytearray, depth: int) -> None:
         if array.dtype.kind in "biuf":
             extension(1, array_data(array), out)
         else:
-            pack(array.tolist(), out, depth + 1)
+            n += pack(array.tolist(), out, depth + 1)
     else:
         pack(f"<{type(value).__name__}>", out, depth)
+    return n
 
 
 def extension(code: int, data: bytes, out: bytearray) -> None:
@@ -293,22 +304,29 @@ def reply(tag: int, payload: bytes) -> None:
 
 def reply_failure(stage: str, error: BaseException) -> None:
     """Tells what the policy's own code raised. Its text is the policy's to forge; it names its own failure only."""
-    try:
+    kind, text, message, missing = None, "", "an exception that cannot be shown", None
+    # A hostile exception may raise when it is looked at; what is known by then is told.
+    with contextlib.suppress(BaseException):
         frames = error.__traceback__
         while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
             frames = frames.tb_next
-        text = "".join(traceback.format_exception(type(error), error, frames))
+        kind = kind_of(error)
         message = "".join(traceback.format_exception_only(type(error), error)).strip().rpartition("\n")[2]
-    except BaseException:
-        text, message = "", type(error).__name__
+        text = "".join(traceback.format_exception(type(error), error, frames))
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
     report = {
         "stage": stage,
-        "kind": kind_of(error),
-        "message": message[:2000],
-        "traceback": text[-MAX_TEXT:],
-        "missing": getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None,
+        "kind": kind,
+        "message": sendable(message[:2000]),
+        "traceback": sendable(text[-MAX_TEXT:]),
+        "missing": sendable(missing) if type(missing) is str else None,
     }
-    reply(FAILED, json.dumps(report, default=str).encode())
+    reply(FAILED, json.dumps(report).encode())
+
+
+def sendable(text: str) -> str:
+    """Half surrogates, which have no form in UTF-8, as Python writes them."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def kind_of(error: BaseException | None) -> str | None:

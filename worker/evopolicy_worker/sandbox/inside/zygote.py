@@ -24,7 +24,7 @@ import traceback
 from typing import Any
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
-MS_NOSUID, MS_NODEV, MS_BIND, MS_REC, MS_PRIVATE = 2, 4, 4096, 16384, 1 << 18
+MS_RDONLY, MS_NOSUID, MS_NODEV, MS_REMOUNT, MS_BIND, MS_REC, MS_PRIVATE = 1, 2, 4, 32, 4096, 16384, 1 << 18
 NOBODY = 65534
 PID_MARK = 0x7FFFABCD
 MAX_TEXT = 16_000
@@ -51,6 +51,8 @@ def main() -> None:
         sys.path.append(config["packages"])
         warm(config["warm"])
         if config["namespaces"]:
+            for device in config["devices"]:
+                protect(device)
             # Tried once here, so that a host which cannot do it is told at the start.
             fork_isolated(os.pidfd_open(os.getpid()), probe=True)
     except BaseException as error:
@@ -88,6 +90,14 @@ def wait_if_parent(child: int, control: socket.socket) -> None:
         control.close()
         _, status = os.waitpid(child, 0)
         os._exit(os.waitstatus_to_exitcode(status) & 0x7F)
+
+
+def protect(device: str) -> None:
+    """Read-only, which leaves a device's data as it is: who may write could set its times, for all the machine to see."""
+    # These may not be taken away in a namespace, so they are named again; ST_ and MS_ are the same numbers.
+    flags = os.statvfs(device).f_flag & (os.ST_NOSUID | os.ST_NODEV | os.ST_NOEXEC)
+    flags |= MS_REMOUNT | MS_BIND | MS_RDONLY
+    check(libc.mount(None, device.encode(), None, flags, None), f"protect {device}")
 
 
 def warm(modules: list[str]) -> None:
@@ -211,8 +221,10 @@ def policy_process(config: dict[str, Any], fds: list[int]) -> None:
 
 
 def arrange_descriptors(fds: list[int]) -> None:
-    """Requests on 3, replies on 4, output on 1 and 2; everything else closed."""
+    """Requests on 3, replies on 4, output on 1 and 2, an empty input of its own on 0; everything else closed."""
     high = [os.dup2(fd, 100 + k) for k, fd in enumerate(fds)]
+    # Not the zygote's: the flags of an open file are the same for all who share it, and would outlive the episode.
+    os.dup2(os.open("/dev/null", os.O_RDWR), 0)
     for fd, target in zip(high, (player.REQUESTS, player.REPLIES, 1, 2), strict=True):
         os.dup2(fd, target)
     os.closerange(5, 1024)
