@@ -131,12 +131,17 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def defining(self) -> dict[str, Any]:
-        """Everything that makes it this run and no other; the attempt and operational settings do not."""
-        config = None if self.config is None else msgspec.to_builtins(self.config)
-        if config is not None:
-            config = {name: value for name, value in config.items() if name not in _OPERATIONAL}
-        settings = msgspec.to_builtins(msgspec.structs.replace(self.settings, attempt=1))
-        del settings["replays"]  # recorded once all is over, it changes nothing of the run
+        """Everything that makes it this run and no other; the attempt and operational settings do not.
+
+        What is as usual is left out, so that a setting which a later version adds makes no other run of it.
+        """
+        config = None
+        if self.config is not None:
+            told = _unusual(msgspec.to_builtins(self.config), msgspec.to_builtins(AgentConfig(harness="")))
+            config = {name: value for name, value in told.items() if name not in _OPERATIONAL}
+        usual = RunSettings(env="", entry="", model="", exp_id="", attempt=self.settings.attempt)
+        settings = _unusual(msgspec.to_builtins(self.settings), msgspec.to_builtins(usual))
+        settings.pop("replays", None)  # recorded once all is over, it changes nothing of the run
         found = {"agent": self.harness, "config": config, "settings": settings, "agent_wall_s": self.wall_s}
         # What a jail shows (`read`) is where programs lie, which differs from host to host.
         reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
@@ -286,6 +291,17 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         parallel=agent.parallel,
         jail=agent.jail,
     )
+
+
+def _unusual(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
+    """What differs from the usual, inner tables too."""
+    found = {name: value for name, value in told.items() if name not in usual or value != usual[name]}
+    return {
+        name: _unusual(value, usual[name])
+        if isinstance(value, dict) and isinstance(usual.get(name), dict)
+        else value
+        for name, value in found.items()
+    }
 
 
 def _limits(told: dict[str, float]) -> ResourceLimits:

@@ -42,6 +42,7 @@ heldout = 4
 """
 
 
+MORE = ("limits", "notes", "n_heldout")
 JAIL = '[agents.jail]\nhosts = ["h"]\n'
 
 
@@ -180,16 +181,24 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
             assert decision.kind == "keep"
             continue
         changes = decision.why.partition("now: ")[2]
-        assert changes.startswith(
-            'config.model is "gpt-6", was "gpt-5.5", config.effort is "high", was not set'
-        )
-        assert changes.endswith("budget is 32, was 16 and 4 more")
+        assert 'config.model is "gpt-6", was "gpt-5.5"' in changes
+        assert 'config.effort is "high", was not set' in changes
+        assert changes.endswith("and 4 more")
     only_budget = suite_in(tmp_path, FILE.replace("budget = 16", "budget = 32"))[1]
     known = entry(
         was := before[only_budget.name], settings=msgspec.to_builtins(was.defining), state="completed"
     )
     why = decide(only_budget, Found(status="completed", entry=known), "keep").why
     assert why == "the file has other settings for it now: budget is 32, was 16"
+
+
+def test_a_setting_that_a_later_version_adds_makes_no_other_run(tmp_path: Path) -> None:
+    for run in suite_in(tmp_path, FILE.replace("budget = 16", "limits = { act_wall_s = 2.0 }")):
+        told = run.defining
+        assert set(told["settings"]) <= {"env", "entry", "model", "exp_id", "repeat", "budget", *MORE}
+        if run.agent == "GPT":
+            assert told["config"] == {"harness": "codex", "model": "gpt-5.5"}
+            assert told["settings"]["limits"] == {"act_wall_s": 2.0}
 
 
 def test_what_a_jail_lets_through_makes_another_run_and_where_programs_lie_does_not(tmp_path: Path) -> None:

@@ -282,7 +282,7 @@ def test_a_run_is_told_to_the_cluster_as_soon_as_it_is_open(
     result = stage.cluster.told[-1][2]
     assert result is not None
     assert (result["run"], result["state"]) == (f"run of {name}", "completed")
-    assert index.runs[name].settings["settings"]["budget"] is None
+    assert index.runs[name].settings["settings"]["env"] == "toy/line"
 
 
 def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluster(
