@@ -9,7 +9,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import typer
@@ -64,8 +64,8 @@ class Operator:
             "status", StatusRequest(token=self.token), StatusReply, patience_s=10.0
         )
 
-    async def set_worker(self, worker: str, *, draining: bool) -> None:
-        message = SetWorker(token=self.token, worker=worker, state="draining" if draining else "active")
+    async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
+        message = SetWorker(token=self.token, worker=worker, state=state)
         await self._ask.until_answered("worker", message, Done, patience_s=10.0)
 
     async def cancel_run(self, run: str) -> None:
@@ -133,8 +133,19 @@ def drain(
     file: CredentialsFile = None,
 ) -> None:
     """Give a worker no more work: it finishes what runs, then ends."""
-    _asking(connect, file, lambda operator: operator.set_worker(worker, draining=True))
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "draining"))
     typer.echo(f"{worker} is draining")
+
+
+@workers_app.command(epilog="Example: evopolicy workers pause lab-3f2a")
+def pause(
+    worker: Annotated[str, typer.Argument(help="The worker's name.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Give a worker no more work until it is resumed: it finishes what it holds, and stays."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "paused"))
+    typer.echo(f"{worker} is paused")
 
 
 @workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
@@ -143,8 +154,8 @@ def resume(
     connect: Connect = None,
     file: CredentialsFile = None,
 ) -> None:
-    """Take a drained worker back, or one that was quarantined by an audit."""
-    _asking(connect, file, lambda operator: operator.set_worker(worker, draining=False))
+    """Take a worker back that was paused or drained, or quarantined by an audit."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "active"))
     typer.echo(f"{worker} is active")
 
 

@@ -395,7 +395,7 @@ class Checkers:
                 self._early_since.pop(name, None)
 
     def _drained(self, core: Core) -> None:
-        for name in core.fleet.draining:
+        for name in core.fleet.out_of_service:
             worker = core.fleet.workers.get(name)
             if worker is not None:
                 late = [
@@ -403,7 +403,7 @@ class Checkers:
                     for lease in worker.leases.values()
                     if lease.granted_at > self.drained_at.get(name, 1e18) and not lease.doubtful
                 ]
-                want(not late, "a draining worker gets no work", name, late)
+                want(not late, "a worker out of service gets no work", name, late)
 
     def logged(self, log: Log) -> None:
         if log.event == "job_retried":

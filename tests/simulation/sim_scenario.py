@@ -66,6 +66,7 @@ class Simulation:
         self.gateways: list[SimGateway] = []
         # In one seed of four, so that the others show what holds without audits.
         self.audit_share = (0.3, 1.0)[seed // 4 % 2] if seed % 4 == 0 else 0.0
+        self._out_of_service = ("draining", "paused")[seed % 2]
         self.slanderer = "w1" if seed % 8 == 4 else None
         """The worker that lies about what it plays again; players are honest, so all runs come to what they must."""
         settings = CoreSettings(audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S)
@@ -134,7 +135,7 @@ class Simulation:
         self.coordinator.receive(name, events.LivenessLost, {"worker": name}, lambda message: None)
 
     def _drain(self) -> None:
-        """An operator drains a worker and takes it back later."""
+        """An operator takes a worker out of service and back later."""
         name = self._some_worker().name
         operator = self.operators[0]
 
@@ -146,7 +147,7 @@ class Simulation:
             self.checkers.drained_at.pop(name, None)
             operator.ask(events.WorkerStateSet, {"worker": name, "state": "active"}, lambda message: None)
 
-        operator.ask(events.WorkerStateSet, {"worker": name, "state": "draining"}, drained)
+        operator.ask(events.WorkerStateSet, {"worker": name, "state": self._out_of_service}, drained)
 
     # ---- running ----
 

@@ -248,7 +248,8 @@ class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
 class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
     token: str
     worker: str
-    state: Literal["active", "draining"]
+    state: Literal["active", "paused", "draining"]
+    """paused: it gets no more work and stays. draining: it gets no more, and ends once what it plays is done."""
 
 
 class Done(Message, frozen=True, kw_only=True, tag="ok"):
@@ -296,7 +297,7 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     worker: str
     host: str
     slots: int
-    state: Literal["active", "draining", "lost", "quarantined"]
+    state: Literal["active", "paused", "draining", "lost", "quarantined"]
     tiers: tuple[Tier, ...]
     environments: tuple[str, ...]
     fingerprint: str

@@ -107,11 +107,11 @@ class EvaluationPolled(Event, frozen=True, kw_only=True):
 
 
 class WorkerStateSet(Event, frozen=True, kw_only=True):
-    """An operator drained a worker, or took it back."""
+    """An operator drained or paused a worker, or took it back."""
 
     request: RequestId
     worker: str
-    state: Literal["active", "draining"]
+    state: Literal["active", "paused", "draining"]
 
 
 # ---- gateways ----

@@ -7,7 +7,7 @@ Rules that this module owns:
 - A name is its machine's as long as the worker is there.
 - Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it hands in
   from then on is not taken. An operator may take it back.
-- Draining and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
+- Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
 """
 
 from __future__ import annotations
@@ -116,13 +116,13 @@ def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
 
 
 def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
-    if event.state == "draining" and event.worker in core.fleet.quarantined:
+    if event.state != "active" and event.worker in core.fleet.quarantined:
         text = f"{event.worker} is quarantined: {core.fleet.quarantined[event.worker]}"
         turn.refuse(event.request, "quarantined", text)
         return
     turn.persist(WorkerRow(worker=event.worker, state=event.state))
     worker = core.fleet.workers.get(event.worker)
-    if worker is not None and event.state == "draining":
+    if worker is not None and event.state != "active":
         core.scheduler.drop_poll(worker, turn)
     core.fleet.set_state(event.worker, event.state)
     if worker is not None:

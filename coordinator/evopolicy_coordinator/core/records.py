@@ -177,7 +177,7 @@ class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
     """An operator's word on a worker, or an audit's. Key: `worker`."""
 
     worker: str
-    state: Literal["active", "draining", "quarantined"]
+    state: Literal["active", "paused", "draining", "quarantined"]
     reason: str = ""
     """Why it is quarantined."""
     machine: str = ""

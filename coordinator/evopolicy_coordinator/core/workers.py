@@ -4,7 +4,8 @@ Rules that this module owns:
 - A worker is named; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of the
   new one may claim them for a short while, then they are lost like a lost worker's.
 - Workers of one profile (environments, tiers, fingerprint class) are interchangeable but for what they have warm.
-- A worker that is draining, lost, quarantined, benched or taken by a suspect gets no more work.
+- A worker that is paused, draining, lost, quarantined, benched or taken by a suspect gets no more work. One that is
+  draining is told to end once what it plays is done; one that is paused stays, and is as before when it is taken back.
 - A worker whose jobs keep failing through its own fault is benched for a growing time.
 """
 
@@ -27,6 +28,8 @@ from .queue import Flow, Profile, Queue
 from .settings import CoreSettings
 from .timers import Timers
 from .turn import Turn
+
+OutOfService = Literal["draining", "paused"]
 
 BENCH_AFTER = 3
 """Failures in a row, with nothing played in between, after which a worker is benched."""
@@ -66,7 +69,7 @@ class Worker:
     """Whose credentials it joined with; empty for those that the state folder hands out."""
     numerics: str = ""
     """What its numbers depend on: equal for workers that come to the same bits, the processor's features included."""
-    state: Literal["active", "draining", "lost", "quarantined"] = "active"
+    state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; given-up ones too, until the worker no longer names them."""
     held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
@@ -100,8 +103,8 @@ class Fleet:
         self._queue = queue
         self._timers = timers
         self.workers: dict[str, Worker] = {}
-        self.draining: dict[str, None] = {}
-        """Names that an operator drained; kept over restarts."""
+        self.out_of_service: dict[str, OutOfService] = {}
+        """Names that an operator drained or paused; kept over restarts."""
         self.quarantined: dict[str, str] = {}
         """Names that an audit found to forge, and why; until an operator takes them back."""
         self.quarantined_machines: dict[str, str] = {}
@@ -166,12 +169,12 @@ class Fleet:
         return profile
 
     def _count_in(self, worker: Worker) -> None:
-        worker.state = "draining" if worker.name in self.draining else "active"
+        worker.state = self.out_of_service.get(worker.name, "active")
         if worker.state == "active":
             worker.profile.workers[worker.name] = None
             worker.profile.slots += worker.slots
 
-    def count_out(self, worker: Worker, state: Literal["draining", "lost", "quarantined"] = "lost") -> None:
+    def count_out(self, worker: Worker, state: Literal[OutOfService, "lost", "quarantined"] = "lost") -> None:
         """No more work for it."""
         if worker.state == "active":
             del worker.profile.workers[worker.name]
@@ -185,17 +188,17 @@ class Fleet:
     def set_state(
         self,
         name: str,
-        state: Literal["active", "draining", "quarantined"],
+        state: Literal["active", OutOfService, "quarantined"],
         reason: str = "",
         machine: str = "",
     ) -> None:
         """An operator's word, or an audit's; holds for a worker that is not there yet, too."""
-        self.draining.pop(name, None)
+        self.out_of_service.pop(name, None)
         if self.quarantined.pop(name, None) is not None:
             machines = self.quarantined_machines
             self.quarantined_machines = {each: of for each, of in machines.items() if of != name}
-        if state == "draining":
-            self.draining[name] = None
+        if state == "draining" or state == "paused":
+            self.out_of_service[name] = state
         elif state == "quarantined":
             self.quarantined[name] = reason
             if machine:
@@ -217,7 +220,8 @@ class Fleet:
         request, worker.beat = worker.beat, None
         self._timers.disarm(("beat", worker.name))
         assert request is not None
-        turn.reply(request, wire.HeartbeatReply(cancelled=stop, drain=worker.name in self.draining))
+        drain = self.out_of_service.get(worker.name) == "draining"
+        turn.reply(request, wire.HeartbeatReply(cancelled=stop, drain=drain))
 
     # ---- availability ----
 
@@ -236,8 +240,10 @@ class Fleet:
 
     def unpark(self, worker: Worker) -> None:
         profile = worker.profile
-        if profile.parked.pop(worker.name, self) is self or worker.poll is None:
+        if worker.name not in profile.parked:
             return
+        assert worker.poll is not None
+        del profile.parked[worker.name]
         for item in worker.poll.warm:
             there = profile.warm[item]
             there.pop(worker.name, None)

@@ -74,20 +74,25 @@ def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> N
     asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
-def test_drained_worker_gets_no_work_until_it_is_taken_back(coordinator: Coordinator) -> None:
+@pytest.mark.parametrize(("command", "state"), [("drain", "draining"), ("pause", "paused")])
+def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
+    coordinator: Coordinator, command: str, state: str
+) -> None:
+    name = f"w-{state}"
+
     async def scenario() -> None:
-        async with operator_of(coordinator) as operator, working(coordinator, "w-drained") as worker:
-            while "w-drained" not in [found.worker for found in (await operator.status()).workers]:
+        async with operator_of(coordinator) as operator, working(coordinator, name) as worker:
+            while name not in [found.worker for found in (await operator.status()).workers]:
                 await asyncio.sleep(0.02)
-            assert (await called(coordinator, "workers", "drain", "w-drained")).exit_code == 0
-            created = await operator.create("drain")
+            assert (await called(coordinator, "workers", command, name)).exit_code == 0
+            created = await operator.create(command)
             async with gateway_of(coordinator, created) as gateway:
                 await gateway.submit(bundle_of("# policy"), (0,), "key")
                 await asyncio.sleep(0.3)
                 assert not [job for job in worker.jobs if created.run in job.job_id]
                 states = {found.worker: found.state for found in (await operator.status()).workers}
-                assert states["w-drained"] == "draining"
-                assert (await called(coordinator, "workers", "resume", "w-drained")).exit_code == 0
+                assert states[name] == state
+                assert (await called(coordinator, "workers", "resume", name)).exit_code == 0
                 await gateway.results(0)
                 assert [job for job in worker.jobs if created.run in job.job_id]
 

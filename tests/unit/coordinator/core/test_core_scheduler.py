@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Literal
 
+import pytest
 from core_rig import BUNDLE, Rig, result, split_of
 
 from evopolicy_common.messages import operator
@@ -264,22 +266,26 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     assert override.endswith(f" → {named}: the old host is gone")
 
 
-def test_a_draining_worker_gets_no_more_work_also_after_a_restart() -> None:
+@pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])
+def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
+    state: Literal["draining", "paused"], ends: bool
+) -> None:
     rig = Rig()
     session = rig.register()
     rig.create()
     rig.submit(0, 1)
     (lease, _) = rig.poll(session, 2)
-    answer = rig.tell(events.WorkerStateSet(request="drain", worker="w1", state="draining"))
+    answer = rig.tell(events.WorkerStateSet(request="out", worker="w1", state=state))
     assert isinstance(answer, operator.Done)
-    assert rig.beat(session, lease).drain
+    assert rig.beat(session, lease).drain is ends
     rig.play(session, lease)
     assert rig.poll(session, 1) == []
     rig.load()
     session = rig.register()
     rig.pass_time(5.0)
-    assert rig.beat(session).drain
+    assert rig.beat(session).drain is ends
     assert rig.poll(session) == []
+    assert [each.state for each in rig.core.status(rig.now).workers] == [state]
     rig.tell(events.WorkerStateSet(request="back", worker="w1", state="active"))
     assert len(rig.poll(session)) == 1
 
