@@ -100,7 +100,7 @@ curl -sS $auth$info_url
 
 ## Submit
 
-`env_instances` lists train ids from 0 to $last_id, `$example` or `"0-3,7"`; order and repeats are kept. A submit has $least
+`env_instances` lists train ids from 0 to $last_id, `$example` or `"$ranges"`; order and repeats are kept. A submit has $least
 to $most episodes. **Every episode asked for is charged**, also when the policy crashes. One submit at a time.
 
 ```bash
@@ -186,6 +186,8 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
     """The text for one run."""
     n_example = max(run.min_episodes_per_submit, min(2, run.max_episodes_per_submit, run.episode_budget))
     example = [index % run.n_env_instances for index in range(n_example)]
+    most = min(run.max_episodes_per_submit, run.episode_budget)
+    usual = run.n_env_instances > 7 and run.min_episodes_per_submit <= 5 <= most
     scope = (
         "Every episode gets a fresh process and a fresh `Policy`."
         if run.policy_scope == "episode"
@@ -196,9 +198,10 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         env=run.env.env,
         budget=run.episode_budget,
         least=run.min_episodes_per_submit,
-        most=min(run.max_episodes_per_submit, run.episode_budget),
+        most=most,
         last_id=run.n_env_instances - 1,
         example=str(example),
+        ranges="0-3,7" if usual else _ranges(n_example, run.n_env_instances),
         scope=scope,
         imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "nothing else",
         first_submit=submit_id(0, run.episode_budget),
@@ -207,3 +210,10 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         info_url=urls.info,
         submit_url=urls.submit,
     )
+
+
+def _ranges(n_episodes: int, n_ids: int) -> str:
+    """So many episodes as a text of ranges."""
+    whole, rest = divmod(n_episodes, n_ids)
+    lengths = [n_ids] * whole + [rest] * (rest > 0)
+    return ",".join("0" if length == 1 else f"0-{length - 1}" for length in lengths)

@@ -8,7 +8,12 @@ import re
 import sys
 from pathlib import Path
 
-from gateway_double import Served, served
+from gateway_double import Served, opened, served
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evopolicy_gateway.agents_md import NO_URLS, agents_md
+from evopolicy_gateway.submit_request import Bounds, parse
 
 PATIENCE_S = 30.0
 
@@ -65,3 +70,21 @@ def test_every_path_in_the_rules_exists_after_a_submit(tmp_path: Path) -> None:
                 assert (s.folder.workspace / path).exists()
 
     asyncio.run(main())
+
+
+@given(data=st.data(), n_ids=st.integers(1, 70), budget=st.integers(1, 300))
+def test_every_example_request_is_accepted_in_a_run_of_any_size(
+    data: st.DataObject, n_ids: int, budget: int
+) -> None:
+    least = data.draw(st.integers(1, budget))
+    most = data.draw(st.integers(least, 300))
+    sizes = {"min_episodes_per_submit": least, "max_episodes_per_submit": most}
+    text = agents_md(opened(n_env_instances=n_ids, episode_budget=budget, **sizes), NO_URLS)
+    listed, ranges = re.findall(r"train ids from 0 to \d+, `(.*?)` or `(.*?)`", text)[0]
+    (posted,) = re.findall(r"-d '(.*?)' 'SUBMIT_URL'", text)
+    (submitted,) = re.findall(r"^answer = submit\((.*)\)$", text, re.MULTILINE)
+    bounds = Bounds(
+        n_env_instances=n_ids, min_episodes=least, max_episodes=min(most, budget), remaining_budget=budget
+    )
+    bodies = [posted, *(f'{{"env_instances": {ids}}}' for ids in (listed, ranges, submitted))]
+    assert all(parse(body.encode(), bounds) for body in bodies)
