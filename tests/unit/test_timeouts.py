@@ -38,7 +38,7 @@ WIRE = "tests/integration/transport/test_timeouts_on_the_wire.py::"
 GATEWAY = "tests/unit/gateway/test_gateway_timeouts.py::"
 DOORS = "tests/unit/gateway/jail/test_jail_doors.py::"
 CLIS = "tests/unit/gateway/harnesses/test_cli_agents.py::"
-COMMAND = "tests/integration/gateway/test_evopolicy_command.py::"
+COMMAND = "tests/integration/gateway/test_run_command.py::"
 
 TIMEOUTS: dict[str, str] = {
     # What a policy may take.

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
-import uuid
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import Command, command, toy_cluster, wait_until
 
 from evopolicy_common.run_record import decode_run_record
 
 FAKES = Path(__file__).parents[2] / "support" / "fake_clis"
-PATIENCE_S = 150.0
-MARK = "EVOTEST_MARK"
 
 SUITE = """
 name = "t"
@@ -63,65 +57,9 @@ def write_suite(folder: Path, codex: str = "work", claude: str = "work") -> None
     )
 
 
-class Sweep:
-    """A running `evopolicy suite`, with everything below it findable."""
-
-    def __init__(self, cwd: Path, *arguments: str) -> None:
-        self.mark = uuid.uuid4().hex
-        self.out = cwd / f"{self.mark}.out"
-        with self.out.open("wb") as out:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "evopolicy_gateway.cli", "suite", "t.toml", *arguments],
-                cwd=cwd,
-                env={**os.environ, "XDG_STATE_HOME": str(cwd / "xdg"), MARK: self.mark},
-                stdout=out,
-                stderr=subprocess.STDOUT,
-            )
-
-    @property
-    def text(self) -> str:
-        return self.out.read_text()
-
-    def finish(self) -> int:
-        return self.process.wait(timeout=PATIENCE_S)
-
-    def kill(self) -> None:
-        """SIGKILL to the command alone: what it started has to notice."""
-        self.process.kill()
-        self.process.wait()
-        wait_until(lambda: not self.alive(), self)
-
-    def alive(self) -> list[int]:
-        found = []
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdecimal():
-                with contextlib.suppress(OSError):
-                    state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-                    if state != "Z" and f"{MARK}={self.mark}".encode() in (entry / "environ").read_bytes():
-                        found.append(int(entry.name))
-        return found
-
-    def kill_all(self) -> None:
-        for pid in self.alive():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        self.process.wait()
-
-
-def wait_until(what: Any, sweep: Sweep) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not what():
-        assert time.monotonic() < deadline, sweep.text
-        time.sleep(0.05)
-
-
-@contextlib.contextmanager
-def sweep(cwd: Path, *arguments: str) -> Iterator[Sweep]:
-    running = Sweep(cwd, *arguments)
-    try:
-        yield running
-    finally:
-        running.kill_all()
+def sweep(cwd: Path, *arguments: str) -> AbstractContextManager[Command]:
+    """`evopolicy suite` on the file that `write_suite` wrote."""
+    return command(cwd, "suite", "t.toml", *arguments)
 
 
 def index_in(root: Path) -> dict[str, Any]:
@@ -134,24 +72,21 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
     root = tmp_path / "runs" / "t"
     sessions = [root / "fake codex/toy_line/t-0/.gateway", root / "fake claude/toy_line/t-0/.gateway"]
     with sweep(tmp_path, "--local") as first:
+        wait_until((root / "suite.json").exists, lambda: first.text)
         wait_until(
-            lambda: (
-                index_in(root).get("evolve/toy/line/0", {}).get("state") == "completed"
-                if (root / "suite.json").exists()
-                else False
-            ),
-            first,
+            lambda: index_in(root).get("evolve/toy/line/0", {}).get("state") == "completed",
+            lambda: first.text,
         )
-        wait_until(lambda: all(_turns(folder) == 1 for folder in sessions), first)
+        wait_until(lambda: all(_turns(folder) == 1 for folder in sessions), lambda: first.text)
         first.kill()
     evolved = root / "evolve/toy_line/t-0/run.json"
     written = evolved.stat().st_mtime_ns
     kept = [json.loads((folder / "session.json").read_text())["session"] for folder in sessions]
     with sweep(tmp_path, "--local") as second:
-        wait_until(lambda: "runs:" in second.text, second)
+        wait_until(lambda: "runs:" in second.text, lambda: second.text)
         second.kill()
     with sweep(tmp_path, "--local") as third:
-        assert third.finish() == 0, third.text
+        assert third.wait() == 0, third.text
         assert third.alive() == []
         text = third.text
     assert "1 kept" in text
@@ -169,7 +104,7 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
         assert session in starts.splitlines()[-1]
     assert {entry["state"] for entry in index_in(root).values()} == {"completed"}
     with sweep(tmp_path, "--local", "--dry-run") as after:
-        assert after.finish() == 0
+        assert after.wait() == 0
         assert "3 runs: 3 kept" in after.text
 
 
@@ -197,11 +132,11 @@ def test_a_run_without_a_session_is_begun_again_and_the_old_one_kept_aside(tmp_p
     root = tmp_path / "runs" / "t"
     feedback = root / "own/toy_line/t-0/workspace/feedback/submit_000/summary.json"
     with sweep(tmp_path, "--local") as first:
-        wait_until(feedback.exists, first)
+        wait_until(feedback.exists, lambda: first.text)
         first.kill()
     agent.write_text(agent.read_text().replace("3600", "0"))
     with sweep(tmp_path, "--local") as second:
-        assert second.finish() == 0, second.text
+        assert second.wait() == 0, second.text
         assert "begun again as a new attempt (its agent keeps no session" in second.text
     record = decode_run_record((root / "own/toy_line/t-0/run.json").read_bytes())
     assert record.attempt == 2
@@ -211,33 +146,9 @@ def test_a_run_without_a_session_is_begun_again_and_the_old_one_kept_aside(tmp_p
 
 @pytest.fixture
 def operator_file(tmp_path: Path) -> Iterator[Path]:
-    """Credentials for a coordinator with a worker of two slots."""
-    state = tmp_path / "s"
-    ready = tmp_path / "ready.json"
-    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "xdg")}
-    with (tmp_path / "cluster.log").open("wb") as log:
-        start = [sys.executable, "-m"]
-        coordinator = subprocess.Popen(
-            [*start, "evopolicy_coordinator.cli", "--state", str(state), "--ready-file", str(ready)],
-            env=environment,
-            stdout=log,
-            stderr=log,
-        )
-        deadline = time.monotonic() + PATIENCE_S
-        while not ready.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        credentials = json.loads(ready.read_text())["credentials"]
-        options = ["--env", "toy", "--slots", "2", "--grace", "0", "--credentials", credentials["worker"]]
-        worker = subprocess.Popen(
-            [*start, "evopolicy_worker.cli", *options], env=environment, stdout=log, stderr=log
-        )
-        try:
-            yield Path(credentials["operator"])
-        finally:
-            for process in (worker, coordinator):
-                process.terminate()
-                process.wait(timeout=PATIENCE_S)
+    """Credentials for a cluster of the test's own: sweeps of one name share what a coordinator knows of them."""
+    with toy_cluster(tmp_path) as file:
+        yield file
 
 
 def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, operator_file: Path) -> None:
@@ -246,8 +157,8 @@ def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, oper
         write_suite(host)
     arguments = ("--credentials", str(operator_file), "--parallel", "1")
     with sweep(hosts[0], *arguments) as one, sweep(hosts[1], *arguments) as two:
-        assert one.finish() == 0, one.text
-        assert two.finish() == 0, two.text
+        assert one.wait() == 0, one.text
+        assert two.wait() == 0, two.text
     records = [path for host in hosts for path in host.glob("runs/t/*/*/*/run.json")]
     assert sorted(path.parts[-4] for path in records) == ["evolve", "fake claude", "fake codex"]
     for host in hosts:
@@ -262,11 +173,11 @@ def test_a_dead_hosts_runs_are_taken_over(tmp_path: Path, operator_file: Path) -
     arguments = ("--credentials", str(operator_file), "--only", "fake codex/*")
     session = hosts[0] / "runs/t/fake codex/toy_line/t-0/workspace/.fake/starts"
     with sweep(hosts[0], *arguments) as one:
-        wait_until(session.exists, one)
+        wait_until(session.exists, lambda: one.text)
         one.kill()
     with sweep(hosts[1], *arguments) as two:
-        wait_until(lambda: "taken over" in two.text, two)
-        wait_until(lambda: "begins" in two.text, two)
+        wait_until(lambda: "taken over" in two.text, lambda: two.text)
+        wait_until(lambda: "begins" in two.text, lambda: two.text)
 
 
 def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
@@ -276,7 +187,7 @@ def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
     arguments = ("--credentials", str(operator_file), "--only", "fake claude/*")
     root = tmp_path / "runs" / "t"
     with sweep(tmp_path, *arguments) as first:
-        assert first.finish() == 1, first.text
+        assert first.wait() == 1, first.text
         assert "401" in first.text
     (entry,) = index_in(root).values()
     assert entry["state"] == "error"
@@ -284,7 +195,7 @@ def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
     # What the fake plays is told by its settings, which make another run of it.
     write_suite(tmp_path, claude="work")
     with sweep(tmp_path, *arguments, "--changed", "rerun") as second:
-        assert second.finish() == 0, second.text
+        assert second.wait() == 0, second.text
     (entry,) = index_in(root).values()
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
 
@@ -293,7 +204,7 @@ def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file
     write_suite(tmp_path)
     arguments = ("--credentials", str(operator_file), "--only", "evolve/*", "--json")
     with sweep(tmp_path, *arguments) as running:
-        assert running.finish() == 0, running.text
+        assert running.wait() == 0, running.text
         lines = [json.loads(line) for line in running.text.splitlines() if line.startswith("{")]
     kinds = [line["event"] for line in lines]
     assert kinds[0] == "planned"

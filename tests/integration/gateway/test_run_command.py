@@ -1,0 +1,209 @@
+"""`evopolicy run` on a cluster that is up: whole runs on the toy environments, by agents that do well, badly and nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from commands import agent, record_in, run_dir, run_on
+
+from evopolicy_common.summary import decode_summary
+
+
+def test_a_spoken_agent_gets_turns_until_it_stops_and_the_run_is_finalised(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+for line in sys.stdin:
+    prompt = json.loads(line)
+    answer = submit([prompt["turn"]])
+    print("a line of its own")
+    print(json.dumps({"turn": prompt["turn"], "text": answer["status"], "stop": prompt["turn"] == 1}), flush=True)
+"""
+    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 0
+    record = record_in(run_dir(tmp_path))
+    assert record.outcome.closed_reason == "agent_stopped"
+    assert record.outcome.budget_used == 2
+    assert record.agent.turns == 2
+    assert "agent stopped" in out
+    lines = [json.loads(line) for line in (run_dir(tmp_path) / "logs/agent.jsonl").read_text().splitlines()]
+    assert [line["turn"] for line in lines if line.get("type") == "prompt"] == [0, 1]
+    assert {"type": "stdout", "text": "a line of its own"} in lines
+    assert "4 episodes" not in lines[0]["message"]
+    assert "5 episodes of the budget are left" in next(
+        line["message"] for line in lines if line.get("turn") == 1 and "message" in line
+    )
+
+
+def test_an_agent_that_stays_when_its_budget_is_spent_is_ended_even_if_it_ignores_being_asked(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+import signal
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+submit([0, 1, 2, 3, 4, 5])
+time.sleep(1000)
+"""
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("budget_spent", 6)
+
+
+def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(operator_file: Path, tmp_path: Path) -> None:
+    exit_code, _, err = run_on(
+        operator_file, tmp_path, agent(tmp_path, "submit([0, 1])\ntime.sleep(1000)"), "--agent-wall-s", "2"
+    )
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used, outcome.status) == ("wall_limit", 2, "completed")
+
+
+def test_an_agents_children_are_gone_however_they_hide(operator_file: Path, tmp_path: Path) -> None:
+    code = """
+hide = (
+    "import os, signal, sys, time\\n"
+    "signal.signal(signal.SIGTERM, signal.SIG_IGN)\\n"
+    "os.setsid() if os.getsid(0) != os.getpid() else None\\n"
+    "if os.fork(): os._exit(0)\\n"
+    "open(sys.argv[1], 'w').write(str(os.getpid()))\\n"
+    "time.sleep(1000)\\n"
+)
+subprocess.Popen([sys.executable, "-c", hide, "child.pid"], start_new_session=True)
+while not os.path.exists("child.pid"):
+    time.sleep(0.01)
+submit([0])
+"""
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
+    assert exit_code == 0, err
+    child = int((run_dir(tmp_path) / "workspace" / "child.pid").read_text())
+    assert not Path(f"/proc/{child}").exists()
+
+
+BAD_INPUT = """
+from pathlib import Path
+system, policy = Path("system"), Path("system/policy.py")
+good = policy.read_text()
+log = []
+
+def case(name, env_instances=(0,)):
+    answer = submit(env_instances if isinstance(env_instances, str) else list(env_instances))
+    info = json.load(urllib.request.urlopen(os.environ["EVOPOLICYGYM_INFO_URL"]))
+    errors = Path("feedback", answer.get("submit_id", "-"), "errors.txt")
+    log.append([name, answer.get("status"), info["state"]["remaining_budget"],
+                json.loads(errors.read_text())["message"] if errors.exists() else answer.get("error", {}).get("message")])
+
+case("ids out of range", [64])
+case("backwards", "3-1")
+case("empty", [])
+policy.unlink(); case("missing policy")
+policy.symlink_to("/etc/passwd"); case("policy is a link"); policy.unlink()
+policy.write_text(good)
+(system / "link").symlink_to("/etc"); case("link beside"); (system / "link").unlink()
+with open(system / "big", "wb") as big: big.truncate(2 << 30)
+case("two gigabytes"); (system / "big").unlink()
+policy.write_text("class Policy(:\\n"); case("syntax error")
+policy.write_text("import gymnasium\\nclass Policy: ...\\n"); case("simulator")
+policy.write_text("class Other: ...\\n"); case("no class")
+policy.write_text(good.replace("self.action =", "raise ValueError('in init')\\n        self.action =")); case("init raises")
+policy.write_text(good.replace("return self.action", "return {'no': [object]}")); case("nonsense action")
+policy.write_text(good.replace("return self.action", "while True: pass")); case("never returns")
+policy.write_text(good.replace("return self.action", "raise RuntimeError('at once')")); case("act raises")
+Path("log.json").write_text(json.dumps(log))
+"""
+
+
+def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path, tmp_path: Path) -> None:
+    exit_code, _, err = run_on(
+        operator_file, tmp_path, agent(tmp_path, BAD_INPUT), "--budget", "20", "--limit", "act_wall_s=1"
+    )
+    assert exit_code == 0, err
+    folder = run_dir(tmp_path)
+    log = {
+        name: (status, left, message)
+        for name, status, left, message in json.loads((folder / "workspace" / "log.json").read_text())
+    }
+    expected = {
+        "ids out of range": ("invalid_env_instance", 20, "0 to 63"),
+        "backwards": ("invalid_env_instance", 20, "'1-3'"),
+        "empty": ("budget_invalid", 20, "0 episodes"),
+        "missing policy": ("missing_policy", 19, "policy.py"),
+        "policy is a link": ("missing_policy", 18, "symbolic link"),
+        "link beside": ("import_error", 17, "link is a symbolic link"),
+        "two gigabytes": ("import_error", 16, "2,147,483,648"),
+        "syntax error": ("import_error", 15, "invalid syntax"),
+        "simulator": ("denied_import", 14, "gymnasium"),
+        "no class": ("import_error", 13, "Policy"),
+        "init raises": ("init_error", 12, "in init"),
+        "nonsense action": ("ok", 11, None),
+        "never returns": ("ok", 10, None),
+        "act raises": ("ok", 9, None),
+    }
+    for name, (status, left, said) in expected.items():
+        assert log[name][:2] == (status, left), (name, log[name])
+        if said is not None:
+            assert said in log[name][2], (name, log[name])
+    feedback = folder / "workspace" / "feedback"
+    told = {}
+    for index, name in ((8, "nonsense action"), (9, "never returns"), (10, "act raises")):
+        errors = (feedback / f"submit_{index:03d}").glob("episodes/*/error.txt")
+        told[name] = [json.loads(error.read_text())["category"] for error in errors]
+    assert told == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
+    rows = (feedback / "submit_008/episodes").glob("*/trajectory.jsonl")
+    assert all(
+        json.loads(line)["info"]["action_invalid"] for path in rows for line in path.read_text().splitlines()
+    )
+    record = record_in(folder)
+    assert [one.status for one in record.rejected_submits] == ["invalid_env_instance"] * 2 + [
+        "budget_invalid"
+    ]
+    assert set(record.outcome.val_scores) == {"8", "9", "10"}
+
+
+def test_without_an_ok_submit_there_is_no_score_and_the_exit_code_says_so(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = "open('system/policy.py', 'w').write('1 / 0')\nsubmit([0, 1])"
+    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
+    assert exit_code == 3
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", None, None)
+    assert outcome.budget_used == 2
+    assert "no_ok_submit" in out
+
+
+def test_replay_submits_the_given_policies_in_order_with_even_shares(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"
+    for name, push in (("b", 0.5), ("a", -0.5)):
+        (tmp_path / "given" / name / "system").mkdir(parents=True)
+        (tmp_path / "given" / name / "system" / "policy.py").write_text(policy.format(push))
+    exit_code, _, err = run_on(operator_file, tmp_path, "replay:given", "--budget", "5")
+    assert exit_code == 0, err
+    folder = run_dir(tmp_path)
+    assert folder.parts[-3] == "replay-given"
+    sources = [(folder / f"checkpoints/submit_00{i}/system/policy.py").read_text() for i in range(2)]
+    assert "-0.5" in sources[0]
+    assert "-0.5" not in sources[1]
+    summaries = [
+        decode_summary((folder / f"workspace/feedback/submit_00{i}/summary.json").read_bytes())
+        for i in range(2)
+    ]
+    assert [summary.env_instances for summary in summaries] == [(0, 1, 2), (0, 1)]
+
+
+def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    stop_at_once = agent(tmp_path, "")
+    assert run_on(operator_file, tmp_path, stop_at_once)[0] == 3
+    before = (run_dir(tmp_path) / "run.json").read_bytes()
+    code, _, err = run_on(operator_file, tmp_path, stop_at_once)
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    assert "--overwrite" in err
+    assert (run_dir(tmp_path) / "run.json").read_bytes() == before
+    assert run_on(operator_file, tmp_path, stop_at_once, "--overwrite")[0] == 3
+    assert (run_dir(tmp_path) / "run.json").read_bytes() != before

@@ -1,0 +1,137 @@
+"""A run goes on when its gateway, its agent's keeper or its command dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+from commands import PATIENCE_S, agent, command, record_in, run_arguments, run_dir, run_on, wait_until
+
+
+def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:
+    code = """
+first = patient_submit([0, 1], "one")
+open("first", "w").write(json.dumps(first))
+while not os.path.exists("killed"):
+    time.sleep(0.02)
+second = patient_submit([2, 3], "two")
+again = patient_submit([0, 1], "one")
+open("again", "w").write(json.dumps(again))
+"""
+    with command(tmp_path, *run_arguments(operator_file, agent(tmp_path, code))) as running:
+        workspace = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace")])[0]
+        wait_until((workspace / "first").exists)
+        os.kill(running.running("evopolicy_gateway.serve_cli"), signal.SIGKILL)
+        (workspace / "killed").touch()
+        exit_code, out, err = running.finish()
+        assert exit_code == 0, err
+        assert running.alive() == []
+    assert "starting it again" in out
+    assert json.loads((workspace / "again").read_text()) == json.loads((workspace / "first").read_text())
+    record = record_in(run_dir(tmp_path))
+    assert record.outcome.budget_used == 4
+    assert sorted(path.name for path in (workspace / "feedback").iterdir()) == ["submit_000", "submit_001"]
+
+
+def test_a_killed_keeper_leaves_nothing_of_its_agent_which_is_begun_again(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+if os.path.exists("child.pid"):
+    open("gone", "w").write(str(not os.path.exists("/proc/" + open("child.pid").read())))
+    submit([1])
+    sys.exit()
+submit([0])
+hide = "import os, time\\nos.setsid()\\nopen('child.pid', 'w').write(str(os.getpid()))\\ntime.sleep(1000)"
+subprocess.Popen([sys.executable, "-c", hide])
+time.sleep(1000)
+"""
+    arguments = run_arguments(operator_file, agent(tmp_path, code))
+    with command(tmp_path, *arguments, "--jail", "none") as running:
+        found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
+        wait_until(found.read_text)
+        os.kill(running.running("evopolicy_gateway.harnesses.keeper"), signal.SIGKILL)
+        exit_code, out, err = running.finish()
+        assert exit_code == 0, err
+        assert running.alive() == []
+    assert "keeper died; starting it again" in " ".join(out.split())
+    assert (found.parent / "gone").read_text() == "True"
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
+
+
+def test_an_agent_whose_keeper_dies_again_and_again_has_failed(operator_file: Path, tmp_path: Path) -> None:
+    code = "submit([0])\nos.kill(os.getppid(), 9)\ntime.sleep(1000)"
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
+    assert exit_code == 0, err
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.closed_reason, outcome.budget_used) == ("agent_failed", 5)
+
+
+def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_told(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = """
+first = patient_submit([0, 1], "one")
+open("here", "w")
+if len(os.listdir("feedback")) < 2:
+    time.sleep(0 if os.path.exists("again") else 1000)
+patient_submit([2, 3], "two")
+"""
+    arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--resume"]
+    with command(tmp_path, *arguments) as running:
+        here = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])[0]
+        with command(tmp_path, *arguments) as second:
+            code_of_second, _, err = second.finish()
+        assert code_of_second == 2
+        assert "another command plays this run" in err
+        (here.parent / "again").touch()
+        running.process.kill()
+        with command(tmp_path, *arguments, "--validation", "3") as other:
+            code_of_other, _, err = other.finish()
+        assert code_of_other == 2
+        assert "other settings" in err
+        with command(tmp_path, *arguments) as again:
+            exit_code, out, err = again.finish()
+        assert exit_code == 0, err
+        wait_until(lambda: not running.alive())
+    assert "goes on with run" in out
+    record = record_in(run_dir(tmp_path))
+    assert (record.outcome.budget_used, record.outcome.closed_reason) == (4, "agent_stopped")
+    before = (run_dir(tmp_path) / "run.json").read_bytes()
+    with command(tmp_path, *arguments) as finished:
+        assert finished.finish()[0] == 0
+    assert (run_dir(tmp_path) / "run.json").read_bytes() == before
+
+
+def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: Path, tmp_path: Path) -> None:
+    waits = agent(tmp_path, "submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)")
+    with command(tmp_path, *run_arguments(operator_file, waits)) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        running.kill()
+    folder = run_dir(tmp_path)
+    known = re.findall(r"http://\S+/submit", (folder / "workspace" / "AGENTS.md").read_text())
+    by_hand = subprocess.Popen(
+        [sys.executable, "-m", "evopolicy_gateway.serve_cli", str(folder), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert by_hand.stdout is not None
+        urls = json.loads(by_hand.stdout.readline())
+        assert set(known) == {urls["EVOPOLICYGYM_SUBMIT_URL"]}
+        body = json.dumps({"env_instances": "0-3"}).encode()
+        with urllib.request.urlopen(urllib.request.Request(known[0], data=body)) as answer:
+            assert json.load(answer)["submit_id"] == "submit_001"
+        assert by_hand.wait(timeout=PATIENCE_S) == 0
+    finally:
+        by_hand.kill()
+        by_hand.communicate()
+    assert '"closed"' in (folder / ".gateway" / "journal.jsonl").read_text()

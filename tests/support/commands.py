@@ -1,0 +1,180 @@
+"""`evopolicy` as an operator starts it: a child process, everything below which can be found, and a cluster for it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from coordinator_harness import Coordinator
+
+from evopolicy_common.run_record import RunRecord, decode_run_record
+
+T = TypeVar("T")
+
+MARK = "EVOTEST_MARK"
+PATIENCE_S = 150.0
+SMALL = ["--budget", "6", "--validation", "2", "--heldout", "2"]
+
+AGENT = """
+import json, os, subprocess, sys, time, urllib.request
+
+def submit(body, **headers):
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": body}).encode(), headers=headers
+    )
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as error:
+        return json.load(error)
+
+def patient_submit(body, key):
+    while True:
+        try:
+            return submit(body, **{"Idempotency-Key": key})
+        except (OSError, ValueError):
+            time.sleep(0.1)
+"""
+
+
+def agent(folder: Path, code: str) -> str:
+    """`--agent` for a program with that code, which has `submit` and `patient_submit`."""
+    path = folder / "agent.py"
+    path.write_text(AGENT + code)
+    return f"command:{sys.executable} {path}"
+
+
+def wait_until(what: Callable[[], T], told: Callable[[], str] = lambda: "it did not come true") -> T:
+    """The first value that counts as true; AssertionError with what is `told` when none comes."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (value := what()):
+        assert time.monotonic() < deadline, told()
+        time.sleep(0.05)
+    return value
+
+
+class Command:
+    """`evopolicy` that runs; it and all that it starts carry a mark in their environment."""
+
+    def __init__(self, cwd: Path, *arguments: str) -> None:
+        self.mark = uuid.uuid4().hex
+        self._out, self._err = cwd / f"{self.mark}.out", cwd / f"{self.mark}.err"
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "evopolicy_gateway.cli", *arguments],
+                cwd=cwd,
+                env={**os.environ, "XDG_STATE_HOME": str(cwd / "xdg"), MARK: self.mark},
+                stdout=out,
+                stderr=err,
+            )
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    @property
+    def text(self) -> str:
+        """All that it has said."""
+        return self.out + self.err
+
+    def wait(self) -> int:
+        """Its exit code."""
+        return self.process.wait(timeout=PATIENCE_S)
+
+    def finish(self) -> tuple[int, str, str]:
+        """Exit code, standard output, standard error."""
+        return self.wait(), self.out, self.err
+
+    def alive(self) -> list[int]:
+        """The command and what it has started, as far as it lives."""
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdecimal():
+                with contextlib.suppress(OSError):
+                    state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+                    if state != "Z" and f"{MARK}={self.mark}".encode() in (entry / "environ").read_bytes():
+                        found.append(int(entry.name))
+        return found
+
+    def running(self, module: str) -> int:
+        """The one process below it that runs this module."""
+        (pid,) = [pid for pid in self.alive() if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        return pid
+
+    def kill(self) -> None:
+        """SIGKILL to the command alone: what it started has to notice, and is waited for."""
+        self.process.kill()
+        self.process.wait()
+        wait_until(lambda: not self.alive())
+
+    def kill_all(self) -> None:
+        for pid in self.alive():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.wait()
+
+
+@contextlib.contextmanager
+def command(cwd: Path, *arguments: str) -> Iterator[Command]:
+    """`evopolicy` with these arguments in `cwd`; nothing of it lives after the `with`."""
+    # The mark has to pass the agent's jail too.
+    marked = ("--jail-env", MARK) if arguments[0] in ("run", "local") else ()
+    running = Command(cwd, *arguments, *marked)
+    try:
+        yield running
+    finally:
+        running.kill_all()
+
+
+@contextlib.contextmanager
+def toy_cluster(root: Path) -> Iterator[Path]:
+    """The operator's credentials for a coordinator and a worker with two slots for the toy environments."""
+    coordinator = Coordinator(root / "s")
+    credentials = coordinator.ready["credentials"]
+    options = ["--env", "toy", "--slots", "2", "--grace", "0", "--credentials", credentials["worker"]]
+    with coordinator.log.open("ab") as log:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "evopolicy_worker.cli", *options],
+            env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
+            stdout=log,
+            stderr=log,
+        )
+    try:
+        yield Path(credentials["operator"])
+    finally:
+        worker.terminate()
+        worker.wait(timeout=PATIENCE_S)
+        coordinator.stop()
+
+
+def run_on(operator_file: Path, cwd: Path, agent_name: str, *more: str) -> tuple[int, str, str]:
+    """A run named `t` on that cluster, to its end."""
+    with command(cwd, *run_arguments(operator_file, agent_name), *more) as running:
+        return running.finish()
+
+
+def run_arguments(operator_file: Path, agent_name: str) -> list[str]:
+    arguments = ["run", "--env", "toy/line", "--agent", agent_name, "--exp-id", "t", *SMALL]
+    return [*arguments, "--credentials", str(operator_file)]
+
+
+def run_dir(cwd: Path, env: str = "toy_line", exp_id: str = "t") -> Path:
+    """The one run directory of that name."""
+    (found,) = (cwd / "runs").glob(f"*/{env}/{exp_id}")
+    return found
+
+
+def record_in(folder: Path) -> RunRecord:
+    return decode_run_record((folder / "run.json").read_bytes())
