@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import os
+import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +30,7 @@ def scratch_folder(kind: str) -> Iterator[Path]:
         lock = _own(root)
         yield root
     finally:
-        shutil.rmtree(root, ignore_errors=True)
+        remove_tree(root)
         if lock >= 0:
             os.close(lock)
 
@@ -42,11 +45,57 @@ def clear_stale(kind: str) -> int:
             lock = os.open(root / _OWNER, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(root, ignore_errors=True)
+                remove_tree(root)
                 cleared += 1
             finally:
                 os.close(lock)
     return cleared
+
+
+def remove_tree(folder: Path) -> None:
+    """Removes a folder with all that is in it, as far as this user may; never raises for what is in it.
+
+    A program that was locked up in it may have nested folders deeper than Python recurses, or taken away its own rights.
+    Nobody may be changing the folder meanwhile.
+    """
+    with contextlib.suppress(RecursionError):
+        shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists() and not folder.is_symlink():
+        with contextlib.suppress(OSError):
+            _flatten_away(folder)
+
+
+def _flatten_away(folder: Path) -> None:
+    """Brings what is in folders up into `folder`, level by level, and removes it there."""
+    folder.chmod(0o700)
+    root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        names = (f"{secrets.token_hex(8)}-{n}" for n in itertools.count())
+        left = os.listdir(root)
+        while left:
+            name = left.pop()
+            if not _is_folder(name, root):
+                os.unlink(name, dir_fd=root)
+                continue
+            os.chmod(name, 0o700, dir_fd=root)
+            inner = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
+            try:
+                for child in os.listdir(inner):
+                    if _is_folder(child, inner):
+                        # To give a folder another parent is to write to it.
+                        os.chmod(child, 0o700, dir_fd=inner)
+                    os.rename(child, here := next(names), src_dir_fd=inner, dst_dir_fd=root)
+                    left.append(here)
+            finally:
+                os.close(inner)
+            os.rmdir(name, dir_fd=root)
+    finally:
+        os.close(root)
+    folder.rmdir()
+
+
+def _is_folder(name: str, parent: int) -> bool:
+    return stat.S_ISDIR(os.stat(name, dir_fd=parent, follow_symlinks=False).st_mode)
 
 
 def _own(root: Path) -> int:

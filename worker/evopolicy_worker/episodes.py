@@ -16,7 +16,6 @@ import contextlib
 import hashlib
 import math
 import os
-import shutil
 import time
 from collections import OrderedDict
 from pathlib import Path
@@ -36,6 +35,7 @@ from evopolicy_common.messages.episode import (
     PolicyFailure,
     ResourceLimits,
 )
+from evopolicy_common.scratch import remove_tree
 from evopolicy_common.trajectory import Recorder, decode
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
@@ -134,7 +134,7 @@ class Player:
         """The processes of the policies so far are gone after this, and so are their folders."""
         self._zygote.bury()
         while self._folders:
-            shutil.rmtree(self._folders.pop(), ignore_errors=True)
+            remove_tree(self._folders.pop())
 
     def close(self) -> None:
         for environment in self._environments.values():

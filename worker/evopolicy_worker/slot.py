@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import shutil
 import signal
 import sys
 from collections import deque
@@ -21,6 +20,7 @@ import structlog
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.scratch import remove_tree
 from evopolicy_worker import environments
 from evopolicy_worker import slot_messages as messages
 
@@ -148,7 +148,7 @@ class Slot:
             with contextlib.suppress(asyncio.CancelledError):
                 await self._listener
             self._listener = None
-        await asyncio.to_thread(shutil.rmtree, self._scratch, ignore_errors=True)
+        await asyncio.to_thread(remove_tree, self._scratch)
 
     def _end_process(self) -> None:
         if self._process is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.scratch import clear_stale, scratch_folder
+from evopolicy_common.scratch import clear_stale, remove_tree, scratch_folder
 
 OWNER = """
 import sys, tempfile, time
@@ -57,3 +58,40 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "evopolicy-local-link").symlink_to(tmp_path / "elsewhere")
     assert clear_stale("local") == 0
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_folders_nested_deeper_than_python_recurses_are_removed(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "folder", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    (outside / "kept").write_text("kept")
+    (folder / "file").write_text("x")
+    at = os.open(folder, os.O_RDONLY)
+    for k in range(3000):
+        os.mkdir("d", dir_fd=at)
+        if k % 500 == 0:
+            os.symlink(outside, "link", dir_fd=at)
+            os.mkdir("shut", 0, dir_fd=at)
+        inner = os.open("d", os.O_RDONLY, dir_fd=at)
+        os.close(at)
+        at = inner
+    os.close(at)
+    remove_tree(folder)
+    assert not folder.exists()
+    assert (outside / "kept").read_text() == "kept"
+
+
+def test_folders_without_rights_are_removed_and_a_link_is_not_followed(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    inner = folder / "a" / "b"
+    inner.mkdir(parents=True)
+    (inner / "file").write_text("x")
+    for shut in (inner, inner.parent, folder):
+        shut.chmod(0)
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    remove_tree(folder)
+    remove_tree(link)
+    remove_tree(tmp_path / "missing")
+    assert not folder.exists()
+    assert link.is_symlink()
