@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from run_dirs import write_suite
+from invented_study import write_suite
 
 
 def main() -> None:

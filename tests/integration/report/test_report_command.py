@@ -12,7 +12,9 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
-from run_dirs import AGENTS, Version, png, policy, write_run, write_suite
+from invented_policies import Version, png, policy
+from invented_study import AGENTS, write_suite
+from run_dirs import write_run
 from typer.testing import CliRunner
 
 from evopolicy_coordinator.analysis import figures_of, paper, rows, study, write_report

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from browser import Page
-from run_dirs import write_suite
+from invented_study import write_suite
 from typer.testing import CliRunner
 
 from evopolicy_coordinator.report_cli import app

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from run_dirs import Version, policy, write_run
+from invented_policies import Version, policy
+from run_dirs import write_run
 
 from evopolicy_common.run_record import Tokens
 from evopolicy_coordinator.analysis.audit import audit_signals, token_use

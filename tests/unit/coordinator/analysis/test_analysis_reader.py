@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from run_dirs import Version, policy, write_run
+from invented_policies import Version, policy
+from run_dirs import write_run
 
 from evopolicy_coordinator.analysis.comparability import (
     IN_QUESTION,

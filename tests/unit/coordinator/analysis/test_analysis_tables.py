@@ -8,7 +8,8 @@ import json
 from pathlib import Path
 
 import pytest
-from run_dirs import Version, png, policy, write_run
+from invented_policies import Version, png, policy
+from run_dirs import write_run
 
 from evopolicy_coordinator.analysis import figures_of, study
 from evopolicy_coordinator.analysis.agent_log import read_agent_log
