@@ -1,8 +1,9 @@
 """Kills, freezes and starves real processes at seeded instants of whole runs: `python tests/faults/fault_matrix.py`.
 
 A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when its
-command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the published list (`evopolicy_common.run_difference`), its budget spent
-to the episode, and no process be left over. Exit code 1 when one is not.
+command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the
+published list (`evopolicy_common.run_difference`), its budget spent to the episode, and no process be left over. A worker
+that was frozen past its leases must say so. Exit code 1 when anything is not as it must be.
 """
 
 from __future__ import annotations
@@ -131,16 +132,16 @@ class Row:
         return "same run, its command given again" if self.again else "same run"
 
 
-def cases(seeds: int, part: int = 0, parts: int = 1) -> list[Case]:
+def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Case]:
     """All cases by site, or one of `parts` parts of them: of the first site every so many, the others one by one.
 
-    `seeds`: instants for each kind of fault; 0 for one of each that is `SELECTED`.
+    `seeds`: instants for each kind of fault, from the `first` on; 0 for one of each that is `SELECTED`.
     """
     found = []
     for number, (site, faults) in enumerate(FAULTS.items()):
         of_site = [
             Case(target, fault, seed, site)
-            for seed in range(seeds or 1)
+            for seed in range(first, first + (seeds or 1))
             for target, fault in faults
             if seeds or (target, fault) in SELECTED
         ]
@@ -195,8 +196,14 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
                 time.sleep(DISK_FULL_S)
         else:
             # The whole machine stands still, as far as the coordinator can tell.
+            before = times_frozen(cluster)
             with stopped([pid, *processes.descendants(pid)]):
                 time.sleep(LONG_FREEZE_S)
+            deadline = time.monotonic() + PATIENCE_S
+            while times_frozen(cluster) == before and time.monotonic() < deadline:
+                time.sleep(0.05)
+            if times_frozen(cluster) == before:
+                row.wrong.append("the worker does not say that it was frozen")
     except ProcessLookupError:
         return False
     return True
@@ -206,6 +213,11 @@ def kill(pids: list[int]) -> None:
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+
+
+def times_frozen(cluster: FaultCluster) -> int:
+    """How often the worker has said that it stood still, and that its leases may be gone."""
+    return (cluster.root / "worker.log").read_text(errors="replace").count("this worker was frozen")
 
 
 async def refusals(cluster: FaultCluster, name: str) -> list[str]:
@@ -357,6 +369,7 @@ def main() -> None:
     parser.add_argument(
         "--fault-seeds", type=int, default=1, help="instants for each kind of fault; 0: some kinds only"
     )
+    parser.add_argument("--first-seed", type=int, default=0, help="the first of these instants (0)")
     parser.add_argument("--only", default="", help="cases whose name holds this, such as 'worker SIGKILL'")
     parser.add_argument(
         "--part",
@@ -385,7 +398,8 @@ def main() -> None:
         if root is None:
             root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="evof-")))
         root.mkdir(parents=True, exist_ok=True)
-        wanted = [case for case in cases(options.fault_seeds, *options.part) if options.only in case.name]
+        drawn = cases(options.fault_seeds, *options.part, first=options.first_seed)
+        wanted = [case for case in drawn if options.only in case.name]
         well = play_all(wanted, tell, root)
     sys.exit(0 if well else 1)
 

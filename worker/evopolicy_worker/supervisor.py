@@ -196,11 +196,14 @@ class Supervisor:
             self.drain()
 
     def _cancel(self, lease_id: str) -> None:
+        """Stops what a lease was for that is this worker's no more."""
         if lease_id in self._queue:
+            log.info("lease is gone", lease=lease_id, was="waiting")
             lease = self._queue.pop(lease_id)
             self._put_result(lease, "returned")
             self._capacity_freed.set()
         elif lease_id in self._running and lease_id not in self._cancelled:
+            log.info("lease is gone", lease=lease_id, was="running")
             self._cancelled.add(lease_id)
             slot = self._running[lease_id]
             task = asyncio.create_task(slot.cancel())

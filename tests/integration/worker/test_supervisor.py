@@ -1,7 +1,6 @@
 """The worker's supervisor against a real coordinator process, with slots that answer by script.
 
-The slots are the tests' own so that every way in which a slot can end a job is met; `tests/integration/cluster` has the
-real ones.
+The slots are the tests' own so that every way in which a slot can end a job is met; `tests/faults` has the real ones.
 """
 
 from __future__ import annotations

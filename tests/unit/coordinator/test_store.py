@@ -6,11 +6,13 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from store_rows import blob, outcome_row, run_row, state_row, submit_row
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator import store as store_module
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import EvaluationRow, StrikeRow, WorkerRow, head_of
 from evopolicy_coordinator.store import SCHEMA_VERSION, Reader, Store, train_run
@@ -177,6 +179,42 @@ def test_only_train_groups_belong_to_a_gateway() -> None:
         records.evaluation_group("train"),
     ):
         assert train_run(group) is None
+
+
+@pytest.mark.parametrize("version", range(1, SCHEMA_VERSION))
+def test_a_database_of_an_older_version_is_migrated_with_all_that_is_in_it(path: Path, version: int) -> None:
+    db = sqlite3.connect(path, isolation_level=None)
+    for script in store_module._MIGRATIONS[:version]:
+        db.executescript(script)
+    db.execute(f"PRAGMA user_version={version}")
+    older = msgspec.msgpack.decode(msgspec.msgpack.encode(run_row()))
+    del older["audit_share"]  # a field that came later
+    db.execute("INSERT INTO runs VALUES ('r-1', 'key-r-1', ?)", (msgspec.msgpack.encode(older),))
+    db.execute("INSERT INTO run_states VALUES ('r-1', 'open', ?)", (msgspec.msgpack.encode(state_row()),))
+    db.close()
+    for _ in range(2):
+        store = Store(path)
+        snapshot = store.load()
+        assert store._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
+        store.close()
+        assert snapshot.runs == (run_row(),)
+        assert snapshot.states == (state_row(),)
+        assert snapshot.audits == ()
+
+
+def test_a_migration_that_fails_halfway_leaves_the_older_version(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        broken = "CREATE TABLE made (name TEXT); CREATE TABLE made (name TEXT);"
+        patched.setattr(store_module, "_MIGRATIONS", (*store_module._MIGRATIONS, broken))
+        patched.setattr(store_module, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
+        with pytest.raises(StorageError, match="made"):
+            Store(path)
+    store = Store(path)
+    assert store._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
+    assert store._db.execute("SELECT * FROM sqlite_master WHERE name = 'made'").fetchone() is None
+    store.close()
 
 
 def test_file_of_a_newer_version_is_refused(path: Path) -> None:
