@@ -100,6 +100,12 @@ class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
     agent: dict[str, Any] = {}
 
 
+class AgentTime(Event, frozen=True, kw_only=True, tag="agent_time"):
+    """How much of its wall limit the agent has used since it was started."""
+
+    used_s: float
+
+
 class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """The first line to an agent's keeper."""
 
@@ -123,7 +129,7 @@ class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
     pass
 
 
-AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentDoing | AgentEnded
+AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentEnded
 AnyOrder = CloseRun | StartAgent | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)

@@ -111,6 +111,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "session.json"
 
     @property
+    def times(self) -> Path:
+        """How long its train side has taken so far: `Times`."""
+        return self.state / "times.json"
+
+    @property
     def agent(self) -> Path:
         """What a jailed agent has outside its workspace: home and /tmp."""
         return self.state / "agent"

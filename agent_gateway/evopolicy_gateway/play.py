@@ -32,6 +32,7 @@ from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
     AgentDoing,
     AgentEnded,
+    AgentTime,
     AgentTurn,
     CloseRun,
     Progress,
@@ -45,6 +46,7 @@ from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import IntendedRun, OpenedRun, RunFolder, run_folder, save
 from evopolicy_gateway.operations import Operations
+from evopolicy_gateway.times import Stopwatch
 from evopolicy_gateway.watch import Watch
 
 LAST_WORDS_S = 10.0
@@ -157,7 +159,8 @@ class RunPlay:
         self._order: CloseRun | None = None
         self._gateway: Child | None = None
         self._keeper: Child | None = None
-        self.last: Progress | None = None
+        self._stopwatch: Stopwatch
+        """From when it is played: the folder then is new, or holds what earlier commands took."""
 
     @property
     def agent_at_work(self) -> bool:
@@ -219,20 +222,21 @@ class RunPlay:
 
     async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
         self.run = run
-        plan, agent_s = self._plan, 0.0
+        plan = self._plan
+        self._stopwatch = Stopwatch(self._folder.times)
         try:
             if agents_side:
-                agent_s = await self._agents_side()
+                await self._agents_side()
             finished = await self._finish(run)
         except BaseException as error:
             if not (self._stays_open and isinstance(error, asyncio.CancelledError)):
                 await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
-        return await record.write(self._folder, plan, finished, self._operations, self.last, agent_s)
+        return await record.write(self._folder, plan, finished, self._operations, self._stopwatch.times)
 
-    async def _agents_side(self) -> float:
-        """Until the run is closed; returns the seconds that it took."""
-        started = time.monotonic()
+    async def _agents_side(self) -> None:
+        """Until the run is closed."""
+        self._stopwatch.opened()
         serving = asyncio.create_task(self._keep_gateway())
         keeping: asyncio.Task[AgentEnded] | None = None
         try:
@@ -265,7 +269,7 @@ class RunPlay:
                 if child is not None:
                     await child.end(END_GRACE_S)
             await children.end_orphans()
-        return time.monotonic() - started
+            self._stopwatch.closed()
 
     async def _close(self, ended: AgentEnded) -> None:
         reason = "budget_spent" if self._spent.is_set() else ended.reason
@@ -289,6 +293,7 @@ class RunPlay:
         quick_deaths = 0
         while not self._closed.is_set():
             started = time.monotonic()
+            self._stopwatch.gateway_begins()
             self._gateway = await Child.start(program, self._folder.harness_log, talks=True)
             async for event in self._gateway.events():
                 await self._on_gateway_event(event)
@@ -314,7 +319,7 @@ class RunPlay:
             if self._order is not None and self._gateway is not None:
                 await self._gateway.tell(self._order)
         elif isinstance(event, Progress):
-            self.last = event
+            self._stopwatch.gateway_told(event.in_flight_s, event.feedback_s)
             self._watch.progress(self._name, event)
             if event.spent:
                 self._spent.set()
@@ -348,9 +353,8 @@ class RunPlay:
 
         An agent with a session goes on in it; any other program is started anew in its workspace.
         """
-        until = time.monotonic() + self._plan.wall_limit_s
         for _ in range(_MAX_KEEPER_DEATHS):
-            ended = await self._keep_agent_once(ready, max(1.0, until - time.monotonic()))
+            ended = await self._keep_agent_once(ready)
             if ended is not None:
                 return ended
             if self._spent.is_set():
@@ -358,8 +362,10 @@ class RunPlay:
             self._watch.note(self._name, "the agent's keeper died; starting it again, and the agent with it")
         return AgentEnded(reason="agent_failed", detail="its keeper died")
 
-    async def _keep_agent_once(self, ready: Ready, wall_limit_s: float) -> AgentEnded | None:
+    async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
         """How the agent ended; None when its keeper died."""
+        self._stopwatch.agent_begins()
+        left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.harnesses.keeper"]
         self._keeper = await Child.start(program, self._folder.harness_log, talks=True)
         await self._keeper.tell(
@@ -373,7 +379,7 @@ class RunPlay:
                     "EVOPOLICYGYM_SUBMIT_URL": ready.submit_url,
                 },
                 started_in=str(self._plan.started_in),
-                wall_limit_s=wall_limit_s,
+                wall_limit_s=left_s,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
                 jail=self._jail(),
@@ -385,6 +391,8 @@ class RunPlay:
                 self._watch.turn(self._name, event.turn, event.text)
             elif isinstance(event, AgentDoing):
                 self._watch.doing(self._name, event)
+            elif isinstance(event, AgentTime):
+                self._stopwatch.agent_told(event.used_s)
             elif isinstance(event, AgentEnded):
                 ended = event
         await self._keeper.ended()
@@ -405,7 +413,8 @@ class RunPlay:
             async with asyncio.timeout(GIVE_UP_PATIENCE_S):
                 await self._operations.cancel(run)
                 finished = await self._finish(run)
-                await record.write(self._folder, self._plan, finished, self._operations, self.last, 0.0, why)
+                times = self._stopwatch.times
+                await record.write(self._folder, self._plan, finished, self._operations, times, why)
 
 
 @contextlib.contextmanager

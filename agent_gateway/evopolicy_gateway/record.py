@@ -37,13 +37,14 @@ from evopolicy_common.run_record import (
     encode_checkpoint_metrics,
     encode_run_record,
 )
+from evopolicy_common.scratch import remove_tree
 from evopolicy_common.summary import utc_text
 from evopolicy_gateway import replays
-from evopolicy_gateway.control import Progress
 from evopolicy_gateway.formatting import submit_id
 from evopolicy_gateway.journal import Journal, Rejected
 from evopolicy_gateway.layout import RunFolder, Staged
 from evopolicy_gateway.operations import Operations
+from evopolicy_gateway.times import Times
 
 if TYPE_CHECKING:
     from evopolicy_gateway.play import Plan
@@ -54,8 +55,7 @@ async def write(
     plan: Plan,
     finished: RunFinished,
     operations: Operations,
-    last: Progress | None,
-    agents_side_s: float,
+    times: Times,
     error: str | None = None,
 ) -> RunRecord:
     """Writes everything and removes the gateway's folder. StorageError when the disk refuses.
@@ -73,7 +73,7 @@ async def write(
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, error=error)
     recorded = await replays.fetch(folder.root, finished, operations)
-    return await asyncio.to_thread(_write_record, folder, plan, finished, last, agents_side_s, recorded)
+    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded)
 
 
 def run_record(
@@ -81,15 +81,13 @@ def run_record(
     finished: RunFinished,
     staged: Staged | None,
     rejected: Sequence[Rejected],
-    last: Progress | None,
-    agents_side_s: float,
+    times: Times,
     recorded: tuple[Replay, ...] = (),
 ) -> RunRecord:
     """The record of a finished run; pure. `staged` None: it ended before its workspace was made."""
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns
-    in_flight_s = 0.0 if last is None else last.in_flight_s
     return RunRecord(
         model=settings.model,
         env=settings.env,
@@ -118,10 +116,10 @@ def run_record(
             started_at=utc_text(finished.created_at),
             finished_at=utc_text(finished.finished_at),
             wall_s=round(finished.finished_at - finished.created_at, 3),
-            agent_s=round(max(0.0, agents_side_s - in_flight_s), 3),
+            agent_s=round(max(0.0, times.open_s - times.in_flight_s), 3),
             queue_s=round(finished.wall_s.get("queue", 0.0), 3),
             rollout_s=round(finished.wall_s.get("rollout", 0.0), 3),
-            feedback_s=0.0 if last is None else last.feedback_s,
+            feedback_s=round(times.feedback_s, 3),
             finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
         ),
         outcome=_outcome(finished),
@@ -273,7 +271,7 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
     if system.is_symlink() or system.is_file():
         system.unlink()
     elif system.exists():
-        shutil.rmtree(system)
+        remove_tree(system)
     bundles.unpack(bundle, system)
 
 
@@ -281,8 +279,7 @@ def _write_record(
     folder: RunFolder,
     plan: Plan,
     finished: RunFinished,
-    last: Progress | None,
-    agents_side_s: float,
+    times: Times,
     recorded: tuple[Replay, ...],
 ) -> RunRecord:
     staged = None
@@ -293,7 +290,7 @@ def _write_record(
         journal = Journal(folder.journal)
         rejected = [entry for entry in journal.entries if isinstance(entry, Rejected)]
         journal.close()
-    done = run_record(plan, finished, staged, rejected, last, agents_side_s, recorded)
+    done = run_record(plan, finished, staged, rejected, times, recorded)
     write_atomically(folder.run_json, encode_run_record(done))
-    shutil.rmtree(folder.state, ignore_errors=True)
+    remove_tree(folder.state)
     return done

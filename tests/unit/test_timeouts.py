@@ -213,6 +213,7 @@ NO_TIMEOUTS: dict[str, str] = {
     "gateway/harnesses/cli_agent.py:_MAX_PAUSE_S": SIZE,
     "gateway/harnesses/cli_agent.py:_IN_FLIGHT_PAUSE_S": PACE,
     "gateway/harnesses/clock.py:_LOOK_S": PACE,
+    "gateway/harnesses/keeper.py:_TELL_TIME_S": PACE,
     "gateway/harnesses/trouble.py:MAX_BACKOFF_S": SIZE,
     "gateway/operations.py:WAIT_S": PACE,
     "gateway/operations.py:_UNAVAILABLE_PAUSE_S": PACE,

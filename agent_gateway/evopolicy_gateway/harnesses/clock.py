@@ -25,6 +25,10 @@ class AgentClock:
         now = self._now() if self._paused_at is None else self._paused_at
         return self._limit_s - (now - self._started - self._paused_s)
 
+    def used_s(self) -> float:
+        """Seconds that have passed on it."""
+        return self._limit_s - self.left_s()
+
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
         """It stands still inside the `with`."""

@@ -19,7 +19,7 @@ import structlog
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway import control, processes
-from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentTurn, Orders, StartAgent
+from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentTime, AgentTurn, Orders, StartAgent
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
@@ -33,6 +33,7 @@ END_GRACE_S = 3.0
 """From SIGTERM to SIGKILL."""
 LAST_WORDS_S = 2.0
 _TEXT_SHOWN = 2000
+_TELL_TIME_S = 5.0
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -56,6 +57,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     play = asyncio.create_task(_play(order, stage, config))
     told = asyncio.create_task(_stopped(orders))
     late = asyncio.create_task(clock.run_out())
+    telling = asyncio.create_task(_tell_time(clock))
     log.info("agent started", agent=order.agent)
     try:
         await asyncio.wait([play, told, late], return_when=asyncio.FIRST_COMPLETED)
@@ -67,8 +69,9 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         play.cancel()
         ending = (await asyncio.gather(play, return_exceptions=True))[0]
     finally:
-        told.cancel()
-        late.cancel()
+        for task in (told, late, telling):
+            task.cancel()
+        control.emit(AgentTime(used_s=clock.used_s()))
         agent_log.close()
     if left:
         log.error("processes of the agent survive", pids=left)
@@ -121,6 +124,13 @@ def _tell(doing: Doing) -> None:
             provider=doing.provider,
         )
     )
+
+
+async def _tell_time(clock: AgentClock) -> None:
+    """Again and again, so that an agent that is killed and goes on has no more time than another."""
+    while True:
+        await asyncio.sleep(_TELL_TIME_S)
+        control.emit(AgentTime(used_s=clock.used_s()))
 
 
 async def _stopped(orders: Orders) -> None:

@@ -110,6 +110,29 @@ patient_submit([2, 3], "two")
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 
+def test_the_agents_time_is_of_the_whole_run_however_often_it_was_interrupted(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = "os.path.exists('here') or submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)"
+    arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--resume"]
+    with command(tmp_path, *arguments) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        wait_until((run_dir(tmp_path) / ".gateway/times.json").exists)
+        running.kill()
+    kept = run_dir(tmp_path) / ".gateway" / "times.json"
+    times = json.loads(kept.read_text())
+    assert times["agent_s"] > 0
+    assert times["open_s"] >= times["in_flight_s"]
+    # As if it had been at work for a day.
+    kept.write_text(json.dumps({**times, "agent_s": 86400.0, "open_s": 86400.0}))
+    with command(tmp_path, *arguments) as again:
+        exit_code, _, err = again.finish()
+    assert exit_code == 0, err
+    record = record_in(run_dir(tmp_path))
+    assert (record.outcome.closed_reason, record.outcome.budget_used) == ("wall_limit", 2)
+    assert record.timing.agent_s > 86000.0
+
+
 def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: Path, tmp_path: Path) -> None:
     waits = agent(tmp_path, "submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)")
     with command(tmp_path, *run_arguments(operator_file, waits)) as running:

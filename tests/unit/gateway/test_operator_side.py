@@ -26,6 +26,7 @@ from evopolicy_gateway.play import Plan
 from evopolicy_gateway.record import run_record
 from evopolicy_gateway.run_options import RunOptions
 from evopolicy_gateway.runs import RunResult, exit_code, report
+from evopolicy_gateway.times import Times
 from evopolicy_gateway.watch import watching
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
@@ -100,8 +101,8 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
         Rejected(status="budget_invalid", message="no", at=105.0, after_submits=1),
         Rejected(status="conflict", message="busy", at=106.0, after_submits=1),
     ]
-    last = Progress(episode_budget=8, remaining_budget=0, n_submits=3, in_flight_s=4.0, feedback_s=0.5)
-    record = run_record(plan(tmp_path), finished(), STAGED, rejected, last, 9.0)
+    times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
+    record = run_record(plan(tmp_path), finished(), STAGED, rejected, times)
     assert decode_run_record(encode_run_record(record)) == record
     assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0
     assert record.outcome.heldout_std_return == 1.0
@@ -121,7 +122,7 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
 @pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])
 def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
-    outcome = run_record(plan(tmp_path), done, None, [], None, 0.0).outcome
+    outcome = run_record(plan(tmp_path), done, None, [], Times()).outcome
     assert outcome.status == ("error" if status == "cancelled" else status)
     assert outcome.final_score is None
     assert outcome.heldout_returns == ()

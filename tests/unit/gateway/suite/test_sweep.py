@@ -21,6 +21,7 @@ from evopolicy_gateway.suite.decisions import Decision, Found, decide
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
+from evopolicy_gateway.times import Times
 
 PATIENCE_S = 30.0
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
@@ -97,7 +98,7 @@ class Stage:
                     await stage.act(self.name)
                 finally:
                     stage.going.discard(self.name)
-                return run_record(self.plan, finished(self.plan), None, [], None, 0.0)
+                return run_record(self.plan, finished(self.plan), None, [], Times())
 
             resume = play
 

@@ -1,0 +1,45 @@
+"""How a run's seconds add up over the processes and commands that have played it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evopolicy_gateway.times import Stopwatch, Times
+
+
+def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_path: Path) -> None:
+    now = [100.0]
+    path = tmp_path / "times.json"
+    first = Stopwatch(path, lambda: now[0])
+    first.opened()
+    first.gateway_begins()
+    first.agent_begins()
+    first.gateway_told(2.0, 0.5)
+    first.agent_told(5.0)
+    # The second keeper and the second gateway tell more than the first did, and still do not take its place.
+    first.agent_begins()
+    first.agent_told(6.0)
+    first.gateway_begins()
+    first.gateway_told(3.0, 0.75)
+    now[0] = 120.0
+    first.agent_told(7.0)
+    whole = Times(agent_s=12.0, open_s=20.0, in_flight_s=5.0, feedback_s=1.25)
+    assert first.times == whole
+    # This command is killed here; what it told last is on disk.
+    second = Stopwatch(path, lambda: now[0])
+    assert second.times == whole
+    second.opened()
+    second.agent_begins()
+    second.agent_told(1.0)
+    now[0] = 121.0
+    second.closed()
+    now[0] = 500.0
+    assert second.times == Times(agent_s=13.0, open_s=21.0, in_flight_s=5.0, feedback_s=1.25)
+    assert Stopwatch(path).times == second.times
+
+
+def test_times_that_cannot_be_read_or_written_stop_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "times.json"
+    path.write_text("{")
+    assert Stopwatch(path).times == Times()
+    Stopwatch(tmp_path / "gone" / "times.json").keep()
