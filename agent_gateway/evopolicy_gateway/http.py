@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-from collections.abc import Awaitable, Callable
 from typing import Any
 
 import orjson
@@ -40,8 +39,6 @@ LINGER = (256 << 20, 120.0)
 """Bytes and seconds for which the rest of a refused body is read before the connection is closed."""
 STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
 """The same for one without the bearer token."""
-
-Handler = Callable[[Request], Awaitable[Response]]
 
 
 def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:

@@ -55,11 +55,11 @@ def families_for(obs_space: Schema, action_space: Schema) -> list[Family]:
     chooses = action_space["type"] in ("Discrete", "MultiDiscrete")
 
     def count(kind: str) -> int:
-        return parameter_count(kind, {}, obs_space, action_space)
+        return parameter_count(kind, obs_space, action_space)
 
     families = [_constant(action_space, n_outputs)]
     if obs_space["type"] == "Image":
-        families.append(_saliency(count("saliency"), n_outputs))
+        families.append(_saliency(n_outputs))
     if action_space["type"] == "Discrete":
         families.append(_explorer(n_outputs))
     if n_features:
@@ -77,7 +77,7 @@ def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: S
     n_outputs = ActionHead(action_space).size
     families = []
     for kind in ("pusher", "carrier"):
-        size = parameter_count(kind, settings, obs_space, action_space)
+        size = parameter_count(kind, obs_space, action_space)
         others = np.zeros(size)
         others[-n_outputs:] = 1.0
         others[-n_outputs:][settings["outputs"]] = 0.0
@@ -206,7 +206,7 @@ def _explorer(n_outputs: int) -> Family:
     )
 
 
-def _saliency(size: int, n_outputs: int) -> Family:
+def _saliency(n_outputs: int) -> Family:
     centre = np.zeros((n_outputs, 4))
     spread = np.tile([2.0, 0.5, 0.5, 0.3], (n_outputs, 1))
     colours = np.concatenate([np.zeros(3), centre.reshape(-1)])

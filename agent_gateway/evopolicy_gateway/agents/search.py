@@ -55,8 +55,6 @@ class Candidate:
 
     family: Family
     vector: Vector
-    origin: str
-    """How it came about: `opening`, `mutant`, `mean`."""
     episodes: list[Episode] = field(default_factory=list)
     is_final: bool = False
     """True once it was given a checkpoint of its own."""
@@ -141,7 +139,7 @@ class Search:
                 # A small opening shows every family once before any twice.
                 share = family.weight if n > 2 * len(self._families) else 1
                 vectors = list(islice(self._sources[family.name], share))
-                drawn += [Candidate(family=family, vector=v, origin="opening") for v in vectors]
+                drawn += [Candidate(family=family, vector=v) for v in vectors]
                 if len(vectors) < share:
                     sources.remove(family)
         return self._joined(drawn[:n])
@@ -151,7 +149,7 @@ class Search:
         strength = FIRST_STRENGTH * STRENGTH_DECAY**self._round
         self._round += 1
         fresh = [
-            Candidate(family=family, vector=vector, origin="opening")
+            Candidate(family=family, vector=vector)
             for family in self._newcomers
             for vector in islice(self._sources[family.name], max(2, n // 3))
         ]
@@ -285,17 +283,15 @@ class Search:
         # Many numbers: change some of them only, or the step is long in every case and undoes what works.
         touched = self._rng.random(vector.size) < max(0.3, 3 / max(vector.size, 1))
         step = self._rng.standard_normal(vector.size) * touched
-        return Candidate(
-            family=parent.family, vector=vector + strength * parent.family.scale * step, origin="mutant"
-        )
+        return Candidate(family=parent.family, vector=vector + strength * parent.family.scale * step)
 
     def _draw(self, parents: list[Candidate]) -> Candidate:
         """A new candidate of any family that still has some; the best parent again where none has."""
         for index in self._rng.permutation(len(self._families)):
             family = self._families[int(index)]
             for vector in islice(self._sources[family.name], 1):
-                return Candidate(family=family, vector=vector, origin="opening")
-        return Candidate(family=parents[0].family, vector=parents[0].vector, origin="opening")
+                return Candidate(family=family, vector=vector)
+        return Candidate(family=parents[0].family, vector=parents[0].vector)
 
     def _mean_of_best(self) -> Candidate | None:
         """The mean of the leading family's best candidates, as the cross-entropy method would have it."""
@@ -304,7 +300,7 @@ class Search:
         if len(elite) < 2 or not elite[0].family.scale.any():
             return None
         vector = np.mean([c.vector for c in elite], axis=0)
-        return self._joined([Candidate(family=elite[0].family, vector=vector, origin="mean")])[0]
+        return self._joined([Candidate(family=elite[0].family, vector=vector)])[0]
 
     def _joined(self, candidates: list[Candidate]) -> list[Candidate]:
         self.candidates += candidates

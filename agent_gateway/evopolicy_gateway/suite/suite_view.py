@@ -50,7 +50,6 @@ class SuiteView:
         self.rows = {name: Row() for name in names}
         self.on_doing: Callable[[str, AgentDoing], None] = _ignore
         self._parallel = parallel
-        self._began = time.monotonic()
         self._said: dict[str, object] = {}
 
     # What the sweep tells.

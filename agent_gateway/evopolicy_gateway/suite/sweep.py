@@ -195,7 +195,7 @@ class Sweep:
         try:
             if decision.kind in ("restart", "new"):
                 await self._put_aside(folder, decision.attempt - 1)
-            record = await self._played(decision, folder)
+            record = await self._played(decision)
             done = suite_index.entry_of(
                 run,
                 record,
@@ -219,7 +219,7 @@ class Sweep:
         else:
             await self._ask(run, ttl_s=0.0)
 
-    async def _played(self, decision: Decision, folder: RunFolder) -> RunRecord:
+    async def _played(self, decision: Decision) -> RunRecord:
         run = decision.run
         plan = Plan(
             settings=msgspec.structs.replace(run.settings, attempt=decision.attempt),

@@ -74,13 +74,6 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     return out
 
 
-def refuse_mixtures(runs: Iterable[Run]) -> None:
-    """MixedRunsError when the runs differ in what a comparison holds fixed."""
-    found = mixtures(runs)
-    if found:
-        raise MixedRunsError(found)
-
-
 def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
     """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words, and how an operator changed it."""
     items = [set(run.record.versions.fingerprint.items()) for run in runs]

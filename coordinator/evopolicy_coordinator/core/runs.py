@@ -223,7 +223,7 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
         return
     known = run.keys.get(event.key)
     if known is not None:
-        _again(run, event, run.submits[known], turn)
+        _again(event, run.submits[known], turn)
         return
     if run.state.phase != "open":
         turn.refuse(event.request, "run_closed", f"run {run.id!r} takes no more submits")
@@ -247,7 +247,7 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
     _accept(core, run, event, turn)
 
 
-def _again(run: Run, event: events.SubmitRequested, row: SubmitRow, turn: Turn) -> None:
+def _again(event: events.SubmitRequested, row: SubmitRow, turn: Turn) -> None:
     """The answer to a key that is known: the same as the first time, if the request is."""
     if (event.env_instances, event.bundle) != (row.env_instances, row.bundle):
         text = f"key {event.key!r} was used for submit {row.submit_index} with another request"

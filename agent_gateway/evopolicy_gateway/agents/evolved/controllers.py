@@ -20,7 +20,7 @@ SALIENCY_FEATURES = 4
 """Left-right and up-down balance and mean of what is salient, and one."""
 
 
-def parameter_count(kind: str, settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> int:
+def parameter_count(kind: str, obs_space: Schema, action_space: Schema) -> int:
     """Length of the vector that `kind` takes between these spaces. KeyError for an unknown kind."""
     outputs = ActionHead(action_space).size
     features = Features(obs_space).size

@@ -13,10 +13,10 @@ from evopolicy_coordinator.analysis.comparability import (
     IN_QUESTION,
     MixedRunsError,
     mixtures,
-    refuse_mixtures,
 )
 from evopolicy_coordinator.analysis.reader import count_changed_lines, find_run_dirs, load_runs, read_run
 from evopolicy_coordinator.analysis.records import rows
+from evopolicy_coordinator.analysis.study import study
 
 VERSIONS = [
     Version(policy(gain=1.0), (-200.0, -100.0), -180.0),
@@ -184,10 +184,9 @@ def test_changed_lines_count_both_sides_of_every_file() -> None:
 def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: dict, what: str) -> None:
     write_run(tmp_path, VERSIONS)
     write_run(tmp_path, VERSIONS, entry="Agent B", **change)
-    runs = load_runs([tmp_path]).runs
-    assert what in [mixture.what for mixture in mixtures(runs)]
     with pytest.raises(MixedRunsError, match=what):
-        refuse_mixtures(runs)
+        study([tmp_path])
+    assert what in [mixture.what for mixture in study([tmp_path], allow_mixed=True).mixtures]
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_every_family_acts_within_the_action_space(obs_space: dict[str, Any], ac
     candidates = Search(families_for(obs_space, action_space), rng).opening(12)
     assert candidates
     for candidate in candidates:
-        assert candidate.vector.size == parameter_count(candidate.family.kind, {}, obs_space, action_space)
+        assert candidate.vector.size == parameter_count(candidate.family.kind, obs_space, action_space)
         controller = build(candidate.family.kind, candidate.vector, {}, obs_space, action_space, rng)
         for _ in range(3):
             obs = sample(obs_space, rng)
@@ -198,7 +198,7 @@ def stage(system: Path, candidates: list[Candidate], schedule: list[int]) -> Non
 
 def constants(*values: float) -> list[Candidate]:
     family = families_for(BOX, BOX)[0]
-    return [Candidate(family=family, vector=np.array([v, v]), origin="opening") for v in values]
+    return [Candidate(family=family, vector=np.array([v, v])) for v in values]
 
 
 def test_episode_k_plays_the_candidate_that_the_schedule_names(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_rounds_meet_two_cases_when_many_share_the_best_return() -> None:
 def test_finalists_differ_in_behaviour() -> None:
     search = a_search()
     play(search.opening(16), case=0)
-    twins = [Candidate(family=c.family, vector=c.vector, origin="mutant") for c in search.candidates]
+    twins = [Candidate(family=c.family, vector=c.vector) for c in search.candidates]
     search.candidates += twins
     play(twins, case=0)
     finals = [search.finalist() for _ in range(6)]
