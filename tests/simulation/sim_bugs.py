@@ -102,6 +102,13 @@ BUGS = (
     Bug("accept the same key twice", runs, "submit", "known is not None", "False"),
     Bug("never preempt", Scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:"),
     Bug(
+        "forget the hidden jobs that train jobs wait behind",
+        Scheduler,
+        "hidden_leased",
+        "if lane.n_ready[TRAIN]:",
+        "if False:",
+    ),
+    Bug(
         "lease to a poll that was given up unread",
         Scheduler,
         "poll",

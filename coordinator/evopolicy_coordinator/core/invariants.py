@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from .jobs import N_PRIORITIES, TRAIN
@@ -79,6 +80,11 @@ def _jobs(core: Core) -> None:
                 sum(places) == 1,
                 f"it is in one place (queued, leased, backing off, adopting): {places}",
             )
+            if job.reserved is not None:
+                emptied = core.fleet.workers.get(job.reserved)
+                want(
+                    core, key, emptied is not None and emptied.reserved is job, "who is emptied for it knows"
+                )
             lease = job.lease
             if lease is not None:
                 worker = core.fleet.workers.get(lease.worker)
@@ -96,7 +102,13 @@ def _jobs(core: Core) -> None:
 
 def _queue(core: Core) -> None:
     flows = {group.flow for group in core.groups.values()}
+    for job in core.queue.suspects:
+        want(core, job.job_id, job.queued and job.alone, "a suspect waits")
     for flow in flows:
+        leased = sum(group.n_leased for group in core.groups.values() if group.flow is flow)
+        want(core, flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
+        unpinned = core.unpinned.get(flow.id) is flow
+        want(core, flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
         for priority in range(N_PRIORITIES):
             valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
             want(core, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
@@ -104,8 +116,22 @@ def _queue(core: Core) -> None:
             want(core, flow.id, not stray, "only queued jobs of that priority wait there")
             if flow.lane is not None and flow.n_ready[priority]:
                 want(core, flow.id, flow.in_heap[priority], "a flow with ready jobs gets its turn")
+    stopping = Counter(
+        lease.stopped_for.key
+        for worker in core.fleet.workers.values()
+        for lease in worker.leases.values()
+        if lease.stopped_for is not None
+    )
     for lane in core.queue.lanes.values():
-        want(core, str(lane.key), lane.stopping >= 0, "stopping jobs are counted")
+        want(core, str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
+        hidden = any(any(profile.hidden) for profile in lane.profiles)
+        looked_at = ("lane", lane.key) in core.timers
+        want(
+            core,
+            str(lane.key),
+            looked_at or not (lane.n_ready[TRAIN] and hidden),
+            "train jobs that wait beside hidden ones are looked at again",
+        )
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
             want(core, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
@@ -152,5 +178,15 @@ def _workers(core: Core) -> None:
             (len(live), held) == (worker.n_live, worker.held),
             "its live leases are counted",
         )
+        want(
+            core, worker.name, core.fleet.sessions.get(worker.session) == worker.name, "its session is known"
+        )
+        if worker.reserved is not None:
+            want(
+                core,
+                worker.name,
+                worker.reserved.reserved == worker.name,
+                "it is emptied for a suspect that knows",
+            )
         if worker.alone is not None:
             want(core, worker.name, worker.alone.id in worker.leases, "what it plays alone is leased to it")

@@ -7,8 +7,9 @@ Rules that this module owns:
 - A poll whose time is over gets no lease: while the loop stood still its worker has given it up, and would never see it.
 - New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
 - A suspect runs alone: on an idle worker, or on one that is emptied for it; nothing else goes there meanwhile.
-- A waiting train job stops hidden jobs: audits and early validation as often as it takes, others a bounded number of
-  times. The hidden job goes back into the queue; its worker lets go of it and polls again.
+- A waiting train job stops hidden jobs, a suspect those of the worker that is emptied for it: audits and early validation
+  as often as it takes, others a bounded number of times. The hidden job goes back into the queue; its worker lets go of
+  it and polls again.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from .turn import Turn
 from .workers import LeasePoll, Worker
 
 if TYPE_CHECKING:
+    from .leases import Lease
     from .machine import Core
 
 PREFETCH_BELOW_S = 1.0
@@ -185,11 +187,19 @@ class Scheduler:
                 continue
             if idle:
                 return self._alone(job, worker, turn)
-            job.reserved = worker.name
-            worker.reserved = job
-            core.chronicle.tell(turn.now, turn.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
+            self._reserve(job, worker, turn)
             return None
         return None
+
+    def _reserve(self, job: JobState, worker: Worker, turn: Turn) -> None:
+        """Begin to empty a busy worker for a suspect; a train job does not wait for what is hidden there to end."""
+        job.reserved = worker.name
+        worker.reserved = job
+        self._core.chronicle.tell(turn.now, turn.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
+        if job.priority == TRAIN:
+            for lease in list(worker.leases.values()):
+                if lease.live and lease.job.priority != TRAIN and self._may_stop(lease.job):
+                    self._stop_hidden(lease, worker, f"preempted for {job.job_id}", turn)
 
     def _alone(self, job: JobState, worker: Worker, turn: Turn) -> wire.Lease:
         core = self._core
@@ -216,12 +226,16 @@ class Scheduler:
             if lane is not None and job.queued:
                 self._try_parked(lane, turn, TRIES_MAX)
         fed = list(turn.dirty)
+        turn.dirty.clear()
         for lane in fed:
             self._feed(lane, turn)
         for lane in fed:
             if lane.n_ready[TRAIN]:
                 self._preempt(lane, turn)
-        for lane in [lane for lane in turn.dirty if lane not in fed]:
+        while turn.dirty:
+            # What was stopped just now waits again: another worker may have a slot for it.
+            lane = next(iter(turn.dirty))
+            del turn.dirty[lane]
             self._feed(lane, turn)
         for name, stops in turn.stops.items():
             self._tell(name, tuple(stops), turn)
@@ -306,15 +320,23 @@ class Scheduler:
                         return
                     if lease.worker == avoided:
                         continue
-                    if priority == HELDOUT and job.preemptions >= core.settings.preemptions_max:
+                    if not self._may_stop(job):
                         del hidden[lease]
                         continue
-                    job.preemptions += 1
                     worker = core.fleet.workers[lease.worker]
-                    core.book.stop(lease, turn, f"preempted for {lane.key[0]}")
-                    core.book.give_back(job, "returned", worker, turn, ran=False)
+                    self._stop_hidden(lease, worker, f"preempted for {lane.key[0]}", turn)
                     if worker.n_live < worker.slots:
                         # Only now a slot comes free by it: what was stopped before had still to wait for one.
                         wanted -= 1
                         lane.stopping += 1
                         lease.stopped_for = lane
+
+    def _may_stop(self, job: JobState) -> bool:
+        """Whether train jobs may stop a hidden job (once more)."""
+        return job.priority != HELDOUT or job.preemptions < self._core.settings.preemptions_max
+
+    def _stop_hidden(self, lease: Lease, worker: Worker, why: str, turn: Turn) -> None:
+        """Stop a hidden job for the sake of train jobs; it goes back into the queue."""
+        lease.job.preemptions += 1
+        self._core.book.stop(lease, turn, why)
+        self._core.book.give_back(lease.job, "returned", worker, turn, ran=False)

@@ -221,6 +221,21 @@ def test_a_busy_worker_is_emptied_for_a_suspect() -> None:
     assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
 
 
+def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emptied_for_it() -> None:
+    rig, (first, second), lease = one_job("w1", "w2")
+    rig.create("r2", n_valid=2)
+    rig.submit(0, run="r2", key="x")
+    rig.play(second, *rig.poll(second, 1))
+    hidden = rig.poll(second, 2)
+    rig.beat(first, lease)
+    keep(rig, 18.0, (second, tuple(hidden)))
+    assert rig.core.fleet.workers["w1"].state == "lost"
+    assert rig.poll(second, 2) == []  # it is emptied for the suspect
+    assert set(rig.beat(second, *hidden).cancelled) == {each.lease_id for each in hidden}
+    rig.hand_in(second, *(result(each, "returned") for each in hidden))
+    assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
+
+
 def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_the_operator() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.hand_in(first, result(lease, "failed", error="disk full"))
