@@ -13,10 +13,13 @@ from pathlib import Path
 from browser import Page
 from PIL import Image
 
+PICK = """(() => { const p = document.getElementById('timeline-picker'); p.value = 'gym/racing';
+  p.dispatchEvent(new Event('change')); })()"""
 TO_SECTION = """(() => { const e = document.querySelector(%r); e.scrollIntoView();
   window.scrollBy(0, -8); return e.id; })()"""
 VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => new Promise((done) => {
   video.preload = 'auto';
+  video.controls = false;
   video.addEventListener('seeked', () => done(video.videoWidth));
   video.addEventListener('error', () => done(0));
   video.addEventListener('loadeddata', () => { video.currentTime = video.duration / 2; });
@@ -45,17 +48,18 @@ def main() -> None:
             shoot(page, out / f"{name}.png")
         page.look(width=1280, height=1000)
         for section in ("evolution", "timelines"):
+            page.run(PICK)
             page.run(TO_SECTION % f"section[id^={section}], section[aria-labelledby^={section}]")
             shoot(page, out / f"report-{section}.png")
         page.look(width=390, height=844, phone=True)
         page.open(report / "index.html")
         shoot(page, out / "report-phone.png")
-        page.look(width=1280, height=720)
-        page.open(report / "replays" / "gym-continuouscar.html")
+        page.look(width=1280, height=690)
+        page.open(report / "replays" / "gym-racing.html")
         assert all(page.run(VIDEOS))
-        page.run("new Promise((done) => setTimeout(done, 1500))")  # the players' own signs go
+        page.run("new Promise((done) => setTimeout(done, 500))")  # the frames are painted
         shoot(page, out / "report-replays.png")
-        (trace,) = (report / "traces").glob("gym-continuouscar-stand-in*.html")
+        (trace,) = (report / "traces").glob("gym-racing-stand-in*.html")
         page.look(width=1280, height=1400)
         page.open(trace)
         shoot(page, out / "report-trace.png")

@@ -32,6 +32,16 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 
+KEYS = {
+    "Tab": (9, ""),
+    "Enter": (13, "\r"),
+    "Space": (32, " "),
+    "ArrowUp": (38, ""),
+    "ArrowDown": (40, ""),
+    "ArrowRight": (39, ""),
+}
+"""Key to its Windows key code, by which the protocol knows it, and the text that it types."""
+
 
 def find_browser() -> str:
     """Path of a Chromium; FileNotFoundError saying what to install."""
@@ -168,6 +178,23 @@ class Page:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def press(self, key: str) -> None:
+        """A key of the keyboard: `Tab`, `Enter`, `Space` or an arrow such as `ArrowDown`."""
+        code, text = KEYS[key]
+        name = " " if key == "Space" else key
+        pressed: dict[str, Any] = {"key": name, "code": key, "windowsVirtualKeyCode": code}
+        self.call("Input.dispatchKeyEvent", type="keyDown", **pressed, **({"text": text} if text else {}))
+        self.call("Input.dispatchKeyEvent", type="keyUp", **pressed)
+
+    def accessible(self) -> list[tuple[str, str]]:
+        """Role and name of everything that assistive technology is told of, in the page's order."""
+        nodes = self.call("Accessibility.getFullAXTree")["nodes"]
+        return [
+            (node["role"]["value"], node.get("name", {}).get("value", ""))
+            for node in nodes
+            if not node["ignored"] and "role" in node
+        ]
 
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
         """PNG of the window, or of the whole page."""

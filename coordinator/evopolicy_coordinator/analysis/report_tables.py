@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from evopolicy_coordinator.analysis import structure
 from evopolicy_coordinator.analysis.edits import demand_of
 from evopolicy_coordinator.analysis.normalised import DEMANDS
 from evopolicy_coordinator.analysis.ranking import Interval
+from evopolicy_coordinator.analysis.run_tables import (
+    ENTRY,
+    ENV,
+    HARNESS,
+    RUN,
+    LinkOf,
+    no_link,
+    one_or_all,
+    tables_of_runs,
+)
 from evopolicy_coordinator.analysis.scores import (
     family_of,
     family_title,
@@ -19,21 +28,10 @@ from evopolicy_coordinator.analysis.scores import (
 from evopolicy_coordinator.analysis.study import Study, Suite
 from evopolicy_coordinator.analysis.tables import Column, Table, best_marks
 
-_ENTRY = Column(key="entry", title="Agent")
-_HARNESS = Column(key="harness", title="Harness")
-_ENV = Column(key="env", title="Environment")
-_RUN = Column(key="run", title="Run")
 _DEMAND = Column(key="demand", title="Demand")
 
-LinkOf = Callable[[str], str]
-"""Run name to the page about it, or the empty string."""
 
-
-def _no_link(run: str) -> str:
-    return ""
-
-
-def tables_of(study: Study, link_of: LinkOf = _no_link) -> list[Table]:
+def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
     """Every table of the report in its order; those without rows are left out, except what was left out."""
     found: list[Table] = []
     for suite in study.suites:
@@ -44,8 +42,7 @@ def tables_of(study: Study, link_of: LinkOf = _no_link) -> list[Table]:
         _structure(study),
         _edit_sizes(study),
         _tokens(study),
-        _audit(study, link_of),
-        _left_out(study),
+        *tables_of_runs(study, link_of),
     ]
     return [table for table in found if table.rows or table.name == "left_out"]
 
@@ -57,7 +54,7 @@ def _span(interval: Interval | None, digits: int) -> str | None:
 def _aggregate(suite: Suite, study: Study) -> Table:
     families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
     families = families if len(families) > 1 else []
-    budgets = sorted({run.budget for run in study.runs if run.env in suite.board.environments})
+    budgets = _budgets(suite, study)
     whole = suite_size(suite.name) or len(suite.board.environments)
     rows: list[dict[str, Any]] = [
         {
@@ -68,6 +65,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             "score_interval": _span(row.score_interval, 3),
             "rank": row.rank,
             "rank_interval": _span(row.rank_interval, 0),
+            "budget": None if row.is_reference else budgets.get(row.entry),
             "wins": row.wins,
             "top2": row.top2,
             "environments": f"{row.n_environments} of {whole}",
@@ -75,12 +73,14 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         }
         for row in suite.board.standings
     ]
-    columns = [_ENTRY, _HARNESS]
+    columns = [ENTRY, HARNESS]
     columns += [Column(key=family, title=family_title(family), kind="number") for family in families]
     columns.append(Column(key="score", title=suite_title(suite.name), kind="number"))
     if any(row.score_interval is not None for row in suite.board.standings):
         columns.append(Column(key="score_interval", title="95 % interval"))
         columns.append(Column(key="rank_interval", title="Rank interval"))
+    if budgets:
+        columns.append(Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."))
     columns += [
         Column(key="wins", title="Wins", kind="integer", note="Environments on which it ranks first."),
         Column(
@@ -89,7 +89,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         Column(key="environments", title="Environments"),
         Column(key="runs", title="Runs", kind="integer"),
     ]
-    budget = f" Budget: {' or '.join(str(b) for b in budgets)} train episodes a run." if budgets else ""
+    budget = " Budget: train episodes of a run." if budgets else ""
     caption = (
         "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank, and "
         "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
@@ -104,6 +104,15 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         rows=tuple(rows),
         marks=best_marks(rows, [*families, "score"]),
     )
+
+
+def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
+    """Entry to the train episodes that its runs could spend."""
+    found: dict[str, set[int]] = {}
+    for run in study.runs:
+        if run.env in suite.board.environments:
+            found.setdefault(run.entry, set()).add(run.budget)
+    return {entry: one_or_all(sorted(budgets)) for entry, budgets in found.items()}
 
 
 def _heldout(suite: Suite) -> Table:
@@ -125,7 +134,7 @@ def _heldout(suite: Suite) -> Table:
         caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
         "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
         "that was not run, or a run with no ok submit.",
-        columns=(_ENTRY, _HARNESS, *columns),
+        columns=(ENTRY, HARNESS, *columns),
         rows=tuple(rows),
         marks=marks,
     )
@@ -155,9 +164,9 @@ def _cells(suite: Suite) -> Table:
         caption="Every entry on every environment: mean over its runs, percentile bootstrap interval of the mean where there are "
         "at least two, rank and rank score.",
         columns=(
-            _ENV,
+            ENV,
             Column(key="family", title="Family"),
-            _ENTRY,
+            ENTRY,
             Column(key="mean", title="Held-out mean", kind="number"),
             Column(key="interval", title="95 % interval"),
             Column(key="runs", title="Runs", kind="integer"),
@@ -187,7 +196,7 @@ def _normalised(suite: Suite) -> Table:
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
         "on the same cases, 1 the best agent on that environment. A dash: no agent beats random, no reference, or no score.",
         columns=(
-            _ENV,
+            ENV,
             _DEMAND,
             *(Column(key=agent, title=agent, kind="number", digits=2) for agent in agents),
         ),
@@ -217,9 +226,9 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
         "validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train episodes consumed when the "
         "curve first gets there. Validation is hidden from agents during the run.",
         columns=(
-            _ENV,
-            _ENTRY,
-            _RUN,
+            ENV,
+            ENTRY,
+            RUN,
             Column(key="submits", title="Scored submits", kind="integer"),
             Column(key="best", title="Best validation mean", kind="number"),
             Column(
@@ -235,9 +244,11 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
 
 
 def _edit_types(study: Study) -> Table:
+    harness = {run.entry: run.harness for run in study.runs}
     rows = [
         {
             "entry": row.entry,
+            "harness": harness[row.entry],
             "demand": row.demand,
             "n_synthesis": row.n_synthesis,
             "hit_synthesis": row.rate_synthesis,
@@ -264,7 +275,8 @@ def _edit_types(study: Study) -> Table:
         "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, the first score-bearing submit (it "
         "follows none), submits that are not ok, and ok ones without a validation score.",
         columns=(
-            _ENTRY,
+            ENTRY,
+            HARNESS,
             _DEMAND,
             count("n_synthesis", "Synthesis n", "New topology."),
             Column(key="hit_synthesis", title="Synthesis hit", kind="percent"),
@@ -301,8 +313,8 @@ def _structure(study: Study) -> Table:
         "environments of a demand group. State counts attributes that methods assign on their instance.",
         columns=(
             _DEMAND,
-            _ENTRY,
-            _HARNESS,
+            ENTRY,
+            HARNESS,
             *(Column(key=k, title=t, kind="number", digits=1) for k, t in zip(keys, titles, strict=True)),
             Column(key="runs", title="Runs", kind="integer"),
         ),
@@ -329,7 +341,7 @@ def _edit_sizes(study: Study) -> Table:
         "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
         "only: files outside the source bundle changed, such as weights.",
         columns=(
-            _ENTRY,
+            ENTRY,
             Column(key="lines", title="Changed lines"),
             Column(key="n", title="Transitions", kind="integer"),
             Column(key="p_visible", title="Visible mean improved", kind="percent"),
@@ -354,7 +366,7 @@ def _tokens(study: Study) -> Table:
     ]
 
     def millions(key: str, title: str, note: str) -> Column:
-        return Column(key=key, title=title, kind="number", digits=2, note=note)
+        return Column(key=key, title=title, kind="number", digits=2, below=True, note=note)
 
     return Table(
         name="tokens",
@@ -362,8 +374,8 @@ def _tokens(study: Study) -> Table:
         caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
         "reasoning. Diagnostic only, no part of a score. A dash: the agent does not tell.",
         columns=(
-            _ENV,
-            _ENTRY,
+            ENV,
+            ENTRY,
             millions("input", "In (M)", "Non-cached input."),
             millions("cache", "Cache (M)", "Cache read plus cache creation."),
             millions("output", "Out (M)", "Output, reasoning included."),
@@ -371,65 +383,4 @@ def _tokens(study: Study) -> Table:
             Column(key="runs", title="Runs that tell", kind="integer"),
         ),
         rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
-    )
-
-
-def _audit(study: Study, link_of: LinkOf) -> Table:
-    rows: list[dict[str, Any]] = []
-    for found in study.audit:
-        row = {key: getattr(found, key) for key in found.__struct_fields__}
-        selected = found.selected_index
-        row |= {
-            "env": title_of(found.env),
-            "run": found.run.rsplit(" / ", 1)[-1],
-            "selected": None if selected is None else f"s{selected:03d}",
-        }
-        rows.append(row)
-
-    def integer(key: str, title: str) -> Column:
-        return Column(key=key, title=title, kind="integer")
-
-    def seconds(key: str, title: str) -> Column:
-        return Column(key=key, title=f"{title} (s)", kind="number", digits=0)
-
-    return Table(
-        name="audit",
-        title="Audit signals",
-        caption="One row a run. Invalid rate: accepted submits that are not ok, of all accepted. Score drops: score-bearing submits "
-        "whose validation mean is below the one before. Growth: AST nodes of the selected policy over those of the first. "
-        "Wall time by phase, in seconds; phases may overlap.",
-        columns=(
-            _ENV,
-            _ENTRY,
-            _RUN,
-            integer("accepted", "Accepted"),
-            integer("rejected", "Rejected"),
-            Column(key="invalid_rate", title="Invalid rate", kind="percent"),
-            integer("budget_used", "Budget used"),
-            Column(key="episodes_per_submit", title="Episodes / submit", kind="number", digits=1),
-            integer("failed_episodes", "Failed episodes"),
-            integer("score_drops", "Score drops"),
-            Column(key="selected", title="Selected"),
-            Column(key="complexity_growth", title="Growth (×)", kind="number", digits=2),
-            integer("turns", "Turns"),
-            integer("retries", "Retries"),
-            seconds("wall_s", "Wall"),
-            seconds("agent_s", "Agent"),
-            seconds("queue_s", "Queue"),
-            seconds("rollout_s", "Rollout"),
-            seconds("feedback_s", "Feedback"),
-            seconds("finalise_s", "Finalise"),
-        ),
-        rows=tuple(rows),
-        links={i: link for i, found in enumerate(study.audit) if (link := link_of(found.run))},
-    )
-
-
-def _left_out(study: Study) -> Table:
-    return Table(
-        name="left_out",
-        title="Left out",
-        caption="Folders that are no complete run, and why. They are in no table and no figure.",
-        columns=(Column(key="path", title="Folder"), Column(key="reason", title="Reason")),
-        rows=tuple({"path": str(item.path), "reason": item.reason} for item in study.left_out),
     )

@@ -21,6 +21,8 @@ class Column(msgspec.Struct, frozen=True, kw_only=True):
     kind: Kind = "text"
     digits: int = 3
     """Decimals that a `number` is shown with."""
+    below: bool = False
+    """A `number` above 0 that is less than its last decimal is shown as such (`<0.01`), not as 0."""
     note: str = ""
     """What it means, in a sentence, shown on demand."""
 
@@ -47,6 +49,9 @@ def shown(value: Any, column: Column) -> str:
     if column.kind == "percent":
         return f"{100.0 * value:.0f} %"
     if column.kind == "number" and isinstance(value, int | float):
+        least = 10.0**-column.digits
+        if column.below and 0.0 < value < least:
+            return f"<{least:.{column.digits}f}"
         text = f"{value:.{column.digits}f}"
         return text.removeprefix("-") if float(text) == 0.0 else text
     return str(value)
@@ -103,18 +108,47 @@ def latex_text(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A `table` environment with booktabs rules; best in bold, second-best underlined, as in the paper."""
-    spec = "".join("l" if column.kind == "text" else "r" for column in table.columns)
-    wrap = {0: "{}", 1: "\\textbf{{{}}}", 2: "\\underline{{{}}}"}
+    """A `table` environment with booktabs rules; best in bold, second-best underlined, as in the paper.
+
+    A table too wide for a page is in panels one below the other, each with the first columns of text.
+    """
     lines = [
         "% needs \\usepackage{booktabs}",
         "\\begin{table}",
         "\\centering",
         f"\\caption{{{latex_text(table.caption or table.title)}}}",
         f"\\label{{tab:{table.name}}}",
+    ]
+    if len(table.columns) > _ROOMY:
+        lines += ["\\scriptsize", "\\setlength{\\tabcolsep}{3pt}"]
+    for number, columns in enumerate(_panels(table.columns)):
+        lines += ["\\par\\vspace{0.75em}"] * bool(number) + _tabular(table, columns)
+    return "\n".join([*lines, "\\end{table}", ""])
+
+
+_ROOMY = 7
+"""Columns that fit a page in its own type size."""
+_WIDEST = 13
+"""Columns that fit a page in small type."""
+
+
+def _panels(columns: tuple[Column, ...]) -> list[tuple[Column, ...]]:
+    if len(columns) <= _WIDEST:
+        return [columns]
+    first = next((i for i, column in enumerate(columns) if column.kind != "text"), len(columns))
+    head, rest = columns[:first], columns[first:]
+    n = -(-len(rest) // max(1, _WIDEST - 3 - len(head)))
+    size = -(-len(rest) // n)
+    return [(*head, *rest[i : i + size]) for i in range(0, len(rest), size)]
+
+
+def _tabular(table: Table, columns: tuple[Column, ...]) -> list[str]:
+    spec = "".join("l" if column.kind == "text" else "r" for column in columns)
+    wrap = {0: "{}", 1: "\\textbf{{{}}}", 2: "\\underline{{{}}}"}
+    lines = [
         f"\\begin{{tabular}}{{{spec}}}",
         "\\toprule",
-        " & ".join(latex_text(column.title) for column in table.columns) + " \\\\",
+        " & ".join(latex_text(column.title) for column in columns) + " \\\\",
         "\\midrule",
     ]
     for number, row in enumerate(table.rows):
@@ -122,11 +156,10 @@ def to_latex(table: Table) -> str:
             wrap[table.marks.get((number, column.key), 0)].format(
                 latex_text(shown(row.get(column.key), column))
             )
-            for column in table.columns
+            for column in columns
         ]
         lines.append(" & ".join(cells) + " \\\\")
-    lines += ["\\bottomrule", "\\end{tabular}", "\\end{table}", ""]
-    return "\n".join(lines)
+    return [*lines, "\\bottomrule", "\\end{tabular}"]
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator.analysis.html.pages import (
+    FORMS,
     FigureView,
     PlayedEpisode,
     default_title,
@@ -32,6 +33,7 @@ from evopolicy_coordinator.analysis.html.pages import (
 from evopolicy_coordinator.analysis.palette import Look, looks
 from evopolicy_coordinator.analysis.records import Run
 from evopolicy_coordinator.analysis.report_tables import tables_of
+from evopolicy_coordinator.analysis.run_tables import feedback_use, submits_of
 from evopolicy_coordinator.analysis.scores import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables import Table, to_csv, to_latex, to_markdown
@@ -41,6 +43,8 @@ REPORT_SCHEMA_VERSION = 1
 _OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
 _POINTS_PER_REM = 11.0
 """Figures are shown a little larger than printed: a rem of the page for that many points."""
+
+_WRITTEN = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 Progress = Callable[[str, int, int], None]
 """Told (what, done, total)."""
@@ -64,14 +68,19 @@ def write_report(
     look = looks(study.entries, study.reference)
     trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
     tables = tables_of(study, lambda run: trace_links.get(run, ""))
-    for table in tables:
-        for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
-            (out / "tables" / f"{table.name}.{suffix}").write_text(text, encoding="utf-8")
     figures, figure_data = _write_figures(study, out, tell)
     if traces:
+        submits: list[dict[str, Any]] = []
         for done, run in enumerate(study.runs, start=1):
-            _write_trace(trace(run), out, look.get(run.entry))
+            found = trace(run)
+            _write_trace(found, out, look, _beside(run, study.runs))
+            submits += submits_of(found)
             tell("run pages", done, len(study.runs))
+        tables.append(feedback_use(submits))
+    for table in tables:
+        for _, suffix in FORMS:
+            text = _WRITTEN[suffix](table)
+            (out / "tables" / f"{table.name}.{suffix}").write_text(text, encoding="utf-8", errors="replace")
     replay_links = _write_replays(study, out, look)
     page = index_page(
         study,
@@ -144,7 +153,18 @@ class _Html(str):
         return str(self)
 
 
-def _write_trace(found: Trace, out: Path, look: Look | None) -> None:
+def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
+    """A run of each other agent on the same environment, of the same repeat where there is one."""
+    found: dict[str, Run] = {}
+    for other in runs:
+        if other.env == run.env and other.entry != run.entry:
+            chosen = found.setdefault(other.entry, other)
+            if chosen.record.repeat != run.record.repeat == other.record.repeat:
+                found[other.entry] = other
+    return list(found.values())
+
+
+def _write_trace(found: Trace, out: Path, looks: Mapping[str, Look], beside: Sequence[Run]) -> None:
     folder = out / "traces"
     folder.mkdir(exist_ok=True)
     name = slug(found.run)
@@ -157,7 +177,13 @@ def _write_trace(found: Trace, out: Path, look: Look | None) -> None:
                 image_links.setdefault(row.submit.index, []).append((path.name, f"{name}/{target.name}"))
         if row.video is not None and _copy(row.video, folder / name / f"{row.submit.label}.mp4"):
             videos[row.submit.index] = f"{name}/{row.submit.label}.mp4"
-    page = trace_page(found, look=look, image_links=image_links, videos=videos)
+    page = trace_page(
+        found,
+        look=looks.get(found.run.entry),
+        image_links=image_links,
+        videos=videos,
+        beside=[(other.entry, looks.get(other.entry), f"{slug(other)}.html") for other in beside],
+    )
     (folder / f"{name}.html").write_text(page, encoding="utf-8", errors="replace")
 
 

@@ -71,7 +71,8 @@ def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
     tables = {path.stem for path in (report / "tables").glob("*.csv")}
     assert tables >= {
         "leaderboard_core16", "heldout_core16", "cells_core16", "normalised_core16", "leaderboard_toy", "evolution",
-        "edit_types", "structure", "edit_sizes", "tokens", "audit", "left_out",
+        "edit_types", "structure", "edit_sizes", "tokens", "audit", "runs", "feedback_use", "agents", "environments",
+        "left_out",
     }  # fmt: skip
     for suffix in ("md", "tex"):
         assert {path.stem for path in (report / "tables").glob(f"*.{suffix}")} == tables
@@ -86,6 +87,50 @@ def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
     assert set(data["tables"]) == tables
     assert len(data["runs"]) == 23
     assert all(data["figures"][name]["data"] for name in figures)
+
+
+def table(report: Path, name: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((report / "tables" / f"{name}.csv").read_text().splitlines()))
+
+
+def test_feedback_use_has_a_row_for_every_submit_with_what_was_read_and_said(
+    report: Path, runs: Path
+) -> None:
+    found = table(report, "feedback_use")
+    assert len(found) == sum(int(row["submits"]) for row in table(report, "runs"))
+    record = json.loads((runs / "Kestrel" / "gym_acrobot" / "exp" / "run.json").read_text())
+    own = [r for r in found if (r["env"], r["entry"], r["run"]) == ("Acrobot", "Kestrel", "exp")]
+    assert [r["submit"] for r in own] == [f"s{i:03d}" for i in range(len(own))]
+    assert [r["before"] for r in own[1:]] == [r["after"] for r in own[:-1]]
+    assert {r["submit"]: float(r["validation"]) for r in own if r["validation"]} == {
+        f"s{int(index):03d}": score for index, score in record["outcome"]["val_scores"].items()
+    }
+    assert [r["submit"] for r in own if r["selected"]] == [f"s{record['outcome']['best_submit_index']:03d}"]
+    assert any("feedback/submit_000" in r["read"] for r in own)
+    assert any(r["said"] for r in own)
+    assert own[0]["edit"] == "first"
+
+
+def test_agents_and_environments_are_listed_as_they_were_set_up(tmp_path: Path) -> None:
+    for repeat, settings in enumerate(
+        ({"effort": "high", "retries": 5, "requests_failed": 3, "folder": "/home/me"}, {"effort": "low"})
+    ):
+        folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], repeat=repeat, budget=64)
+        record = json.loads((folder / "run.json").read_text())
+        record["agent"] |= {"settings": settings, "model_string": "m-1", "cli_version": "2.0"}
+        (folder / "run.json").write_text(json.dumps(record))
+    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    agents = table(tmp_path / "report", "agents")
+    assert [(r["entry"], r["cli_version"], r["model"], r["settings"], r["runs"]) for r in agents] == [
+        ("Agent A", "2.0", "m-1", "effort high, retries 5", "1"),
+        ("Agent A", "2.0", "m-1", "effort low", "1"),
+    ]
+    (env,) = table(tmp_path / "report", "environments")
+    assert (env["id"], env["family"], env["demand"], env["budget"], env["steps"]) == (
+        "gym/acrobot", "Gym / Box2D", "tuning", "64", "500",
+    )  # fmt: skip
+    board = table(tmp_path / "report", "leaderboard_core16")
+    assert {r["entry"]: r["budget"] for r in board} == {"Agent A": "64", "Random policy": ""}
 
 
 def test_every_link_and_image_of_every_page_resolves(report: Path) -> None:

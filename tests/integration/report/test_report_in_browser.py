@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from browser import Page
-from invented_study import write_suite
+from invented_study import AGENTS, write_suite
 from typer.testing import CliRunner
 
 from evopolicy_coordinator.report_cli import app
@@ -143,6 +143,86 @@ def test_everything_interactive_has_a_name_and_headings_descend_in_steps(index: 
     assert levels[0] == 1
     assert all(after - before <= 1 for before, after in pairwise(levels))
     assert index.run("document.documentElement.lang") == "en"
+
+
+def test_everything_can_be_reached_and_worked_by_keyboard(index: Page) -> None:
+    focused = "document.activeElement"
+    index.press("Tab")
+    assert index.run(f"{focused}.textContent") == "Skip to the content"
+    assert index.run(f"{focused}.getBoundingClientRect().left") >= 0
+    index.press("Enter")
+    assert index.run("location.hash") == "#main"
+    stops = []
+    for _ in range(25):
+        index.press("Tab")
+        stops.append(
+            index.run(
+                f"[{focused}.tagName, getComputedStyle({focused}).outlineStyle, {focused}.closest('main') !== null]"
+            )
+        )
+    assert all(outline == "solid" and inside for _, outline, inside in stops), stops
+    assert {tag for tag, _, _ in stops} >= {"DIV", "A", "BUTTON"}
+    header = "document.getElementById('evolution-table').tHead.rows[0].cells[6]"
+    index.run(f"{header}.querySelector('button').focus()")
+    index.press("Enter")
+    assert index.run(f"{header}.getAttribute('aria-sort')") == "descending"
+    index.press("Space")
+    assert index.run(f"{header}.getAttribute('aria-sort')") == "ascending"
+    index.run("document.getElementById('timeline-picker').focus()")
+    index.press("ArrowDown")
+    assert (
+        index.run("document.querySelector('figure[data-timeline]:not([hidden])').dataset.timeline")
+        != "gym/acrobot"
+    )
+    scroller = "document.getElementById('audit-table').parentElement"
+    index.run(f"{scroller}.focus()")
+    assert index.run(f"{scroller}.scrollWidth > {scroller}.clientWidth")
+    index.run(
+        f"void (window.scrolled = new Promise((done) => {scroller}.addEventListener('scroll', () => done(true), {{ once: true }})))"
+    )
+    index.press("ArrowRight")
+    assert index.run("window.scrolled")
+    assert index.run(f"{scroller}.scrollLeft") > 0
+
+
+def test_screen_reader_is_told_the_name_of_every_table_figure_and_control(page: Page, report: Path) -> None:
+    named = {
+        "button",
+        "link",
+        "table",
+        "image",
+        "searchbox",
+        "combobox",
+        "region",
+        "navigation",
+        "columnheader",
+        "rowheader",
+    }
+    for path in [report / "index.html", sorted((report / "traces").glob("*.html"))[0]]:
+        page.look()
+        page.open(path)
+        told = page.accessible()
+        assert [(role, name) for role, name in told if role in named and not name.strip()] == []
+        assert [role for role, _ in told].count("main") == 1
+        regions = [name for role, name in told if role in ("region", "navigation")]
+        assert len(regions) == len(set(regions)), "two places of one name"
+    page.open(report / "index.html")
+    told = page.accessible()
+    figures = len(
+        page.run("[...document.querySelectorAll('figure:not([hidden]) svg[role=img]')].map((e) => e.id)")
+    )
+    assert sum(role == "image" for role, _ in told) == figures
+    assert sum(role == "table" for role, _ in told) >= 10
+
+
+def test_run_pages_lead_to_the_other_agents_on_the_same_environment(page: Page, report: Path) -> None:
+    page.look()
+    page.open(sorted((report / "traces").glob("gym-racing-Kestrel-*.html"))[0])
+    links = page.run(
+        "[...document.querySelectorAll('nav[aria-label^=Other] a')].map((a) => [a.textContent, a.getAttribute('href')])"
+    )
+    assert [name for name, _ in links] == sorted(set(AGENTS) - {"Kestrel"}, key=str.casefold)
+    assert all((report / "traces" / href).is_file() and href.startswith("gym-racing-") for _, href in links)
 
 
 def test_text_has_enough_contrast_in_both_themes(page: Page, report: Path) -> None:

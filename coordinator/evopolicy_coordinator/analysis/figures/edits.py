@@ -15,7 +15,7 @@ from evopolicy_coordinator.analysis.palette import EDIT_COLOURS, Look
 from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.records import rows
 from evopolicy_coordinator.analysis.scores import title_of
-from evopolicy_coordinator.analysis.structure import BINS, DATA_ONLY
+from evopolicy_coordinator.analysis.structure import BINS, DATA_ONLY, UNCHANGED
 from evopolicy_coordinator.analysis.study import Study, Timeline
 
 MAX_ROWS = 24
@@ -210,8 +210,11 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     for place, label in enumerate(labels)
                     if label in own and getattr(own[label], key) is not None
                 ]
+                sizes = [
+                    point for point in points if labels[round(point[0] - shift)] not in (UNCHANGED, DATA_ONLY)
+                ]
                 panel.plot(
-                    [x for x, _, _ in points], [y for _, y, _ in points],
+                    [x for x, _, _ in sizes], [y for _, y, _ in sizes],
                     color=look.colour, linestyle=look.dash, linewidth=1.1, alpha=0.6,
                 )  # fmt: skip
                 panel.scatter(

@@ -48,14 +48,14 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
                         linewidth=1.0,
                     )
                 panel.annotate(
-                    f"{value:.2f}",
+                    f"{value:.3f}",
                     (value, place),
                     xytext=(6, 0),
                     textcoords="offset points",
                     va="center",
                     fontsize=8,
                 )
-            panel.set_xlim(-0.03, 1.24)
+            panel.set_xlim(-0.03, 1.32)
             panel.set_xticks([0.0, 0.5, 1.0])
             panel.set_ylim(len(standings) - 0.5, -0.5)
             panel.grid(axis="y", visible=False)

@@ -21,6 +21,8 @@ from evopolicy_coordinator.analysis.trace import Trace, TraceRow, diff, sources
 
 _FILTER_FROM = 9
 """Rows from which a table has a filter."""
+FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
+"""Written forms of a table, and their suffixes."""
 
 
 class FigureView(msgspec.Struct, frozen=True, kw_only=True):
@@ -126,7 +128,10 @@ def index_page(
             "feedback", "Feedback use",
             texts=["Each run has a page: what its agent read and said before every submit, what it changed, and what came of it, with "
                    "all checkpoints and their differences."],
-            tables=[_trace_index(study, trace_links)] if trace_links else [],
+            tables=shown_tables("runs") if trace_links else [],
+            links=[(f"All submits in one table ({label})", f"tables/feedback_use.{suffix}") for label, suffix in FORMS]
+            if trace_links
+            else [],
         ),
         _section(
             "replays", "Replays",
@@ -134,6 +139,7 @@ def index_page(
             ["None of these runs has recorded episodes of its selected checkpoint."],
             links=[(title_of(env), href) for env, href in replay_links.items()],
         ),
+        _section("setup", "Setup", tables=shown_tables("agents", "environments")),
         _section(
             "left-out", "Left out",
             tables=shown_tables("left_out") if study.left_out else [],
@@ -194,16 +200,19 @@ def _notices(study: Study) -> list[dict[str, Any]]:
 
 
 def _table_view(table: Table) -> dict[str, Any]:
-    stems = [("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex")]
     return {
         "id": table.name.replace("_", "-") + "-table",
         "title": table.title,
         "caption": table.caption,
-        "files": [(label, f"tables/{table.name}.{suffix}") for label, suffix in stems],
+        "files": [(label, f"tables/{table.name}.{suffix}") for label, suffix in FORMS],
         "filter": len(table.rows) >= _FILTER_FROM,
         "folded": False,
         "columns": [
-            {"title": column.title, "numeric": column.kind != "text", "note": column.note}
+            {
+                "title": column.title.replace(" /", "\u00a0/"),
+                "numeric": column.kind != "text",
+                "note": column.note,
+            }
             for column in table.columns
         ],
         "rows": [
@@ -228,44 +237,16 @@ def _cell(table: Table, number: int, column: Column, value: Any) -> dict[str, An
     }
 
 
-def _trace_index(study: Study, links: Mapping[str, str]) -> dict[str, Any]:
-    runs = [run for run in study.runs if run.name in links]
-    columns = (
-        Column(key="env", title="Environment"),
-        Column(key="entry", title="Agent"),
-        Column(key="run", title="Run"),
-        Column(key="submits", title="Submits", kind="integer"),
-        Column(key="score", title="Held-out mean", kind="number"),
-    )
-    table = Table(
-        name="traces",
-        title="Runs",
-        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
-        columns=columns,
-        rows=tuple(
-            {
-                "env": title_of(run.env),
-                "entry": run.entry,
-                "run": run.name.rsplit(" / ", 1)[-1],
-                "submits": len(run.submits),
-                "score": run.score,
-            }
-            for run in runs
-        ),
-        links={i: links[run.name] for i, run in enumerate(runs)},
-    )
-    return {**_table_view(table), "files": []}
-
-
 def trace_page(
     trace: Trace,
     *,
     look: Look | None,
     image_links: Mapping[int, Sequence[tuple[str, str]]],
     videos: Mapping[int, str],
+    beside: Sequence[tuple[str, Look | None, str]] = (),
 ) -> str:
     """One run's page. `image_links` has, by submit index, (name, path relative to the page) of its copied images, `videos`
-    the path of its copied feedback video."""
+    the path of its copied feedback video, `beside` (agent, look, page) of other agents on the same environment."""
     run = trace.run
     outcome = run.record.outcome
     transitions = [row.transition for row in trace.rows if row.transition is not None]
@@ -289,6 +270,7 @@ def trace_page(
         lead=f"Run {run.record.exp_id}, repeat {run.record.repeat}, harness {run.harness}, policy scope "
         f"{run.record.experiment_dimensions.policy_scope}" + (f", ended by: {closed}." if closed else "."),
         look=look,
+        beside=beside,
         facts=facts,
         budget=run.budget,
         timeline=Markup(svg),

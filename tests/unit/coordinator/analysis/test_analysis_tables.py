@@ -19,7 +19,15 @@ from evopolicy_coordinator.analysis.figures.style import inline_svg, new_figure,
 from evopolicy_coordinator.analysis.palette import looks
 from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.reader import read_run
-from evopolicy_coordinator.analysis.tables import Column, Table, best_marks, to_csv, to_latex, to_markdown
+from evopolicy_coordinator.analysis.tables import (
+    Column,
+    Table,
+    best_marks,
+    shown,
+    to_csv,
+    to_latex,
+    to_markdown,
+)
 from evopolicy_coordinator.analysis.trace import diff, trace
 
 ROWS = (
@@ -61,6 +69,29 @@ def test_latex_escapes_and_marks() -> None:
     assert "E & \\underline{0.00} & -- & \\textbf{3} \\\\" in text
     assert "\\begin{tabular}{lrrr}" in text
     assert "\\caption{50 \\% of it.}" in text
+
+
+def test_wide_latex_table_is_in_panels_that_each_name_their_rows() -> None:
+    numbers = tuple(Column(key=f"e{i}", title=f"E{i}", kind="number", digits=0) for i in range(16))
+    row = {"who": "A", "how": "h", **{f"e{i}": i for i in range(16)}}
+    head = (Column(key="who", title="Agent"), Column(key="how", title="Harness"))
+    text = to_latex(Table(name="w", title="W", caption="", columns=(*head, *numbers), rows=(row,)))
+    assert text.count("\\begin{tabular}{llrrrrrrrr}") == text.count("\\end{tabular}") == 2
+    assert "A & h & 0 & 1 & 2 & 3 & 4 & 5 & 6 & 7 \\\\" in text
+    assert "A & h & 8 & 9 & 10 & 11 & 12 & 13 & 14 & 15 \\\\" in text
+    assert text.count("\\begin{table}") == text.count("\\label") == 1
+
+
+def test_number_too_small_to_show_is_told_from_nought() -> None:
+    column = Column(key="x", title="X", kind="number", digits=2, below=True)
+    assert [shown(value, column) for value in (0.0, 0.0001, 0.0099, 0.01, 0.014)] == [
+        "0.00",
+        "<0.01",
+        "<0.01",
+        "0.01",
+        "0.01",
+    ]
+    assert shown(0.0001, Column(key="x", title="X", kind="number", digits=2)) == "0.00"
 
 
 def test_equal_best_values_share_the_mark_and_leave_no_second() -> None:
