@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from readme_commands import readme_commands
+from documents import blocks_of_commands
 from typer.testing import CliRunner
 
 from evopolicy_common import credentials
@@ -19,7 +19,7 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
 def run_blocks(wanted: str, places: dict[str, Path]) -> str:
     """Runs the blocks whose certificates are asked for by a command that holds `wanted`, and says what they printed."""
     said = ""
-    for block in readme_commands(DEPLOY / "README.md"):
+    for block in blocks_of_commands(DEPLOY / "README.md"):
         text = [" ".join(words) for words in block]
         if not any(wanted in line for line in text):
             continue

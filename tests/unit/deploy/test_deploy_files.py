@@ -20,22 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 import yaml
-from readme_commands import readme_commands
-
-from evopolicy_coordinator import cli as coordinator_cli
-from evopolicy_gateway import cli as gateway_cli
-from evopolicy_worker import cli as worker_cli
+from documents import APPS, blocks_of_commands, parse
 
 ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "deploy"
 UNITS = ("evopolicy-coordinator.service", "evopolicy-worker@.service")
-APPS = {
-    "evopolicy": gateway_cli.app,
-    "evopolicy-coordinator": coordinator_cli.app,
-    "evopolicy-worker": worker_cli.app,
-}
 BUBBLEWRAP_CALLS = {
     *("clone", "clone3", "unshare", "mount", "umount2", "pivot_root", "chroot", "sethostname", "setns"),
     *("prctl", "seccomp", "capset", "setresuid", "setresgid", "prlimit64", "sched_setaffinity"),
@@ -55,19 +45,6 @@ class Unit(configparser.ConfigParser):
 
     def all(self, key: str) -> list[str]:
         return [line.partition("=")[2] for line in self._lines if line.startswith(f"{key}=")]
-
-
-def parse(words: list[str]) -> None:
-    """Fails when the command does not take these options; runs nothing."""
-    command: Any = typer.main.get_command(APPS[words[0]])
-    arguments = words[1:]
-    name: str | None = words[0]
-    while name is not None:
-        context = command.make_context(name, list(arguments))
-        rest = [*getattr(context, "_protected_args", getattr(context, "protected_args", [])), *context.args]
-        name = None
-        if rest:
-            name, command, arguments = command.resolve_command(context, rest)
 
 
 def environment_file(path: Path) -> dict[str, str]:
@@ -261,7 +238,7 @@ def test_docker_takes_the_compose_file() -> None:
 
 
 def test_the_commands_of_the_readme_are_taken() -> None:
-    parsed = [words for block in readme_commands(DEPLOY / "README.md") for words in block]
+    parsed = [words for block in blocks_of_commands(DEPLOY / "README.md") for words in block]
     for words in parsed:
         parse(words)
     assert len(parsed) >= 9

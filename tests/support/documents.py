@@ -1,0 +1,78 @@
+"""What documents say of our commands, held against the commands themselves. Nothing is run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from evopolicy_coordinator import cli as coordinator_cli
+from evopolicy_gateway import cli as gateway_cli
+from evopolicy_gateway import serve_cli
+from evopolicy_worker import cli as worker_cli
+
+APPS = {
+    "evopolicy": gateway_cli.app,
+    "evopolicy-coordinator": coordinator_cli.app,
+    "evopolicy-gateway": serve_cli.app,
+    "evopolicy-worker": worker_cli.app,
+}
+
+
+def blocks_of_commands(path: Path) -> list[list[list[str]]]:
+    """For each fenced block that has any, our own commands in order, as words, whatever they are started with; none of diagrams."""
+    blocks = re.findall(r"```\n(.*?)```", path.read_text(), re.DOTALL)
+    found = [[_command(line) for line in block.splitlines()] for block in blocks if "─" not in block]
+    return [told for block in found if (told := [words for words in block if words])]
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command of ours that does something, by its whole name."""
+    for name, app in APPS.items():
+        yield from _below(name, typer.main.get_command(app))
+    for name, app in _of_other_rooms().items():
+        yield from _below(f"evopolicy {name}", typer.main.get_command(app))
+
+
+def parse(words: list[str]) -> None:
+    """Fails when the command does not take these words."""
+    other = _of_other_rooms().get(words[1]) if words[0] == "evopolicy" else None
+    command: Any = typer.main.get_command(other or APPS[words[0]])
+    arguments = words[1:] if other is None else words[2:]
+    name: str | None = words[0]
+    while name is not None:
+        context = command.make_context(name, list(arguments))
+        rest = [*getattr(context, "_protected_args", getattr(context, "protected_args", [])), *context.args]
+        name = None
+        if rest:
+            name, command, arguments = command.resolve_command(context, rest)
+
+
+def _of_other_rooms() -> dict[str, typer.Typer]:
+    return {point.name: point.load() for point in entry_points(group=gateway_cli.COMMANDS_GROUP)}
+
+
+def _below(name: str, command: Any) -> Iterator[tuple[str, Any]]:
+    inner = getattr(command, "commands", {})
+    if not inner or command.invoke_without_command:
+        yield name, command
+    for word, each in inner.items():
+        yield from _below(f"{name} {word}", each)
+
+
+def _command(line: str) -> list[str]:
+    try:
+        words = shlex.split(line, comments=True)
+    except ValueError:
+        return []
+    for index, word in enumerate(words):
+        name = word.rpartition("/")[2]
+        # The shortest of the names is also that of a user and a folder: it counts at the beginning only.
+        if name in APPS and (index == 0 or name != "evopolicy") and words[index + 1 :]:
+            return [name, *words[index + 1 :]]
+    return []

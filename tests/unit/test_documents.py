@@ -1,0 +1,135 @@
+"""What the documents name is there: files, links, tests, commands and their options, make's targets."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import pytest
+from documents import blocks_of_commands, commands, parse
+
+from evopolicy_coordinator.intake import _VERBS
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = [
+    *("README.md", "ARCHITECTURE.md", "SECURITY.md", "deploy/README.md", "examples/policies/README.md"),
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md"))),
+]
+FOLDERS = ("common", "coordinator", "worker", "agent_gateway", "deploy", "docs", "examples", "tests")
+ELSEWHERE = frozenset({"AGENTS.md", "system/policy.py", "policy.py", "my_policy/policy.py", "my_agent.py"})
+"""Files of a workspace, of an agent's or of an operator's."""
+ROOMS = {
+    "common/": "common/evopolicy_common/",
+    "coordinator/": "coordinator/evopolicy_coordinator/",
+    "worker/": "worker/evopolicy_worker/",
+    "gateway/": "agent_gateway/evopolicy_gateway/",
+}
+"""How tables shorten a room's package."""
+
+
+def text_of(document: str) -> str:
+    return (ROOT / document).read_text()
+
+
+def code_in(document: str) -> list[str]:
+    """What stands in backticks within a line."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text_of(document), flags=re.DOTALL))
+
+
+@cache
+def tree() -> frozenset[str]:
+    """Paths of all files and folders that belong to the project."""
+    names = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    ).stdout.splitlines()
+    # Unpacked from an archive there is no git to ask.
+    files = names or [
+        str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*")
+    ]
+    return frozenset(str(each) for name in files for each in (Path(name), *Path(name).parents))
+
+
+@cache
+def tests() -> frozenset[str]:
+    """Names of all tests."""
+    found = set()
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                found.add(node.name)
+    return frozenset(found)
+
+
+def is_there(name: str) -> bool:
+    """A path in the tree, from its root, a room's package, or as the only end of a path that says so."""
+    name = name.rstrip("/")
+    for short, whole in ROOMS.items():
+        if name.startswith(short) and whole + name.removeprefix(short) in tree():
+            return True
+    return name in tree() or any(path.endswith(f"/{name}") for path in tree())
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_files_that_a_document_names_are_there(document: str) -> None:
+    named = {word.partition("::")[0] for word in code_in(document) if " " not in word and "{" not in word}
+    files = {
+        word
+        for word in named
+        if re.fullmatch(r"[\w@./-]+\.(py|md|toml|yaml|sh|csv)", word) or word.partition("/")[0] in FOLDERS
+    }
+    assert {word for word in files - ELSEWHERE if not is_there(word)} == set()
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_links_of_a_document_lead_somewhere(document: str) -> None:
+    links = [link for link in re.findall(r"\]\(([^)#]+)", text_of(document)) if "://" not in link]
+    assert [link for link in links if not (ROOT / document).parent.joinpath(link).exists()] == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_tests_that_a_document_names_are_there(document: str) -> None:
+    named = {name for word in code_in(document) for name in re.findall(r"\btest_\w+\b(?!\.py)", word)}
+    modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    assert named - tests() - modules == set()
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_commands_in_a_documents_blocks_are_taken(document: str) -> None:
+    for block in blocks_of_commands(ROOT / document):
+        for words in block:
+            parse(words)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_options_that_a_document_names_are_ours(document: str) -> None:
+    ours = {option for _, command in commands() for each in command.params for option in each.opts}
+    scripts = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    named = {option for word in code_in(document) for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", word)}
+    assert {option for option in named - ours - {"--help"} if f'"{option}"' not in scripts} == set()
+
+
+def test_make_has_the_targets_that_documents_name() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", text_of("Makefile"), re.MULTILINE))
+    for document in DOCUMENTS:
+        assert set(re.findall(r"`make ([a-z-]+)", text_of(document))) <= targets, document
+
+
+def test_every_command_is_in_a_document_and_its_help_has_an_example() -> None:
+    told = "\n".join(map(text_of, DOCUMENTS))
+    names = {name: f"`{name.partition(' ')[2]}" for name, _ in commands()}
+    assert [name for name, short in names.items() if name not in told and short not in told] == []
+    assert [name for name, each in commands() if "Example: " not in f"{each.epilog} {each.help}"] == []
+
+
+def test_the_keys_that_the_architecture_lists_are_those_that_are_answered() -> None:
+    listed = re.findall(r"`(?:work|gw/<run>)/\{([^}]+)\}`", text_of("ARCHITECTURE.md"))
+    assert len(listed) == 2
+    verbs = {verb.strip() for verbs in listed for verb in verbs.split(",")}
+    assert verbs <= set(_VERBS.values())
