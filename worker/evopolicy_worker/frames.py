@@ -55,6 +55,8 @@ class Report(msgspec.Struct, frozen=True):
     message: str
     traceback: str
     missing: str | None = None
+    used: int | None = None
+    """Of an action that is too large: its bytes."""
 
 
 _report_decoder = msgspec.json.Decoder(Report)

@@ -183,7 +183,7 @@ class PolicyProcess:
         if tag <= frames.GENERIC:
             if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
-                raise self._broken(how)
+                raise self._broken(how, self._action_bytes, len(payload))
             try:
                 return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
             except frames.BadReplyError as error:
@@ -261,7 +261,9 @@ class PolicyProcess:
         if len(data) != 8 + length:
             if length > frames.MAX_REPLY_BYTES:
                 raise self._broken(
-                    f"it announced an answer of {length} bytes; {frames.MAX_REPLY_BYTES} are the limit"
+                    f"it announced an answer of {length:,} bytes; {frames.MAX_REPLY_BYTES:,} are the limit",
+                    frames.MAX_REPLY_BYTES,
+                    length,
                 )
             data = self._read_more(data, 8 + length)
             if len(data) > 8 + length:
@@ -340,6 +342,8 @@ class PolicyProcess:
             if stage in ("reset", "act"):
                 category = of_kind
             message = f"{message} [{text}]"
+        elif report.kind == "action":
+            limit, used = self._action_bytes, report.used
         if stage == "import" and report.missing:
             top = report.missing.partition(".")[0]
             if top in _DENIED:
@@ -347,10 +351,11 @@ class PolicyProcess:
                 message = f"{message}: policies may not import {top}; they see observations only"
         return self._failed(category, message, report.traceback, limit, used)
 
-    def _broken(self, how: str) -> PolicyFailedError:
+    def _broken(self, how: str, limit: float | None = None, used: float | None = None) -> PolicyFailedError:
         """It did what no honest policy process does on its pipes."""
         self._bury()
-        return self._failed(self._fatal("killed"), f"the policy's process was ended: {how}")
+        text = f"the policy's process was ended: {how}"
+        return self._failed(self._fatal("killed"), text, limit=limit, used=used)
 
     def _died(self) -> PolicyFailedError:
         """Its pipe closed: a limit, or an end of its own."""

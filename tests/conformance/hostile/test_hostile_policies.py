@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from corpus import BREAKERS, NO_SANDBOX, POLICIES, PROBE, PROBES, Breaker, Probe, document
+from breakers import BREAKERS, Breaker
+from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
 from slots import HONEST, Slots, make_job, rows
+from undefended import harmed
 
 import evopolicy_worker
 from evopolicy_common.errors import WorkerError
@@ -27,6 +29,8 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]
     folder = tmp_path_factory.mktemp("target")
     secret = folder / "seeds.json"
     secret.write_text("the hidden seeds")
+    own = folder / "own"
+    own.write_text("a file of the worker's user")
     site = Path(pytest.__file__).parents[1]
     listeners = []
     tcp = socket.create_server(("127.0.0.1", 0))
@@ -40,6 +44,7 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]
         threading.Thread(target=serve, args=(listener,), daemon=True).start()
     yield {
         "secret_file": str(secret),
+        "own_file": str(own),
         "worker_code": evopolicy_worker.__file__,
         "simulators": str(site / "gymnasium"),
         "tcp": tcp.getsockname()[1],
@@ -142,6 +147,17 @@ def test_without_the_seal_the_same_code_succeeds(slots: Slots, attack: Breaker) 
     assert failure is None, failure
 
 
+@pytest.mark.parametrize(
+    "attack", [attack for attack in BREAKERS if attack.in_process], ids=lambda attack: attack.name
+)
+def test_in_the_environments_own_process_the_same_code_does_harm(attack: Breaker) -> None:
+    assert harmed(attack.source) is not None
+
+
+def test_an_honest_policy_plays_in_the_environments_own_process_too() -> None:
+    assert harmed(BREAKERS[0].source.replace("time.sleep(0.8)", "pass"), patience_s=60.0) is None
+
+
 def test_nothing_of_an_episode_is_left_for_the_next(slots: Slots) -> None:
     probe(slots, "leave_traces", {})
     assert doors(probe(slots, "find_traces", {}))["THROUGH"] == []
@@ -181,7 +197,7 @@ def test_no_pickle_is_ever_opened(slots: Slots, tmp_path: Path) -> None:
         assert not Path("/tmp/evopolicy-pickled").exists()
 
 
-@pytest.mark.parametrize("way", ["files", "shm", "abstract", "lock", "record"])
+@pytest.mark.parametrize("way", ["files", "shm", "abstract", "lock", "record", "futex", "device"])
 def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
     heard = {}
     for tier in ("bwrap", "none"):

@@ -71,8 +71,10 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
         "limits": sealed,
         "seals": tier != "none" and sealed,
         "landlock": None,
-        "filter": seccomp.policy_filter().hex() if tier != "none" else "",
+        "filter": "",
     }
+    if tier != "none":
+        config["filter"] = seccomp.policy_filter(sees_the_machines_files=tier == "landlock").hex()
     has_landlock = landlock_version() > 0
     if tier == "bwrap":
         if has_landlock:

@@ -14,6 +14,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import errno
+import os
 import platform
 import struct
 
@@ -58,6 +59,7 @@ _MADVISE = (
 _FUTEX_PRIVATE = 128
 _FUTEX_WAIT, _FUTEX_WAIT_BITSET = 0, 9
 _PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
+_MODES_AND_TIMES = ("chmod", "fchmod", "fchmodat", "utime", "utimes", "utimensat", "futimesat")
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
 _YOUNGEST = 450
@@ -81,9 +83,11 @@ def supported() -> bool:
     return platform.machine() in NUMBERS
 
 
-def policy_filter() -> bytes:
+def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
     """The program: 8 bytes an instruction, to be given to seccomp(2) with `PID_MARK` replaced.
 
+    `sees_the_machines_files`: where only Landlock stands before them, which lets an owner change modes and times, and on
+    older kernels cut a file off. Those calls are then refused, modes and times without a word, as `shutil.copy` sets them.
     Raises SandboxError on a processor that the lists do not cover.
     """
     machine = platform.machine()
@@ -139,6 +143,11 @@ def policy_filter() -> bytes:
         # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
         "clone3": [_refuse(errno.ENOSYS)],
     }
+    if sees_the_machines_files:
+        blocks |= {name: [_refuse(0)] for name in _MODES_AND_TIMES}
+        blocks |= {"truncate": [_refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
+        # Its flags lie in memory.
+        blocks["openat2"] = [_refuse(errno.ENOSYS)]
     program += _search(_intervals(numbers, blocks))
     return b"".join(struct.pack("<HBBI", *instruction) for instruction in program)
 
@@ -170,6 +179,17 @@ def _argument(index: int) -> int:
 
 def _refuse(number: int) -> Instruction:
     return (_RETURN, 0, 0, _ERRNO | number)
+
+
+def _no_cutting(argument: int) -> list[Instruction]:
+    """Allows opening a file unless it is opened for reading and cut off all the same."""
+    return [
+        (_LOAD, 0, 0, _argument(argument)),
+        (_AND, 0, 0, os.O_TRUNC | os.O_ACCMODE),
+        (_JUMP_EQUAL, 0, 1, os.O_TRUNC),
+        _refuse(errno.EPERM),
+        _ALLOWED,
+    ]
 
 
 def _one_of(argument: int, allowed: tuple[int, ...], otherwise: int) -> list[Instruction]:

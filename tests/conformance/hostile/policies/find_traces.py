@@ -1,5 +1,5 @@
 """Looks for what `leave_traces.py` left in the episode before."""
-import ctypes, os
+import ctypes, fcntl, os, time
 import numpy
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"
@@ -23,4 +23,6 @@ def attempts():
     yield "in shared memory", take("/dev/shm/evopolicy-left")
     yield "in System V memory", shm
     yield "beside its files", take("../evopolicy-left")
+    yield "in the flags of its input", lambda: fcntl.fcntl(0, fcntl.F_GETFL) & (os.O_NONBLOCK | os.O_APPEND)
+    yield "in a device's times", lambda: abs(time.time() - os.stat("/dev/full").st_mtime) < 2
     yield "in the process", lambda: "LEFT" in os.environ or hasattr(numpy, "LEFT")

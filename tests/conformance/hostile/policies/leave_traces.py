@@ -1,5 +1,5 @@
 """Leaves something for the next episode wherever it can."""
-import ctypes, os
+import ctypes, fcntl, os
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"
 
@@ -16,6 +16,8 @@ def attempts():
     yield "in its files", leave("evopolicy-left")
     yield "in a key", lambda: libc.syscall(248 if X86 else 217, b"user", b"evopolicy-left", b"x", 1, -3) and None
     yield "in System V memory", lambda: libc.syscall(29 if X86 else 194, 0xE0E0E0, 4096, 0o1600) and None
+    yield "in the flags of its input", lambda: fcntl.fcntl(0, fcntl.F_SETFL, os.O_NONBLOCK | os.O_APPEND) and None
+    yield "in a device's times", lambda: os.utime("/dev/full")
     os.environ["LEFT"] = "left"
     import numpy
     numpy.LEFT = "left"

@@ -1,7 +1,9 @@
 """Two policies in parallel slots try to find each other: one leaves a sign, the other looks for it."""
-import ctypes, fcntl, json, os, socket, time
+import ctypes, fcntl, json, os, socket, struct, time
 TARGET = json.load(open("target.json"))
 LIBRARY = os.path.join(os.path.dirname(os.__file__), "this.py")
+LIBRARY_FD = os.open(LIBRARY, os.O_RDONLY)
+libc = ctypes.CDLL(None, use_errno=True)
 
 def file(path):
     def run():
@@ -55,7 +57,34 @@ def record_lock():
     ask = struct.pack("hhqqi4x", fcntl.F_WRLCK, 0, 0, 0, 0)
     return seen(lambda: struct.unpack("hhqqi4x", fcntl.fcntl(fd, fcntl.F_GETLK, ask))[0] != fcntl.F_UNLCK)
 
+def page():
+    libc.mmap.restype = ctypes.c_void_p
+    word = struct.unpack("<I", os.pread(LIBRARY_FD, 4, 0))[0]
+    return ctypes.c_void_p(libc.mmap(None, ctypes.c_size_t(4096), 1, 1, LIBRARY_FD, ctypes.c_long(0))), word
+
+def futex():
+    # The page is the same one for all who map this file, and so is the queue of those that wait on it.
+    address, word = page()
+    number = 202 if os.uname().machine == "x86_64" else 98
+    if TARGET["role"] == "tell":
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            libc.syscall(number, address, 1, 1, None, None, 0)
+            time.sleep(0.01)
+        return None
+    pause = struct.pack("<qq", 0, 800_000_000)
+    return libc.syscall(number, address, 0, ctypes.c_uint(word), pause, None, 0) == 0
+
+def device():
+    if TARGET["role"] == "tell":
+        time.sleep(0.3)
+        os.utime("/dev/zero")
+        return None
+    before = os.stat("/dev/zero").st_mtime
+    return seen(lambda: os.stat("/dev/zero").st_mtime != before)
+
 def attempts():
     yield {"files": ("in /tmp", file("/tmp/evopolicy-talk")), "shm": ("in shared memory", file("/dev/shm/evopolicy-talk")),
            "abstract": ("abstract socket", abstract), "lock": ("a lock on a shared file", lock),
+           "futex": ("who waits on a page of a shared file", futex), "device": ("a device's times", device),
            "record": ("a record lock on a shared file", record_lock)}[TARGET["way"]]

@@ -203,6 +203,22 @@ def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: p
         assert allowed(program, number) & 0xFFFF == 1
 
 
+def test_where_the_machines_files_are_seen_none_is_changed_or_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
+    own, seen = seccomp.policy_filter(), seccomp.policy_filter(sees_the_machines_files=True)
+    truncate, chmod, utimensat, open_, openat, openat2 = 76, 90, 280, 2, 257, 437
+    for number in (truncate, chmod, utimensat, openat2):
+        assert allowed(own, number) == seccomp._ALLOW
+    assert allowed(seen, truncate) & 0xFFFF == 1
+    assert allowed(seen, chmod) == allowed(seen, utimensat) == seccomp._ERRNO
+    assert allowed(seen, openat2) & 0xFFFF == 38
+    reading, writing, cutting = 0, 1, 0o1000
+    for arguments in ((open_, 0), (openat, 0, 0)):
+        assert allowed(seen, *arguments, reading) == seccomp._ALLOW
+        assert allowed(seen, *arguments, writing | cutting) == seccomp._ALLOW  # where it may write at all
+        assert allowed(seen, *arguments, reading | cutting) & 0xFFFF == 1
+
+
 def test_on_an_unknown_processor_there_is_no_filter_and_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: "riscv64")
     assert not seccomp.supported()

@@ -198,6 +198,17 @@ def read_text(body: Any, at: Any) -> str:
 # Actions.
 
 
+class TooLargeError(ValueError):
+    """An action of more bytes than it may have: how many, as far as they were counted."""
+
+    # As the agent is to read it: without the name of a module that is none of its own.
+    __module__ = "builtins"
+
+    def __init__(self, message: str, used: int) -> None:
+        super().__init__(message)
+        self.used = used
+
+
 def encoded(action: Any) -> bytes:
     """The reply frame for what `act` returned."""
     kind = type(action)
@@ -205,7 +216,9 @@ def encoded(action: Any) -> bytes:
         return struct.pack("<IBxxxq", 8, INT, action)
     if kind is np.ndarray and action.dtype.kind in "biuf" and action.itemsize <= 8:
         if action.nbytes > action_bytes:
-            raise ValueError(f"the action has {action.nbytes:,} bytes; {action_bytes:,} are the limit")
+            raise TooLargeError(
+                f"the action has {action.nbytes:,} bytes; {action_bytes:,} are the limit", action.nbytes
+            )
         data = array_data(action)
         return REPLY_HEADER.pack(len(data), ARRAY) + data
     if isinstance(action, np.integer) and kind is not np.uint64:
@@ -219,9 +232,10 @@ def encoded(action: Any) -> bytes:
     out = bytearray()
     n = pack(action, out, 0)
     if len(out) > action_bytes:
-        raise ValueError(f"the action has {len(out):,} bytes; {action_bytes:,} are the limit")
+        raise TooLargeError(f"the action has {len(out):,} bytes; {action_bytes:,} are the limit", len(out))
     if n > action_bytes // VALUE_BYTES:
-        raise ValueError(f"the action holds {n:,} values; {action_bytes // VALUE_BYTES:,} are the limit")
+        how = f"the action holds {n:,} values; {action_bytes // VALUE_BYTES:,} are the limit"
+        raise TooLargeError(how, n * VALUE_BYTES)
     return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
 
 
@@ -246,7 +260,7 @@ def pack(value: Any, out: bytearray, depth: int) -> int:
     if depth > MAX_ACTION_DEPTH:
         raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
     if len(out) > action_bytes:
-        raise ValueError(f"the action has more than {action_bytes:,} bytes, which are the limit")
+        raise TooLargeError(f"the action has more than {action_bytes:,} bytes, which are the limit", len(out))
     if isinstance(value, np.generic):
         value = np.asarray(value) if value.dtype.kind == "f" else value.item()
     if value is None:
@@ -320,6 +334,7 @@ def reply_failure(stage: str, error: BaseException) -> None:
         "message": sendable(message[:2000]),
         "traceback": sendable(text[-MAX_TEXT:]),
         "missing": sendable(missing) if type(missing) is str else None,
+        "used": error.used if type(error) is TooLargeError else None,
     }
     reply(FAILED, json.dumps(report).encode())
 
@@ -333,6 +348,8 @@ def kind_of(error: BaseException | None) -> str | None:
     """Which limit an exception tells of, if any."""
     seen = 0
     while error is not None and seen < 10:
+        if type(error) is TooLargeError:
+            return "action"
         if isinstance(error, MemoryError):
             return "memory"
         if isinstance(error, OSError):

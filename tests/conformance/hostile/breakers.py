@@ -1,0 +1,363 @@
+"""The corpus's breakers: policies that misbehave at step 3 of an episode or before its first, and their verdicts.
+
+Three ways in which one is seen to succeed undefended: under a higher limit, in a process that is not sealed, or in the
+environment's own process (`undefended.py`).
+"""
+
+from __future__ import annotations
+
+import platform
+from typing import Any
+
+import msgspec
+from slots import QUICK
+
+from evopolicy_common.messages.episode import ResourceLimits
+
+BREAKER = """
+import ctypes, json, os, signal, struct, sys, threading, time
+import numpy as np
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+        {init}
+
+    def reset(self, episode_index):
+        {reset}
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == 4:
+            {act}
+        return [0.0]
+"""
+
+
+class Breaker(msgspec.Struct, frozen=True, kw_only=True):
+    """Code that misbehaves, and its verdict."""
+
+    name: str
+    act: str = "pass"
+    reset: str = "pass"
+    init: str = "pass"
+    verdict: str | None
+    """The failure's category; None when the episode goes on unharmed."""
+    limits: ResourceLimits = QUICK
+    off: ResourceLimits | None = None
+    """Limits under which the same code succeeds; None when the defence is not a limit."""
+    unsealed: bool = False
+    """Whether it succeeds when the policy's process is not sealed (its numbers are bounded, so the machine is safe)."""
+    harmless_anywhere: bool = False
+    """Whether there is nothing to defend against, as the corpus is to show."""
+
+    @property
+    def in_process(self) -> bool:
+        """Whether it is seen to succeed in the environment's own process."""
+        return self.off is None and not self.unsealed and not self.harmless_anywhere
+
+    @property
+    def source(self) -> str:
+        return BREAKER.format(init=self.init, reset=self.reset, act=self.act)
+
+
+def limits(**changes: Any) -> ResourceLimits:
+    return msgspec.structs.replace(QUICK, **changes)
+
+
+BREAKERS = (
+    Breaker(
+        name="endless act",
+        act="time.sleep(0.8)",
+        verdict="act_timeout",
+        limits=limits(act_wall_s=0.3),
+        off=QUICK,
+    ),
+    Breaker(
+        name="endless computing",
+        act="t = time.process_time()\n            while time.process_time() < t + 0.7: pass",
+        verdict="cpu_limit",
+        limits=limits(cpu_s=0.4, act_wall_s=20.0),
+        off=limits(act_wall_s=20.0),
+    ),
+    Breaker(
+        name="endless reset",
+        reset="time.sleep(0.8)",
+        verdict="act_timeout",
+        limits=limits(act_wall_s=0.3),
+        off=QUICK,
+    ),
+    Breaker(
+        name="slow episode",
+        act="time.sleep(0.8)",
+        verdict="episode_timeout",
+        limits=limits(episode_wall_s=0.4),
+        off=QUICK,
+    ),
+    Breaker(
+        name="sleeping __init__",
+        init="time.sleep(0.8)",
+        verdict="init_error",
+        limits=limits(init_wall_s=0.5),
+        off=QUICK,
+    ),
+    Breaker(
+        name="blocked signals",
+        act="signal.pthread_sigmask(signal.SIG_BLOCK, range(1, 65)); time.sleep(0.8)",
+        verdict="act_timeout",
+        limits=limits(act_wall_s=0.3),
+        off=QUICK,
+    ),
+    Breaker(
+        name="memory bomb",
+        act="self.a = [np.empty(1 << 20) for _ in range(50)]",
+        verdict="oom",
+        unsealed=True,
+        off=limits(memory_bytes=1 << 30),
+    ),
+    Breaker(
+        name="memory bomb in C",
+        act="libc = ctypes.CDLL(None); libc.malloc.restype = ctypes.c_void_p\n"
+        "            p = [libc.malloc(ctypes.c_size_t(64 << 20)) for _ in range(6)]\n"
+        "            if not all(p): raise MemoryError",
+        verdict="oom",
+        unsealed=True,
+    ),
+    Breaker(
+        name="disk filling",
+        act="open('/tmp/f', 'wb').write(bytes(6 << 20))",
+        verdict="file_limit",
+        off=limits(file_bytes=16 << 20),
+    ),
+    Breaker(
+        name="disk filling by many files",
+        act="[open(f'f{k}', 'wb').write(bytes(1 << 20)) for k in range(6)]",
+        verdict="file_limit",
+        off=limits(file_bytes=16 << 20),
+    ),
+    Breaker(
+        name="thousands of files",
+        act="[open(f'f{k}', 'w').close() for k in range(9000)]",
+        verdict="file_limit",
+        off=limits(files=20_000),
+    ),
+    Breaker(
+        name="folders nested deeper than Python recurses, which nobody may open",
+        act="[(os.mkdir('d'), os.chdir('d')) for _ in range(3000)]; os.chmod('/tmp', 0)",
+        verdict=None,
+        harmless_anywhere=True,
+    ),
+    Breaker(
+        name="descriptor exhaustion",
+        act="self.f = [os.open('/dev/null', 0) for _ in range(400)]",
+        verdict="file_limit",
+        unsealed=True,
+        off=limits(open_files=600),
+    ),
+    Breaker(
+        name="thread bomb",
+        act="[threading.Thread(target=time.sleep, args=(2,)).start() for _ in range(12)]",
+        verdict="process_limit",
+        off=limits(processes=32),
+    ),
+    Breaker(
+        name="fork bomb",
+        act="self.f = [os.fork() or os._exit(0) for _ in range(3)]",
+        verdict="process_limit",
+        unsealed=True,
+    ),
+    Breaker(name="closes its answers", act="os.close(4); time.sleep(60)", verdict="killed"),
+    Breaker(name="closes its questions", act="os.close(3)", verdict="killed"),
+    Breaker(name="closes everything", act="os.closerange(0, 256)", verdict="killed"),
+    Breaker(name="garbage for an answer", act="os.write(4, os.urandom(300))", verdict="killed"),
+    Breaker(
+        name="an answer without end",
+        act="os.write(4, struct.pack('<IBxxx', 1 << 31, 3)); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="half an answer",
+        act="os.write(4, b'abc'); time.sleep(60)",
+        verdict="act_timeout",
+        limits=limits(act_wall_s=0.3),
+    ),
+    Breaker(
+        name="two answers to one question",
+        act="os.write(4, struct.pack('<IBxxxqIBxxxq', 8, 1, 0, 8, 1, 0))",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a wrong kind of answer",
+        act="os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="an array of objects for an answer",
+        act="os.write(4, struct.pack('<IBxxx4sIIQ', 20, 3, b'|O\\0\\0', 1, 1, id(self))); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a forged failure",
+        act="os.write(4, struct.pack('<IBxxx', 2, 6) + b'{}'); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a forged fault of the sandbox",
+        act="os.write(4, struct.pack('<IBxxx', 4, 7) + b'ours'); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a flood of answers", act="[os.write(4, bytes(65536)) for _ in iter(int, 1)]", verdict="killed"
+    ),
+    Breaker(
+        name="a huge action",
+        act="return np.zeros(1 << 16)",
+        verdict="act_error",
+        off=limits(action_bytes=1 << 20),
+    ),
+    Breaker(
+        name="a forged huge action",
+        act="os.write(4, struct.pack('<IBxxx', 1 << 16, 5) + bytes(1 << 16)); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a forged action of thousands of empty lists",
+        act="os.write(4, struct.pack('<IBxxx', 8003, 5) + b'\\xdc\\x1f\\x40' + b'\\x90' * 8000); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a dict without end",
+        act="D = type('D', (dict,), {'items': lambda s: iter(lambda: ('a', 1), None)}); return D()",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="a list that lies about its length",
+        act="L = type('L', (list,), {'__len__': lambda s: 1 << 40}); return L([1.0])",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="an array of objects for an action",
+        act="return np.array([self, None], dtype=object)",
+        verdict=None,
+    ),
+    Breaker(name="a generator for an action", act="return (x for x in [1.0])", verdict=None),
+    Breaker(name="infinity for an action", act="return [float('inf')]", verdict=None),
+    Breaker(name="NaN for an action", act="return [float('nan')]", verdict=None),
+    Breaker(
+        name="a nested action", act="a = []; [a := [a] for _ in range(100000)]; return a", verdict="act_error"
+    ),
+    Breaker(name="an action that holds itself", act="a = []; a.append(a); return a", verdict="act_error"),
+    Breaker(
+        name="a pickle",
+        act="return type('P', (), {'__reduce__': lambda s: (os.system, ('touch /tmp/evopolicy-pickled',))})()",
+        verdict=None,
+    ),
+    Breaker(
+        name="an action that lies about itself",
+        act="return type('L', (), {'__array__': lambda s, *a, **k: 1 / 0})()",
+        verdict="act_error",
+    ),
+    Breaker(name="os._exit", act="os._exit(0)", verdict="killed"),
+    Breaker(name="a segmentation fault", act="ctypes.string_at(1)", verdict="killed"),
+    Breaker(name="an abort", act="os.abort()", verdict="killed"),
+    Breaker(
+        name="a signal of an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None
+    ),
+    Breaker(
+        name="stopping itself",
+        act="os.kill(os.getpid(), signal.SIGSTOP); time.sleep(60)",
+        verdict="act_timeout",
+        limits=limits(act_wall_s=0.3),
+    ),
+    Breaker(name="endless recursion", act="f = lambda: f(); f()", verdict="act_error"),
+    Breaker(
+        name="an error that cannot be printed",
+        act="raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="an error that raises when it is looked at",
+        act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="an error with half a character in its text",
+        act="raise ValueError(chr(0xD800))",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="a flood of output",
+        act="[os.write(k, b'x' * 65536) for k in (1, 2) for _ in range(200)]",
+        verdict=None,
+    ),
+    Breaker(
+        name="another shim",
+        act="import gc\n"
+        "            for m in list(sys.modules.values()):\n"
+        "                for n in ('encoded', 'reply', 'answer', 'check', 'seal'):\n"
+        "                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m, n, None)\n"
+        "            m = sys.modules['__main__']; m.player.encoded = lambda action: struct.pack('<IBxxxd', 8, 2, 9.0)",
+        verdict=None,
+    ),
+    Breaker(
+        name="no modules any more",
+        act="sys.modules.clear(); sys.stdout = sys.stderr = None; return []",
+        verdict=None,
+    ),
+    Breaker(
+        name="no built-in functions any more",
+        act="import builtins\n            vars(builtins).clear()",
+        verdict="killed",
+    ),
+    Breaker(
+        name="another os module under the shim",
+        act="os.write = lambda *a: 0; os.readv = None",
+        verdict=None,
+        limits=limits(act_wall_s=0.3),
+    ),
+    Breaker(name="tracing every call", act="sys.setprofile(lambda *a: 1 / 0)", verdict="act_error"),
+    Breaker(
+        name="exchanged pipes",
+        act="k = os.dup(3); os.dup2(4, 3); os.dup2(k, 4); return 0.0",
+        verdict="killed",
+    ),
+    Breaker(
+        name="its output in place of its answers",
+        act="os.dup2(1, 4)",
+        verdict="killed",
+        limits=limits(act_wall_s=0.3),
+    ),
+    Breaker(
+        name="a pipe of its own in place of its answers",
+        act="self.r, w = os.pipe(); os.dup2(w, 4); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="signals in the middle of an answer",
+        act="signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
+        "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="an answer before the question",
+        init="os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(0.5)",
+        verdict="killed",
+    ),
+    *(
+        (
+            Breaker(
+                name="a system call by its x32 number",
+                act="ctypes.CDLL(None).syscall(0x40000027)",
+                verdict="killed",
+                unsealed=True,
+            ),
+        )
+        if platform.machine() == "x86_64"
+        else ()
+    ),
+    Breaker(
+        name="a thread that goes on answering",
+        act="threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for _ in range(9999)]).start(); time.sleep(0.1)",
+        verdict="killed",
+    ),
+)

@@ -1,0 +1,62 @@
+"""Bundles that are attacks: each gets its verdict before anything of it is played, and a plain copy falls for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bundle_attacks import BUNDLES, PATHS, SECRET, BundleAttack, packed, plain_copy_reads
+
+from evopolicy_common import bundles
+from evopolicy_common.blobs import BlobStore
+from evopolicy_common.errors import BundleError
+from evopolicy_gateway.snapshots import take
+
+
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """`system/` with a policy, and a file outside that holds the secret."""
+    system, secret = tmp_path / "system", tmp_path / "outside" / "secret"
+    system.mkdir()
+    secret.parent.mkdir()
+    secret.write_bytes(SECRET)
+    (system / "policy.py").write_text("class Policy: ...")
+    return system, secret
+
+
+@pytest.mark.parametrize("attack", BUNDLES, ids=lambda attack: attack.name)
+def test_a_hostile_folder_has_a_verdict_and_no_bundle(tmp_path: Path, attack: BundleAttack) -> None:
+    system, secret = folders(tmp_path)
+    attack.spoil(system, secret)
+    taken = take(system, BlobStore(tmp_path / "blobs"))
+    assert taken.digest is None
+    assert taken.error is not None
+    assert taken.error.category == attack.verdict
+    assert attack.words in taken.error.message
+    assert not any(SECRET in path.read_bytes() for path in (tmp_path / "blobs").rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize(
+    "attack", [attack for attack in BUNDLES if attack.copied], ids=lambda attack: attack.name
+)
+def test_a_plain_copy_holds_what_is_outside(tmp_path: Path, attack: BundleAttack) -> None:
+    system, secret = folders(tmp_path)
+    attack.spoil(system, secret)
+    assert plain_copy_reads(system, secret, tmp_path / "copy")
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_packed_bundle_writes_nothing_outside_its_folder(tmp_path: Path, path: str) -> None:
+    bundle = packed(path)
+    with pytest.raises(BundleError, match="plain relative path"):
+        bundles.load(bundle.packed, bundle.digest)
+    with pytest.raises(BundleError, match="plain relative path"):
+        bundles.unpack(bundle, tmp_path / "a" / "bundle")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plain_write_goes_outside(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (file,) = [file for file in packed("../evil").files if file.path != "policy.py"]
+    (folder / file.path).write_bytes(file.data)
+    assert (tmp_path / "evil").exists()
