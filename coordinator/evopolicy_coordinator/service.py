@@ -44,6 +44,7 @@ from evopolicy_coordinator.core.records import latest_time
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.core.workers import Worker
 from evopolicy_coordinator.intake import Intake, Parsed
+from evopolicy_coordinator.pending import PendingQueries
 from evopolicy_coordinator.store import Store
 from evopolicy_coordinator.turned_away import TurnedAwayWorkers
 from evopolicy_coordinator.watchdog import LoopWatchdog
@@ -59,15 +60,6 @@ _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _STALLS_TOLD = 5
 _READS_FILES = (operator.CreateRun, operator.Evaluate)
-
-
-class _Pending(msgspec.Struct, frozen=True):
-    """A query that waits for its answer."""
-
-    query: IncomingQuery
-    asker: str
-    since: float
-    """Loop time at which it came."""
 
 
 class Service:
@@ -92,8 +84,7 @@ class Service:
         self._turned_away = TurnedAwayWorkers()
         self._outbox: Outbox | None = None
         self._core: Core | None = None
-        self._pending: dict[int, _Pending] = {}
-        self._n_requests = 0
+        self._pending = PendingQueries()
         self._incarnation = 0
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
@@ -130,7 +121,7 @@ class Service:
         while self._outbox is not None and not self._outbox.idle:
             # Comes back after everything that was submitted before it, and what that set going is next.
             await self._writer.call(lambda store: None)
-        self._drop_pending()
+        self._pending.let_go()
         await self._writer.close()
         await asyncio.to_thread(self._answers.close)
         if self._watchdog is not None:
@@ -196,11 +187,11 @@ class Service:
         elif isinstance(message, _READS_FILES):
             self._spawn(self._serve_from_thread(query, parsed))
         else:
-            request = self._admit(query, parsed)
+            request = self._pending.admit(query, parsed.asker)
             try:
                 event = self._intake.event(parsed, request, self._stimulus_of(message))
             except BaseException:
-                self._take(request)
+                self._pending.take(request)
                 raise
             if isinstance(event, LeaseRequested):
                 event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
@@ -213,17 +204,17 @@ class Service:
 
     async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
         """For requests whose event is made from files."""
-        request = self._admit(query, parsed)
+        request = self._pending.admit(query, parsed.asker)
         stimulus = self._stimulus_of(parsed.message)
         try:
             event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
         except RefusedError as error:
-            self._take(request)
+            self._pending.take(request)
             self._refuse(query, error)
             return
         except Exception:
             log.exception("request failed", key=query.key)
-            self._take(request)
+            self._pending.take(request)
             query.drop()
             return
         if request in self._pending:  # else the core was dropped meanwhile, and the query with it
@@ -274,11 +265,6 @@ class Service:
             return
         query.reply(codec.encode(answer))
 
-    def _admit(self, query: IncomingQuery, parsed: Parsed) -> int:
-        self._n_requests += 1
-        self._pending[self._n_requests] = _Pending(query, parsed.asker, self._loop.time())
-        return self._n_requests
-
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
         most = MAX_BUNDLE_BYTES
         if parsed.room == "work":
@@ -304,13 +290,14 @@ class Service:
         self._answers.get(run, message, answer_to(query, parsed.asker))
 
     def _status(self, core: Core) -> operator.StatusReply:
-        part = core.status(self.now())
+        part = core.status(self.now())._asdict()
+        part["stalls"] = self._stalls(part["stalls"])
         return operator.StatusReply(
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
             uptime_s=self.now() - self._started_at,
             turned_away=self._turned_away.told(self.now()),
-            **part._asdict(),
+            **part,
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
@@ -413,7 +400,7 @@ class Service:
         self._core = None
         self._outbox = None
         self._cancel_timer()
-        self._drop_pending()
+        self._pending.let_go()
         if not self._stopping:
             self._spawn(self._reload())
 
@@ -434,13 +421,13 @@ class Service:
 
     def _carry_out(self, effect: Effect) -> None:
         if isinstance(effect, Reply):
-            pending = self._take(effect.request)
+            pending = self._pending.take(effect.request)
             if pending is not None:
                 query = pending.query
                 self._turned_away.answered(query.key, query.payload, effect.message, self.now())
                 query.reply(codec.encode(effect.message), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
-            pending = self._take(effect.request)
+            pending = self._pending.take(effect.request)
             if pending is not None:
                 self._answers.page(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
@@ -462,30 +449,27 @@ class Service:
 
         return tell
 
-    def _take(self, request: int | str) -> _Pending | None:
-        return self._pending.pop(request, None) if isinstance(request, int) else None
-
     def _sweep(self) -> None:
         """Lets go of queries that nobody waits for any more: those of lost workers are never answered."""
-        oldest = self._loop.time() - _FORGET_S
-        for request, pending in list(self._pending.items()):
-            if pending.since > oldest:
-                break
-            pending.query.drop()
-            del self._pending[request]
+        self._pending.let_go(_FORGET_S)
         self._tell_stalls()
         self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
 
     def _tell_stalls(self) -> None:
         """Names in the log what waits longer than it should, as `evopolicy status` does."""
-        stalls = () if self._core is None else self._core.status(self.now()).stalls
+        stalls = () if self._core is None else self._stalls(self._core.status(self.now()).stalls)
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_TOLD])
 
-    def _drop_pending(self) -> None:
-        for pending in self._pending.values():
-            pending.query.drop()
-        self._pending.clear()
+    def _stalls(self, of_core: tuple[str, ...]) -> tuple[str, ...]:
+        """What waits longer than it should, and for what: for the disk, and in the core."""
+        writing_s = 0.0 if self._outbox is None else self._outbox.writing_s
+        if writing_s <= self._settings.stall_s:
+            return of_core
+        return (
+            f"{len(self._pending)} requests wait for the disk: it has been writing for {writing_s:.0f} s",
+            *of_core,
+        )
 
 
 def _check_session(core: Core, name: str, session: str) -> Worker:

@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -111,6 +112,7 @@ class Outbox:
         self._n_durable = 0
         """Persists that are durable and still stand in `_effects`."""
         self._dead = False
+        self._writing_since = 0.0
         self.commits = 0
 
     def put(self, effects: list[Effect]) -> None:
@@ -130,6 +132,7 @@ class Outbox:
             return
         rows, self._rows = self._rows, []
         self._n_in_flight, self._n_waiting = self._n_waiting, 0
+        self._writing_since = time.monotonic()
         self._writer.submit(lambda store: store.write(rows), self._written, self._failed)
 
     def discard(self) -> None:
@@ -137,6 +140,11 @@ class Outbox:
         self._dead = True
         self._effects.clear()
         self._rows.clear()
+
+    @property
+    def writing_s(self) -> float:
+        """For how long the transaction in flight has been, seconds; 0.0 when there is none."""
+        return time.monotonic() - self._writing_since if self._n_in_flight else 0.0
 
     @property
     def idle(self) -> bool:

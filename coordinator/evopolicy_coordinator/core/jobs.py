@@ -109,6 +109,8 @@ class JobState:
     lease: Lease | None = None
     failures: int = 0
     """Infrastructure failures so far, in this incarnation."""
+    last_failure: str = ""
+    """What the last of them was and where, for an operator."""
     avoid: str | None = None
     """The worker that it last failed on: not given to it before `avoid_until`, while there is another."""
     avoid_until: float = 0.0

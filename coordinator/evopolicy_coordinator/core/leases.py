@@ -2,7 +2,8 @@
 
 Rules that this module owns:
 - A job has at most one lease that counts. Every lease has the job's next attempt number; attempts that were given up are
-  fenced off: they are never counted again, and their holders are told to stop.
+  fenced off: what goes wrong in them is nothing to the job any more, and their holders are told to stop. (An outcome is
+  taken from any attempt, as `handin` says: it is the same whoever plays it.)
 - A lease lives by heartbeats that name it. One that no heartbeat names for a time to live is given up; one that its
   worker never came to know of, too. While the loop's own lateness is in doubt nothing expires.
 - A lease that this incarnation has not heard of is adopted from its holder's heartbeat when its job waits.
@@ -227,6 +228,7 @@ class LeaseBook:
         job.since = turn.now
         if retry.counted:
             job.failures += 1
+            job.last_failure = f"{mishap} on {worker.name}" + (f": {error[:200]}" if error else "")
             core.counted_retry(job, turn)
             turn.log(
                 "warning",

@@ -184,7 +184,11 @@ def _stalls(core: Core, now: float) -> tuple[str, ...]:
         if waiting:
             oldest = min(waiting, key=lambda job: job.since)
             what = waits_for(core, group) or _behind(group.flow.lane)
-            again = f", after {oldest.failures} faults" if oldest.failures else ""
+            again = (
+                f", after {oldest.failures} faults, the last: {oldest.last_failure}"
+                if oldest.failures
+                else ""
+            )
             stalls.append(
                 f"{len(waiting)} jobs of {group.id} wait for {what}; {oldest.job_id} for {now - oldest.since:.0f} s{again}"
             )

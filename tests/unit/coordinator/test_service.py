@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import structlog
+from structlog.testing import capture_logs
 
 from evopolicy_common import codec, keys
 from evopolicy_common.blobs import BlobStore
@@ -18,6 +22,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.messages.worker import Message
+from evopolicy_coordinator import service
 from evopolicy_coordinator.answers import Answers
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
@@ -31,6 +36,7 @@ from evopolicy_coordinator.uploads import Uploads
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
 )
+SETTINGS = CoreSettings()
 FAILURE = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
 
 
@@ -68,7 +74,7 @@ class Asked:
 class World:
     """A service on a store in a folder, asked directly."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, settings: CoreSettings) -> None:
         self.root = root
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
@@ -76,7 +82,7 @@ class World:
         self.answers = Answers(root / "db", self.blobs, self.uploads)
         source = SplitSource(data=None, secret=b"s" * 32)
         intake = Intake(IDENTITY, self.blobs, source, self.uploads, allowed_imports=(), denied_imports=())
-        self.service = Service("c", self.store, self.answers, intake, CoreSettings())
+        self.service = Service("c", self.store, self.answers, intake, settings)
         self.writes = 0
         self.full = False
         write = self.store.write
@@ -138,9 +144,11 @@ def register(world: World) -> Asked:
     return asked
 
 
-def play(root: Path, scenario: Callable[[World], Awaitable[None]]) -> World:
+def play(
+    root: Path, scenario: Callable[[World], Awaitable[None]], settings: CoreSettings = SETTINGS
+) -> World:
     async def run() -> World:
-        world = World(root)
+        world = World(root, settings)
         await world.service.start()
         try:
             await asyncio.wait_for(scenario(world), 30)
@@ -263,6 +271,40 @@ def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -
         assert await late.message() is None
 
     play(tmp_path, scenario)
+
+
+def test_a_disk_that_does_not_come_to_an_end_is_named_in_status_and_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        goes_on = threading.Event()
+        write = world.store.write
+
+        def hanging(rows: Any) -> None:
+            assert goes_on.wait(60)
+            write(rows)
+
+        world.store.write = hanging  # type: ignore[method-assign]
+        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
+        create = operator.CreateRun(token="operate", key="k", settings=settings)
+        created = Asked(keys.operator_key("c", "create"), create)
+        world.ask(created)
+        stalls: tuple[str, ...] = ()
+        while not stalls:
+            status = Asked(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
+            world.ask(status)
+            stalls = (await status.message()).stalls
+            await asyncio.sleep(0.01)
+        assert re.fullmatch("1 requests wait for the disk: it has been writing for .* s", stalls[0])
+        with capture_logs() as logs:
+            monkeypatch.setattr(service, "log", structlog.get_logger())
+            world.service._tell_stalls()
+        assert [entry["first"] for entry in logs] == [stalls[:1]]
+        assert not created.answer.done()
+        goes_on.set()
+        assert isinstance(await created.message(), operator.RunCreated)
+
+    play(tmp_path, scenario, CoreSettings(stall_s=0.1))
 
 
 def test_long_poll_ends_by_itself(tmp_path: Path) -> None:

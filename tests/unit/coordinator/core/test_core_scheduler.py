@@ -313,6 +313,18 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     assert rig.core.story("r1/s0/train")
 
 
+def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> None:
+    rig = Rig(stall_s=0.1, retry_base_s=10.0)
+    session = rig.register()
+    rig.create()
+    rig.submit(0)
+    rig.hand_in(session, result(rig.poll(session)[0], "failed", error="no space left on device"))
+    rig.pass_time(1.0)
+    (stall,) = rig.core.status(rig.now).stalls
+    assert "wait for another try after a fault of ours" in stall
+    assert stall.endswith("after 1 faults, the last: failed on w1: no space left on device")
+
+
 def test_a_poll_that_lay_unread_until_its_worker_gave_it_up_gets_no_lease() -> None:
     rig = Rig()
     session = rig.register()
