@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
+import os
+import re
+import signal
+import struct
+import subprocess
 import sys
+import termios
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -70,18 +78,18 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
     # The second turn of either fake never ends, until the third start, which works.
     write_suite(tmp_path, codex="work,endless,work", claude="work,endless,work")
     root = tmp_path / "runs" / "t"
-    sessions = [root / "fake codex/toy_line/t-0/.gateway", root / "fake claude/toy_line/t-0/.gateway"]
+    played = [root / "fake codex/toy_line/t-0", root / "fake claude/toy_line/t-0"]
     with sweep(tmp_path, "--local") as first:
         wait_until((root / "suite.json").exists, lambda: first.text)
         wait_until(
             lambda: index_in(root).get("evolve/toy/line/0", {}).get("state") == "completed",
             lambda: first.text,
         )
-        wait_until(lambda: all(_turns(folder) == 1 for folder in sessions), lambda: first.text)
+        wait_until(lambda: all(_starts(folder) == 2 for folder in played), lambda: first.text)
         first.kill()
     evolved = root / "evolve/toy_line/t-0/run.json"
     written = evolved.stat().st_mtime_ns
-    kept = [json.loads((folder / "session.json").read_text())["session"] for folder in sessions]
+    kept = [json.loads((folder / ".gateway/session.json").read_text())["session"] for folder in played]
     with sweep(tmp_path, "--local") as second:
         wait_until(lambda: "runs:" in second.text, lambda: second.text)
         second.kill()
@@ -108,10 +116,11 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
         assert "3 runs: 3 kept" in after.text
 
 
-def _turns(folder: Path) -> int:
+def _starts(folder: Path) -> int:
+    """How often the fake CLI of a run has been started: its scenario goes on with each."""
     try:
-        return int(json.loads((folder / "session.json").read_text())["turns"])
-    except (OSError, ValueError):
+        return len((folder / "workspace/.fake/starts").read_text().splitlines())
+    except OSError:
         return 0
 
 
@@ -166,18 +175,42 @@ def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, oper
         assert len(index_in(host / "runs" / "t")) == 3
 
 
-def test_a_dead_hosts_runs_are_taken_over(tmp_path: Path, operator_file: Path) -> None:
+def test_a_dead_hosts_runs_are_taken_over_and_it_takes_their_results_when_it_is_back(
+    tmp_path: Path, operator_file: Path
+) -> None:
+    agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
+    flag.parent.mkdir()
+    agent.write_text(
+        "import json, os, sys, time, urllib.request\n"
+        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
+        "data = json.dumps({'env_instances': [0, 1]}).encode()\n"
+        "urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
+        "while not os.path.exists(sys.argv[1]):\n    time.sleep(0.05)\n"
+    )
     hosts = [tmp_path / "one", tmp_path / "two"]
-    write_suite(hosts[0], codex="endless")
-    write_suite(hosts[1], codex="endless")
-    arguments = ("--credentials", str(operator_file), "--only", "fake codex/*")
-    session = hosts[0] / "runs/t/fake codex/toy_line/t-0/workspace/.fake/starts"
+    for host in hosts:
+        host.mkdir()
+        (host / "t.toml").write_text(
+            'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 4\nvalidation = 1\nheldout = 1\n'
+            f'[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent} {flag}"\n'
+            f'[agents.jail]\nread = ["{flag.parent}"]\n'
+        )
+    arguments = ("--credentials", str(operator_file))
     with sweep(hosts[0], *arguments) as one:
-        wait_until(session.exists, lambda: one.text)
+        feedback = hosts[0] / "runs/t/own/toy_line/t-0/workspace/feedback/submit_000/summary.json"
+        wait_until(feedback.exists, lambda: one.text)
         one.kill()
+    flag.touch()
     with sweep(hosts[1], *arguments) as two:
-        wait_until(lambda: "taken over" in two.text, lambda: two.text)
-        wait_until(lambda: "begins" in two.text, lambda: two.text)
+        assert two.wait() == 0, two.text
+        assert "taken over from" in two.text
+    (entry,) = index_in(hosts[1] / "runs" / "t").values()
+    assert (entry["state"], entry["attempt"]) == ("completed", 2)
+    with sweep(hosts[0], *arguments) as back:
+        assert back.wait() == 0, back.text
+    (told,) = index_in(hosts[0] / "runs" / "t").values()
+    assert (told["state"], told["score"], told["directory"]) == ("completed", entry["score"], "")
+    assert [*hosts[0].glob("runs/t/*/*/*/run.json")] == []
 
 
 def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
@@ -212,3 +245,95 @@ def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file
     assert kinds[-1] == "finished"
     assert lines[-1]["state"] == "completed"
     assert "submit" in kinds
+
+
+def test_a_cap_of_the_sweep_interrupts_and_a_higher_one_goes_on_in_the_session(
+    tmp_path: Path, operator_file: Path
+) -> None:
+    write_suite(tmp_path, codex="work,endless,work")
+    file = tmp_path / "t.toml"
+    whole = file.read_text()
+    file.write_text(whole.replace("[[agents]]", "[caps]\nmax_tokens = 1000\n[[agents]]", 1))
+    arguments = ("--credentials", str(operator_file), "--only", "fake codex/*")
+    root = tmp_path / "runs" / "t"
+    with sweep(tmp_path, *arguments) as first:
+        assert first.wait() == 1, first.text
+        assert first.alive() == []
+        assert "1020 of 1000 tokens are used" in first.text
+        assert "1 runs are left as they are" in first.text
+    (entry,) = index_in(root).values()
+    assert (entry["state"], entry["tokens"]["output"]) == ("running", 20)
+    # Whether the second start, which never ends, has come before the cap or not: the next one works.
+    (root / "fake codex/toy_line/t-0/workspace/.fake/starts").write_text("[]\n[]\n")
+    file.write_text(whole)
+    with sweep(tmp_path, *arguments) as second:
+        assert second.wait() == 0, second.text
+        assert "goes on in its session" in second.text
+        assert "used in all: 2,040 tokens" in second.text
+    (entry,) = index_in(root).values()
+    assert (entry["state"], entry["attempt"], entry["tokens"]["output"]) == ("completed", 1, 40)
+
+
+def test_ctrl_c_leaves_runs_open_and_the_exit_code_tells(tmp_path: Path, operator_file: Path) -> None:
+    write_suite(tmp_path, codex="work,endless,work")
+    arguments = ("--credentials", str(operator_file), "--only", "fake codex/*")
+    played = tmp_path / "runs/t/fake codex/toy_line/t-0"
+    with sweep(tmp_path, *arguments) as first:
+        wait_until(lambda: _starts(played) == 2, lambda: first.text)
+        first.process.send_signal(signal.SIGINT)
+        assert first.wait() == 130, first.text
+        assert first.alive() == []
+    with sweep(tmp_path, *arguments) as second:
+        assert second.wait() == 0, second.text
+        assert "goes on in its session" in second.text
+
+
+def test_a_changed_file_is_refused_with_what_has_changed_and_a_run_without_ok_submit_is_told(
+    tmp_path: Path, operator_file: Path
+) -> None:
+    broken = tmp_path / "bundles" / "0"
+    broken.mkdir(parents=True)
+    (broken / "policy.py").write_text("raise ValueError('no policy')\n")
+    text = (
+        'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 2\nvalidation = 1\nheldout = 1\n'
+        '[[agents]]\nname = "broken"\nagent = "replay:bundles"\n'
+    )
+    file = tmp_path / "t.toml"
+    file.write_text(text)
+    arguments = ("--credentials", str(operator_file))
+    with sweep(tmp_path, *arguments) as first:
+        assert first.wait() == 3, first.text
+    file.write_text(text.replace("budget = 2", "budget = 3"))
+    with sweep(tmp_path, *arguments) as second:
+        assert second.wait() == 2, second.text
+        assert "budget is 3, was 2" in " ".join(second.text.split())
+    with sweep(tmp_path, *arguments, "--changed", "keep") as third:
+        assert third.wait() == 3, third.text
+        assert "1 runs: 1 kept" in third.text
+
+
+def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> None:
+    write_suite(tmp_path)
+    main, side = os.openpty()
+    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 160, 0, 0))
+    arguments = ["suite", "t.toml", "--credentials", str(operator_file), "--only", "fake codex/*"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "evopolicy_gateway.cli", *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "TERM": "xterm-256color", "XDG_STATE_HOME": str(tmp_path / "xdg")},
+        stdin=side,
+        stdout=side,
+        stderr=side,
+    )
+    os.close(side)
+    shown = b""
+    with contextlib.suppress(OSError):  # a terminal whose other side is gone
+        while some := os.read(main, 1 << 16):
+            shown += some
+    os.close(main)
+    assert process.wait() == 0, shown.decode()
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode())
+    assert re.search(r"run +budget +submits +best mean +tokens +state +last action", text)
+    assert re.search(r"fake codex/toy/line/0 +[0-4]/4 +\d", text)
+    assert "0 of 1 runs done, 1 running" in text
+    assert "completed, score" in text
