@@ -97,6 +97,7 @@ class BlobStore:
         return self._root / digest[:2] / digest
 
     def has(self, digest: str) -> bool:
+        """Whether the blob is stored, whole."""
         return self.path(digest).is_file()
 
     def size(self, digest: str) -> int:

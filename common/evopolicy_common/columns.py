@@ -23,6 +23,7 @@ _EXT_ARRAY, _EXT_INT = 1, 2
 
 
 def pack(values: list[Any]) -> list[Any]:
+    """Rows of one leaf as a list for msgpack: the kind of column, then its values together."""
     n = len(values)
     first = values[0]
     kind = type(first)
@@ -134,6 +135,8 @@ class Values(Column):
 
 
 class Dicts(Column):
+    """Rows that are dicts of the same keys, a column a key."""
+
     def __init__(self, parts: dict[str, Column], n: int) -> None:
         self.parts = parts
         self._n = n
@@ -150,6 +153,8 @@ class Dicts(Column):
 
 
 class Tuples(Column):
+    """Rows that are tuples of one length, a column a place."""
+
     def __init__(self, parts: list[Column], n: int) -> None:
         self.parts = parts
         self._n = n
@@ -183,6 +188,7 @@ def _require_equal(n: int, parts: list[Column]) -> None:
 
 
 def unpack(packed: list[Any]) -> Column:
+    """The column of what `pack` or `Pictures.packed` gave; ValueError when it is none."""
     kind = packed[0]
     if kind == "array":
         _, n, dtype, shape, data = packed
@@ -264,6 +270,7 @@ decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
 def encode(block: dict[str, Any]) -> bytes:
+    """The bytes of a block."""
     try:
         return encoder.encode(block)
     except (OverflowError, UnicodeEncodeError, TypeError):

@@ -34,16 +34,20 @@ def operator_key(cluster: str, verb: str) -> str:
 
 
 def worker_expr(cluster: str) -> str:
+    """All that workers ask."""
     return f"{_ROOT}/{cluster}/work/**"
 
 
 def gateway_expr(cluster: str) -> str:
+    """All that gateways of all runs ask."""
     return f"{_ROOT}/{cluster}/gw/**"
 
 
 def operator_expr(cluster: str) -> str:
+    """All that operators ask."""
     return f"{_ROOT}/{cluster}/ops/**"
 
 
 def liveliness_expr(cluster: str) -> str:
+    """All workers' liveliness tokens."""
     return f"{_ROOT}/{cluster}/worker/*/live"

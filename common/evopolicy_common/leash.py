@@ -29,6 +29,7 @@ def end_with_parent(death_signal: signal.Signals) -> None:
 
 
 def main(arguments: list[str]) -> None:
+    """Becomes the program; exit code 1 when the parent is gone already, 127 when there is no such program."""
     parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
     end_with_parent(death_signal)
     if os.getppid() != parent:

@@ -101,9 +101,11 @@ class Server:
         self._held.append(self._session.liveliness().declare_subscriber(expression, changed, history=True))
 
     def send(self, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
+        """Answers a query from the thread of its lane; the event loop never sends."""
         self._lanes[lane % _REPLY_LANES].put((query, key, payload))
 
     def close(self) -> None:
+        """Takes no more queries. What waits in a lane may go unanswered; the asker asks again."""
         for lane in self._lanes:
             lane.put(None)
         self._held.clear()
@@ -200,6 +202,7 @@ class Link:
         self._held.append(self._session.liveliness().declare_token(key))
 
     def close(self) -> None:
+        """Gives the session back. Questions that wait get no answer."""
         self._held.clear()
         self._sender.shutdown(wait=False, cancel_futures=True)
         _close(self._session)

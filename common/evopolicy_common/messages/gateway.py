@@ -49,6 +49,8 @@ class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
+    """What changes of a run, as its gateway may know it."""
+
     remaining_budget: int
     n_submits: int
     """Accepted submits so far."""
@@ -77,11 +79,15 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
 
 
 class StateRequest(Message, frozen=True, kw_only=True, tag="state"):
+    """How the run stands; answered at once."""
+
     run: str
     token: str
 
 
 class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
+    """The answer to `StateRequest`."""
+
     state: RunState
 
 

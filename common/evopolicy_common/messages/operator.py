@@ -53,6 +53,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
+    """Open a run. Safe to send again with the same key."""
+
     token: str
     key: str
     """Idempotency key: creating twice with one key gives the same run."""
@@ -60,6 +62,8 @@ class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
 
 
 class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
+    """The run is durable, and its gateway may open it."""
+
     run: str
     capability: str
     """Token of this run's gateway."""
@@ -133,6 +137,8 @@ class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
 
 
 class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
+    """Where a run stands, and once it is finished all of it."""
+
     phase: Literal["open", "validation", "heldout", "random", "finished"]
     done: int
     """Episodes done of this phase."""
@@ -192,6 +198,8 @@ class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_envi
 
 
 class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_state"):
+    """The answer to `DescribeEnvironment`."""
+
     split_hashes: dict[str, str]
     """SHA-256 by split name: equal to a run's where the cases are the same."""
     knows_run: bool
@@ -212,10 +220,14 @@ class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
 
 
 class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_started"):
+    """The evaluation is queued; also the answer to a repeated key."""
+
     evaluation: str
 
 
 class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
+    """A long poll for outcomes of an evaluation from a cursor on."""
+
     token: str
     evaluation: str
     cursor: int
@@ -223,6 +235,8 @@ class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
 
 
 class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
+    """Outcomes in order of arrival; `cursor` is where the next page begins."""
+
     cursor: int
     total: int
     outcomes: tuple[EpisodeOutcome, ...]
@@ -231,6 +245,8 @@ class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
 
 
 class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
+    """End a run or an evaluation without a score."""
+
     token: str
     run: str
 
@@ -246,6 +262,8 @@ class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
 
 
 class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
+    """Take a worker out of service, or back."""
+
     token: str
     worker: str
     state: Literal["active", "paused", "draining"]
@@ -290,10 +308,14 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
 
 
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
+    """What the cluster is doing."""
+
     token: str
 
 
 class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One worker that is connected, or was lately."""
+
     worker: str
     host: str
     slots: int
@@ -313,6 +335,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One unfinished run."""
+
     run: str
     entry: str
     env: str
@@ -339,6 +363,8 @@ class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
+    """The answer to `StatusRequest`."""
+
     cluster: str
     version: str
     uptime_s: float

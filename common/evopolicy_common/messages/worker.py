@@ -51,6 +51,8 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):
+    """The worker is known from now on, and may ask for leases."""
+
     session: str
     """To be sent with every later request; ends with the coordinator's or the worker's process."""
     lease_ttl_s: float
@@ -84,12 +86,16 @@ class Lease(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Leases(Message, frozen=True, kw_only=True, tag="leases"):
+    """The answer to a poll; empty when there was nothing in time."""
+
     leases: tuple[Lease, ...]
     cancelled: tuple[str, ...] = ()
     """Leases to stop at once, told here because the poll happened to wait; heartbeats tell them too."""
 
 
 class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
+    """One lease in a worker's hands, as its heartbeat tells."""
+
     lease_id: str
     job_id: str
     attempt: int
@@ -101,6 +107,8 @@ class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
+    """Every lease that the worker holds, renewed by being listed."""
+
     worker: str
     session: str
     held: tuple[HeldLease, ...]
@@ -109,6 +117,8 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
 
 
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
+    """What the worker is to stop."""
+
     cancelled: tuple[str, ...] = ()
     """Leases to stop at once: expired, cancelled or preempted."""
     drain: bool = False
@@ -121,6 +131,8 @@ down, the supervisor lives (a strike); failed: infrastructure (environment crash
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of one lease."""
+
     lease_id: str
     job_id: str
     attempt: int
@@ -159,11 +171,15 @@ class BlobPut(Message, frozen=True, kw_only=True, tag="blob_put"):
 
 
 class BlobAck(Message, frozen=True, kw_only=True, tag="blob_ack"):
+    """How far a blob has come: the next chunk begins there."""
+
     have: int
     """Bytes that the receiver has; equal to `size` when it is stored (also when it was already there)."""
 
 
 class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
+    """One chunk of a stored blob."""
+
     sender: str
     token: str
     digest: str
@@ -171,6 +187,8 @@ class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
 
 
 class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
+    """The answer to `BlobGet`: the bytes from its offset on, and the size of the whole."""
+
     size: int
     data: bytes
 

@@ -44,6 +44,7 @@ class Ended:
 
 
 def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
+    """Queue an operator's cases, once for each key."""
     known = core.evaluation_keys.get(event.key)
     if known is not None:
         turn.reply(event.request, operator.EvaluationStarted(evaluation=known))
@@ -76,6 +77,7 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
 
 
 def enter(core: Core, row: EvaluationRow) -> Evaluation:
+    """Take an evaluation into the core, with nothing of it queued yet."""
     evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier))
     core.evaluations[row.evaluation] = evaluation
     core.evaluation_keys[row.key] = row.evaluation
@@ -83,6 +85,7 @@ def enter(core: Core, row: EvaluationRow) -> Evaluation:
 
 
 def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
+    """Queue the episodes of an evaluation."""
     row = evaluation.row
     n = len(row.cases)
     # What is played again stands where it stood in its run; anything else is a list of its own.
@@ -137,11 +140,13 @@ def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
 
 
 def pinned(evaluation: Evaluation, fingerprint_class: str, turn: Turn) -> None:
+    """Keep the class of workers that an evaluation is played by."""
     evaluation.row = msgspec.structs.replace(evaluation.row, fingerprint_class=fingerprint_class)
     turn.persist(evaluation.row)
 
 
 def progressed(core: Core, group: JobGroup, turn: Turn) -> None:
+    """Episodes of an evaluation are done: tell those who wait, and end it with its last."""
     if group.done == group.n:
         end(core, group, "", turn)
     else:
@@ -149,6 +154,7 @@ def progressed(core: Core, group: JobGroup, turn: Turn) -> None:
 
 
 def end(core: Core, group: JobGroup, error: str, turn: Turn) -> None:
+    """Nothing more of an evaluation is played; `error` says why it ended early."""
     evaluation = core.evaluations.pop(group.run)
     turn.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
     core.ended_evaluations[group.run] = Ended(group.done)
@@ -163,6 +169,7 @@ def _answer_polls(core: Core, group: JobGroup, turn: Turn, *, finished: bool) ->
 
 
 def polled(core: Core, event: events.EvaluationPolled, turn: Turn) -> None:
+    """An operator asks for outcomes: answered at once, or when there are more than it has."""
     poll = Poll(event.request, "evaluation", evaluation_group(event.evaluation), event.cursor)
     ended = core.ended_evaluations.get(event.evaluation)
     if ended is not None:

@@ -65,6 +65,8 @@ class RunWaited(Event, frozen=True, kw_only=True):
 
 
 class RunCancelled(Event, frozen=True, kw_only=True):
+    """An operator ended a run."""
+
     request: RequestId
     run: str
 
@@ -100,6 +102,8 @@ class EvaluationRequested(Event, frozen=True, kw_only=True):
 
 
 class EvaluationPolled(Event, frozen=True, kw_only=True):
+    """An operator asked for outcomes of an evaluation (long poll)."""
+
     request: RequestId
     evaluation: str
     cursor: int
@@ -125,6 +129,8 @@ class RunOpened(Event, frozen=True, kw_only=True):
 
 
 class StateRequested(Event, frozen=True, kw_only=True):
+    """A gateway asked how its run stands."""
+
     request: RequestId
     run: str
 
@@ -141,6 +147,8 @@ class SubmitRequested(Event, frozen=True, kw_only=True):
 
 
 class ResultsRequested(Event, frozen=True, kw_only=True):
+    """A gateway asked for a submit's outcomes from a cursor on (long poll)."""
+
     request: RequestId
     run: str
     submit_index: int
@@ -161,6 +169,8 @@ class RunClosed(Event, frozen=True, kw_only=True):
 
 
 class WorkerRegistered(Event, frozen=True, kw_only=True):
+    """A worker started, or found its session unknown."""
+
     request: RequestId
     worker: str
     session: str
@@ -175,6 +185,8 @@ class WorkerRegistered(Event, frozen=True, kw_only=True):
 
 
 class LeaseRequested(Event, frozen=True, kw_only=True):
+    """A worker asked for work (long poll)."""
+
     request: RequestId
     worker: str
     session: str
@@ -187,6 +199,8 @@ class LeaseRequested(Event, frozen=True, kw_only=True):
 
 
 class HeartbeatReceived(Event, frozen=True, kw_only=True):
+    """A worker told which leases it holds."""
+
     request: RequestId
     worker: str
     session: str
@@ -196,6 +210,8 @@ class HeartbeatReceived(Event, frozen=True, kw_only=True):
 
 
 class ResultsHandedIn(Event, frozen=True, kw_only=True):
+    """A worker handed in what came of its leases."""
+
     request: RequestId
     worker: str
     session: str

@@ -130,6 +130,7 @@ def quarantine(core: Core, group: JobGroup, turn: Turn) -> None:
 
 
 def close(core: Core, event: events.RunClosed, turn: Turn) -> None:
+    """The agent is gone: no more submits, and the hidden cases are played. Closing twice is closing once."""
     run = core.runs.get(event.run)
     if run is None and event.run not in core.capabilities:
         turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
@@ -304,6 +305,7 @@ def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
 
 
 def waited(core: Core, event: events.RunWaited, turn: Turn) -> None:
+    """An operator waits for the end of a run."""
     run = core.runs.get(event.run)
     if run is None:
         if event.run in core.capabilities:

@@ -52,6 +52,7 @@ def _audits(core: Core) -> None:
 
 
 def want(core: Core, key: str, holds: bool, what: str) -> None:
+    """InvariantError with the story of `key` when something does not hold."""
     if not holds:
         lines = "\n".join(
             f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in core.story(key)

@@ -31,6 +31,7 @@ class Ledger:
 
     @property
     def reserved(self) -> int:
+        """Episodes of submits that have no verdict yet."""
         return sum(self._reservations.values())
 
     @property
@@ -39,6 +40,7 @@ class Ledger:
         return self.granted - self.available
 
     def reserve(self, submit_index: int, n: int) -> None:
+        """Set episodes aside for a submit; InvariantError when there are not so many, or it has some already."""
         if n < 1 or n > self.available or submit_index in self._reservations:
             raise InvariantError(f"cannot reserve {n} for submit {submit_index}: {self}")
         self.available -= n
@@ -59,6 +61,7 @@ class Ledger:
         return n
 
     def validate(self) -> None:
+        """InvariantError when an episode was lost or made."""
         total = self.available + self.reserved + self.settled
         if total != self.granted or min(self.available, self.settled, self.reserved) < 0:
             raise InvariantError(f"budget is not conserved: {self}")

@@ -222,12 +222,14 @@ class Core:
     # ---- flows and groups ----
 
     def add_flow(self, name: str, env: str, tier: Tier) -> Flow:
+        """A new flow for a run or an evaluation, not pinned to workers yet."""
         self._flows += 1
         flow = Flow(name, env, tier, self._flows)
         self.unpinned[name] = flow
         return flow
 
     def drop_flow(self, flow: Flow) -> None:
+        """A run or evaluation is over: nothing of it waits any more."""
         self.unpinned.pop(flow.id, None)
         self.queue.drop(flow)
 
@@ -252,6 +254,7 @@ class Core:
             evaluations.pinned(self.evaluations[flow.id], profile.fingerprint_class, turn)
 
     def place(self, flow: Flow, fingerprint_class: str, turn: Turn) -> None:
+        """Pin a flow to a class of workers: what of it waits, waits for them."""
         self.unpinned.pop(flow.id, None)
         turn.dirty[self.queue.place(flow, fingerprint_class)] = None
 
@@ -340,6 +343,7 @@ class Core:
             finalisation.quarantine(self, group, turn)
 
     def submit_ended(self, run: Run, row: SubmitRow, turn: Turn) -> None:
+        """A submit has its verdict: its hidden validation may begin, and a closed run may go on."""
         if row.status == "ok":
             finalisation.validate_early(self, run, row, turn)
         finalisation.advance(self, run, turn)
@@ -349,22 +353,27 @@ class Core:
         finalisation.advance(self, run, turn)
 
     def counted_retry(self, job: JobState, turn: Turn) -> None:
+        """A job is played again for our own failure; `run.json` tells how often."""
         run = self.runs.get(job.group.run)
         if run is not None:
             run.change(turn, infrastructure_retries=run.state.infrastructure_retries + 1)
 
     def nondeterministic(self, group: JobGroup, turn: Turn) -> None:
+        """Two results of one episode differed; `run.json` tells how often."""
         run = self.runs.get(group.run)
         if run is not None:
             run.change(turn, nondeterministic_results=run.state.nondeterministic_results + 1)
 
     def count_done(self, n: int, now: float) -> None:
+        """Episodes were finished, for the rate that operators see."""
         self.rate.count(n, now)
 
     def waits_for(self, group: JobGroup) -> str:
+        """What a group waits for, in words; empty while it runs."""
         return status.waits_for(self, group)
 
     def forget_run(self, run: Run) -> None:
+        """A run is finished: of it only the last state that its gateway may ask for stays."""
         del self.runs[run.id]
         self.finished[run.id] = runs.last_state(run.state)
         self.drop_flow(run.flow)

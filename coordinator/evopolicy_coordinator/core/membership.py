@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 
 def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
+    """A worker joins, or joins again under a new session."""
     if _refused_as_forger(core, event.worker, event.machine, event.request, turn):
         return
     old = core.fleet.workers.get(event.worker)
@@ -67,6 +68,7 @@ def _refused_as_forger(core: Core, name: str, machine: str, request: events.Requ
 
 
 def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
+    """Who speaks; None, and the request is refused, when its session is unknown or it is quarantined."""
     known = core.fleet.workers.get(event.worker)
     if _refused_as_forger(core, event.worker, known.machine if known else "", event.request, turn):
         return None
@@ -80,12 +82,14 @@ def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
 
 
 def lease_requested(core: Core, event: events.LeaseRequested, turn: Turn) -> None:
+    """A worker asks for work."""
     worker = worker_of(core, event, turn)
     if worker is not None:
         core.scheduler.poll(worker, event, turn)
 
 
 def heartbeat(core: Core, event: events.HeartbeatReceived, turn: Turn) -> None:
+    """Renew the leases that a worker lists, and tell it which to stop."""
     worker = worker_of(core, event, turn)
     if worker is None:
         return
@@ -100,6 +104,7 @@ def heartbeat(core: Core, event: events.HeartbeatReceived, turn: Turn) -> None:
 
 
 def handed_in(core: Core, event: events.ResultsHandedIn, turn: Turn) -> None:
+    """Take results, and answer once they are durable."""
     worker = worker_of(core, event, turn)
     if worker is None:
         return
@@ -109,6 +114,7 @@ def handed_in(core: Core, event: events.ResultsHandedIn, turn: Turn) -> None:
 
 
 def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
+    """A hint only: the worker's leases are looked at sooner than they would be."""
     worker = core.fleet.workers.get(event.worker)
     if worker is not None and worker.state != "lost" and worker.doubted_at is None:
         worker.doubted_at = turn.now
@@ -116,6 +122,7 @@ def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
 
 
 def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
+    """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
     if event.state != "active" and event.worker in core.fleet.quarantined:
         text = f"{event.worker} is quarantined: {core.fleet.quarantined[event.worker]}"
         turn.refuse(event.request, "quarantined", text)
@@ -135,6 +142,7 @@ def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
 
 
 def repinned(core: Core, event: events.RunRepinned, turn: Turn) -> None:
+    """Pin an unfinished run to another class of workers, as an operator says."""
     run = core.runs.get(event.run)
     offered = {
         profile.fingerprint_class: profile
@@ -163,4 +171,5 @@ def repinned(core: Core, event: events.RunRepinned, turn: Turn) -> None:
 
 
 def abandoned(core: Core, event: events.RequestAbandoned, turn: Turn) -> None:
+    """Who asked is gone: nothing is kept for it."""
     core.polls.take(event.request)

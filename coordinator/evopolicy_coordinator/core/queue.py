@@ -69,6 +69,7 @@ class Flow:
         return (1.0 if self.episode_s is None else self.episode_s) * job.n
 
     def observe(self, wall_s: float) -> None:
+        """Learn from an episode that took `wall_s` seconds."""
         self.episode_s = wall_s if self.episode_s is None else 0.8 * self.episode_s + 0.2 * wall_s
 
 
@@ -90,6 +91,7 @@ class Lane:
         return sum(profile.slots for profile in self.profiles)
 
     def workers(self) -> int:
+        """How many active workers may serve it."""
         return sum(len(profile.workers) for profile in self.profiles)
 
     def top(self, priority: int) -> Flow | None:
@@ -133,9 +135,11 @@ class Profile:
 
     @property
     def fingerprint_class(self) -> str:
+        """What runs are pinned to; see `Fingerprint`."""
         return self.key[2]
 
     def serves(self, key: LaneKey) -> bool:
+        """Whether these workers may play what waits in a lane of that key."""
         env, tier, fingerprint_class = key
         return env in self.key[0] and tier in self.key[1] and fingerprint_class == self.key[2]
 
@@ -154,6 +158,7 @@ class Queue:
     # ---- shape ----
 
     def add_profile(self, profile: Profile) -> None:
+        """Let workers of a new profile serve the lanes that they can."""
         self.profiles[profile.key] = profile
         for lane in self.lanes.values():
             self._join(profile, lane)

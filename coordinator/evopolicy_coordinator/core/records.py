@@ -313,14 +313,17 @@ def train_group(run: str, submit_index: int) -> str:
 
 
 def validation_group(run: str, submit_index: int) -> str:
+    """Group id of a checkpoint's validation episodes."""
     return f"{run}/s{submit_index}/validation"
 
 
 def heldout_group(run: str, submit_index: int) -> str:
+    """Group id of a checkpoint's held-out episodes."""
     return f"{run}/s{submit_index}/heldout"
 
 
 def random_group(run: str) -> str:
+    """Group id of the random reference's episodes."""
     return f"{run}/random"
 
 

@@ -69,12 +69,14 @@ class Run:
         turn.persist(self.state)
 
     def change_submit(self, index: int, turn: Turn, **fields: object) -> SubmitRow:
+        """Change a submit's durable row."""
         row = self.submits[index] = msgspec.structs.replace(self.submits[index], **fields)
         turn.persist(row)
         return row
 
 
 def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
+    """Make a run, once for each key."""
     known = core.run_keys.get(event.key)
     if known is not None:
         turn.reply(event.request, operator.RunCreated(run=known, capability=core.capabilities[known]))
@@ -142,6 +144,7 @@ def _fault(event: events.RunCreated) -> str | None:
 
 
 def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
+    """Tell a gateway all that is fixed of its run; refused until some worker has offered the environment."""
     run = _live(core, event.request, event.run, turn)
     if run is None:
         return
@@ -176,6 +179,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
 
 
 def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> None:
+    """Tell a gateway how its run stands, also after it is finished."""
     last = core.finished.get(event.run)
     if last is not None:
         turn.reply(event.request, gateway.StateReply(state=last))
@@ -191,6 +195,7 @@ def last_state(row: RunStateRow) -> gateway.RunState:
 
 
 def run_state(core: Core, run: Run) -> gateway.RunState:
+    """What the gateway of an unfinished run is told of it."""
     in_flight = None
     if run.open is not None:
         group = core.groups[train_group(run.id, run.open)]
@@ -218,6 +223,7 @@ def _live(core: Core, request: events.RequestId, name: str, turn: Turn) -> Run |
 
 
 def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
+    """Take a submit, or refuse it for the first cause in the protocol's order; a known key is answered as before."""
     run = _live(core, event.request, event.run, turn)
     if run is None:
         return
@@ -414,6 +420,7 @@ def end(
 
 
 def results(core: Core, event: events.ResultsRequested, turn: Turn) -> None:
+    """A gateway asks for outcomes: answered at once, or when there are more than it has."""
     run = core.runs.get(event.run)
     if run is None:
         if event.run in core.capabilities:
@@ -469,4 +476,5 @@ def _page(
 
 
 def finished_effect(request: events.RequestId, run: str, turn: Turn) -> ReadFinished:
+    """Have the shell answer with the finished run."""
     return ReadFinished(request=request, run=run, stimulus_id=turn.stimulus_id)

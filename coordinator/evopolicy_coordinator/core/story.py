@@ -16,6 +16,8 @@ class InvariantError(AssertionError):
 
 
 class StoryLine(NamedTuple):
+    """One thing that happened, Unix seconds."""
+
     at: float
     stimulus_id: str
     key: str
@@ -30,6 +32,7 @@ class Story:
         self._lines: deque[StoryLine] = deque(maxlen=lines)
 
     def tell(self, at: float, stimulus_id: str, key: str, what: str) -> None:
+        """Keep a line; the oldest goes when there is no more room."""
         self._lines.append(StoryLine(at, stimulus_id, key, what))
 
     def of(self, key: str) -> list[StoryLine]:

@@ -40,6 +40,7 @@ class Timers:
             self.arm(key, at)
 
     def disarm(self, key: TimerKey) -> None:
+        """Forget the deadline of `key`, if it has one."""
         self._armed.pop(key, None)
 
     def next(self) -> float | None:

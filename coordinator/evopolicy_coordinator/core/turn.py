@@ -34,18 +34,23 @@ class Turn:
         """Workers to the leases that they are to stop."""
 
     def persist(self, row: Row) -> None:
+        """Make a row durable before anything else that this step does."""
         self._rows.append(row)
 
     def add(self, effect: Effect) -> None:
+        """Let the shell do something once the rows are durable."""
         self._out.append(effect)
 
     def reply(self, request: RequestId, message: Message) -> None:
+        """Answer a request."""
         self._out.append(Reply(request=request, message=message, stimulus_id=self.stimulus_id))
 
     def refuse(self, request: RequestId, status: str, message: str) -> None:
+        """Answer a request with the reason why it is not carried out."""
         self.reply(request, Refused(status=status, message=message))
 
     def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
+        """Tell operators."""
         self._out.append(Log(level=level, event=event, fields=fields, stimulus_id=self.stimulus_id))
 
     def effects(self) -> list[Effect]:

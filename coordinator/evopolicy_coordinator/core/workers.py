@@ -59,6 +59,8 @@ class LeasePoll:
 
 @dataclass(slots=True, eq=False)
 class Worker:
+    """One worker as the core knows it."""
+
     name: str
     session: str
     slots: int
@@ -212,6 +214,7 @@ class Fleet:
             self.count_out(worker, state)
 
     def forget(self, worker: Worker) -> None:
+        """A worker that was lost long ago is known no more."""
         del self.workers[worker.name]
         self.sessions.pop(worker.session, None)
 
@@ -239,6 +242,7 @@ class Fleet:
             profile.warm.setdefault(item, {})[worker.name] = None
 
     def unpark(self, worker: Worker) -> None:
+        """Its poll waits no more, or cannot be answered now."""
         profile = worker.profile
         if worker.name not in profile.parked:
             return
