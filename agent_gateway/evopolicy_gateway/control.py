@@ -96,6 +96,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
 
 
 class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
+    """To a gateway: the agent is gone, and why."""
+
     reason: str
     agent: dict[str, Any] = {}
 
@@ -126,7 +128,7 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
 
 
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
-    pass
+    """To a keeper: end the agent and all that it has started."""
 
 
 AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentEnded
@@ -136,6 +138,7 @@ _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
 
 def line(message: Event | Order) -> bytes:
+    """A message as one line of JSON."""
     return msgspec.json.encode(message) + b"\n"
 
 
@@ -165,6 +168,7 @@ class Orders:
         threading.Thread(target=self._read, args=(loop,), name="orders", daemon=True).start()
 
     async def next(self) -> AnyOrder | None:
+        """The next order; waits for it."""
         return await self._queue.get()
 
     def end(self) -> None:

@@ -31,26 +31,32 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def system(self) -> Path:
+        """The policy that the agent edits."""
         return self.workspace / "system"
 
     @property
     def feedback(self) -> Path:
+        """What came of its submits, a folder each."""
         return self.workspace / "feedback"
 
     @property
     def checkpoints(self) -> Path:
+        """The submitted policies with their metrics, written at the end."""
         return self.root / "checkpoints"
 
     @property
     def run_json(self) -> Path:
+        """The run's record, written last."""
         return self.root / "run.json"
 
     @property
     def harness_log(self) -> Path:
+        """What gateway and keeper say."""
         return self.root / "logs" / "harness.log"
 
     @property
     def agent_log(self) -> Path:
+        """All that the agent's programs say, and what they were told."""
         return self.root / "logs" / "agent.jsonl"
 
     @property
@@ -60,6 +66,7 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def credentials(self) -> Path:
+        """The gateway's own, with the run's capability."""
         return self.state / "credentials.json"
 
     @property
@@ -84,10 +91,12 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def journal(self) -> Path:
+        """What the gateway has begun; see `journal.py`."""
         return self.state / "journal.jsonl"
 
     @property
     def blobs(self) -> Path:
+        """Snapshots of `system/` that were submitted."""
         return self.state / "bundles"
 
     @property

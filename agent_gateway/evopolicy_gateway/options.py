@@ -52,6 +52,7 @@ def console(*, stderr: bool) -> Console:
 
 
 def tier_of(text: str) -> Tier:
+    """The sandbox tier that `--tier` names. ConfigError when there is none of that name."""
     return one_of("--tier", text, Tier)  # type: ignore[return-value]
 
 

@@ -47,11 +47,13 @@ class Ticket:
         self.request = msgspec.structs.replace(self.request, bundle=taken.digest, bundle_error=taken.error)
 
     def accept(self, accepted: Accepted) -> None:
+        """The coordinator has taken it: from now on it has its name."""
         self.accepted = accepted
         self.submit_id = submit_id(accepted.submit_index, self._episode_budget)
         self.decided.set()
 
     def settle(self, status: str, summary: bytes) -> None:
+        """It is answered: its feedback is written."""
         self.status, self.summary = status, summary
         self.n_done = len(self.request.env_instances)
         self.waits_for = ""
@@ -59,6 +61,7 @@ class Ticket:
         self.done.set()
 
     def fail(self, error: RequestError) -> None:
+        """It came to nothing."""
         self.error = error
         self.decided.set()
         self.done.set()

@@ -57,6 +57,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     @property
     def identity(self) -> str:
+        """As it stands in the machine's certificate, and as its user name."""
         return f"{self.role}/{self.name}"
 
 
@@ -81,6 +82,7 @@ class Machines:
 
     @property
     def passwords(self) -> Path:
+        """The file that Zenoh's session for other machines reads."""
         return self.folder / "passwords"
 
     def all(self) -> tuple[Machine, ...]:

@@ -72,6 +72,7 @@ class StateFolder:
 
     @property
     def database(self) -> Path:
+        """See `store.py`."""
         return self.root / "coordinator.sqlite"
 
     @property
@@ -81,6 +82,7 @@ class StateFolder:
 
     @property
     def credentials(self) -> Path:
+        """Folder of this machine's credentials, a file a role."""
         return self.root / "credentials"
 
     @property
@@ -119,6 +121,7 @@ class StateFolder:
         return paths
 
     def write_passwords(self) -> None:
+        """Write the file that Zenoh's router reads."""
         lines = [f"{role}:{self.identity.passwords[role]}\n" for role in ROLES]
         write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
 

@@ -60,6 +60,7 @@ class Operator:
         self._ask = operator_requests(link)
 
     async def status(self) -> StatusReply:
+        """What the cluster is doing."""
         return await self._ask.until_answered(
             "status", StatusRequest(token=self.token), StatusReply, patience_s=10.0
         )
@@ -69,10 +70,12 @@ class Operator:
         await self._ask.until_answered("worker", message, Done, patience_s=10.0)
 
     async def cancel_run(self, run: str) -> None:
+        """End a run without a score."""
         message = CancelRun(token=self.token, run=run)
         await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
 
     async def repin_run(self, run: str, fingerprint_class: str, reason: str) -> None:
+        """Let a run go on with workers of another fingerprint class."""
         message = RepinRun(token=self.token, run=run, fingerprint_class=fingerprint_class, reason=reason)
         await self._ask.until_answered("repin", message, Done, patience_s=10.0)
 

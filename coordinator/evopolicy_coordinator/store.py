@@ -271,6 +271,7 @@ class Reader:
         return _guard(self._path, read)
 
     def close(self) -> None:
+        """Close the connection."""
         self._db.close()
 
 

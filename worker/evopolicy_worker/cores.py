@@ -45,6 +45,7 @@ class Cores:
         return core
 
     def close(self) -> None:
+        """Gives the cores back."""
         for lock in self._locks.values():
             lock.close()
         self._locks.clear()

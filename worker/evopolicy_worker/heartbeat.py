@@ -29,14 +29,17 @@ class HeldLeases:
         self._held: dict[str, HeldLease] = {}
 
     def put(self, lease: HeldLease) -> None:
+        """Tell of a lease from the next beat on, or tell how it stands now."""
         with self._lock:
             self._held[lease.lease_id] = lease
 
     def drop(self, lease_id: str) -> None:
+        """Tell of it no more."""
         with self._lock:
             self._held.pop(lease_id, None)
 
     def snapshot(self) -> tuple[HeldLease, ...]:
+        """What the next beat tells."""
         with self._lock:
             return tuple(self._held.values())
 
@@ -74,6 +77,7 @@ class HeartbeatThread:
             self._thread.start()
 
     def stop(self) -> None:
+        """Send no more; the beat that waits is not waited for."""
         self._stop.set()
 
     def _run(self) -> None:

@@ -54,6 +54,7 @@ class Output:
 
     @property
     def open(self) -> bool:
+        """False once the policy has closed the stream."""
         return self._open
 
     def take(self) -> bytes:
@@ -97,6 +98,7 @@ class Watch:
             return 0.0
 
     def drain(self) -> None:
+        """Take in what the policy has printed, so that it never waits for us."""
         self.stdout.drain(self.child.stdout)
         self.stderr.drain(self.child.stderr)
 
@@ -168,9 +170,11 @@ class Monitor(threading.Thread):
         self.wake()
 
     def wake(self) -> None:
+        """Look at once: something has changed."""
         os.eventfd_write(self._wake, 1)
 
     def run(self) -> None:
+        """The thread: judges the watched policy and hears commands, until the process ends."""
         pause_s = 0.0
         while True:
             with self._lock:

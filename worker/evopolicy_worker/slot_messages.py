@@ -28,7 +28,7 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job; answered by Progress and then Played or Fault."""
+    """Play this job; answered by Told, again and again, then by Played or Fault."""
 
     job: Job
     bundle: str | None
@@ -43,11 +43,15 @@ class Ready(Message, frozen=True, kw_only=True, tag="ready"):
 
 
 class Told(Message, frozen=True, kw_only=True, tag="progress"):
+    """How far the running job is."""
+
     episodes_done: int
     steps: int
 
 
 class Played(Message, frozen=True, kw_only=True, tag="played"):
+    """What came of a job, in its order."""
+
     outcomes: tuple[EpisodeOutcome, ...]
     cancelled: bool = False
 
@@ -69,5 +73,6 @@ answers: msgspec.msgpack.Decoder[Answer] = msgspec.msgpack.Decoder(Answer)
 
 
 def framed(message: Message) -> bytes:
+    """A message's bytes with their length before them."""
     data = encoder.encode(message)
     return LENGTH.pack(len(data)) + data

@@ -53,6 +53,7 @@ class Unit:
 
 
 def stable_hash(parts: list[str]) -> str:
+    """A hash that is the same in every process."""
     return hashlib.blake2b("\x1f".join(parts).encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
 
 

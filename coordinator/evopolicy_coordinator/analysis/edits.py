@@ -76,10 +76,12 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def rate_synthesis(self) -> float | None:
+        """Share of syntheses that hit; None without any."""
         return self.hits_synthesis / self.n_synthesis if self.n_synthesis else None
 
     @property
     def rate_parametric(self) -> float | None:
+        """Share of parametric edits that hit; None without any."""
         return self.hits_parametric / self.n_parametric if self.n_parametric else None
 
 

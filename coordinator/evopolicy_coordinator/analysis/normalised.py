@@ -37,6 +37,8 @@ class GroupMean(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Normalised(msgspec.Struct, frozen=True, kw_only=True):
+    """Normalised performance of a set of agents."""
+
     cells: dict[tuple[str, str], NormalisedCell]
     """By (entry, env), agents only."""
     groups: tuple[GroupMean, ...]

@@ -50,6 +50,7 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def entries(self) -> list[str]:
+        """All entries by name, the reference last."""
         return sorted(self.harness, key=lambda entry: (entry == self.reference, entry.casefold(), entry))
 
     @property
@@ -59,6 +60,7 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def environments(self) -> list[str]:
+        """All that have a cell, in the catalogue's order."""
         return ordered_environments(env for _, env in self.cells)
 
     def column(self, env: str) -> dict[str, float | None]:
@@ -96,6 +98,7 @@ def family_of(env: str) -> str:
 
 
 def family_title(family: str) -> str:
+    """As it is shown."""
     return catalogue.families().get(family, family.replace("_", " ").capitalize())
 
 
@@ -109,6 +112,7 @@ def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
 
 
 def suite_title(suite: str) -> str:
+    """As it is shown."""
     known = catalogue.suites().get(suite)
     return known.title if known is not None else suite.capitalize()
 

@@ -72,10 +72,12 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def p_visible(self) -> float | None:
+        """Share whose visible mean rose; None without any to compare."""
         return self.visible_improved / self.n_visible if self.n_visible else None
 
     @property
     def p_validation(self) -> float | None:
+        """Share that raised the validation best; None for an empty bin."""
         return self.validation_improved / self.n if self.n else None
 
 

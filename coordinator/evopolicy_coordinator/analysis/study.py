@@ -68,6 +68,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def reference(self) -> str | None:
+        """Entry that is the uniform-random reference; None when there is none."""
         return next(
             (suite.table.reference for suite in self.suites if suite.table.reference is not None), None
         )

@@ -15,6 +15,8 @@ DASH = "–"
 
 
 class Column(msgspec.Struct, frozen=True, kw_only=True):
+    """One column: its field, its heading and how its values are shown."""
+
     key: str
     """Name of the field in CSV."""
     title: str

@@ -7,6 +7,8 @@ from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 
 
 class Box2DFamily(GymnasiumFamily):
+    """A walker and a racing car."""
+
     distributions = ("gymnasium", "box2d", "pygame-ce")
     modules = ("gymnasium", "Box2D", "pygame")
 

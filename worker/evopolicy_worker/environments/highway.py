@@ -10,6 +10,8 @@ from evopolicy_worker.environments.info import plain_info
 
 
 class HighwayFamily(GymnasiumFamily):
+    """Traffic, and a car to be parked."""
+
     distributions = ("highway-env",)
     modules = ("gymnasium", "highway_env")
     components = {

@@ -6,6 +6,8 @@ from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 
 
 class MiniGridFamily(GymnasiumFamily):
+    """Doors, keys and rooms."""
+
     distributions = ("minigrid",)
     modules = ("gymnasium", "minigrid")
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 
 class MujocoFamily(GymnasiumFamily):
+    """Articulated bodies."""
+
     distributions: tuple[str, ...] = ("gymnasium", "mujoco")
     modules: tuple[str, ...] = ("gymnasium", "mujoco")
     components: Mapping[str, tuple[str, ...]] = {

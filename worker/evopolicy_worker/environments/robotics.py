@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 
 class RoboticsFamily(MujocoFamily):
+    """A robot's arm, with goals."""
+
     distributions = ("gymnasium-robotics", "mujoco")
     modules = ("gymnasium", "mujoco", "gymnasium_robotics")
     components = {}

@@ -1,3 +1,5 @@
+"""What an agent makes of a gateway's answers: verdicts, refusals, and none at all."""
+
 from __future__ import annotations
 
 import socket

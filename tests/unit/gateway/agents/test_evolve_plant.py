@@ -1,3 +1,5 @@
+"""What can be learned of a plant from a few episodes: which action moves which part."""
+
 from __future__ import annotations
 
 from typing import Any

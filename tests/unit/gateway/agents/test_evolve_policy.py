@@ -1,3 +1,5 @@
+"""The policies that `evolve` writes act in every space, alone and as a staged bundle."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""The search: how a budget is planned, what is kept, what is drawn next."""
+
 from __future__ import annotations
 
 import numpy as np
