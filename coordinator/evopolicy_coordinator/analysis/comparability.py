@@ -1,8 +1,9 @@
 """What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, and
 results that an audit has put in question with any others.
 
-Budget, scope, observation form and jail must agree over all runs of a suite; splits (by hash), library fingerprint and
-environment version over the runs of one environment, since environments differ in them anyway.
+Budget, scope, observation form and jail must agree over all runs of a suite; splits (by hash), library fingerprint,
+environment version, how large a submit may be, a policy's limits, and whether feedback has videos over the runs of one
+environment, since environments differ in them anyway.
 """
 
 from __future__ import annotations
@@ -54,7 +55,16 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
     "validation split": lambda run: run.record.versions.data_valid_hash[:12],
     "held-out split": lambda run: run.record.versions.data_heldout_hash[:12],
     "environment version": lambda run: run.record.versions.env,
+    "episodes a submit": lambda run: run.submit_size,
+    "policy limits": lambda run: _limits(run),
+    "videos in feedback": lambda run: run.record.experiment_dimensions.video,
 }
+
+
+def _limits(run: Run) -> str:
+    """As `name=value` words; empty where the run does not tell."""
+    limits = run.record.experiment_dimensions.limits
+    return "" if limits is None else " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(limits).items())
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:

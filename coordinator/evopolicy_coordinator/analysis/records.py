@@ -97,6 +97,12 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         return self.record.experiment_dimensions.episode_budget
 
     @property
+    def submit_size(self) -> str:
+        """Fewest and most train episodes of a submit, such as `1 to 128`."""
+        dimensions = self.record.experiment_dimensions
+        return f"{dimensions.min_episodes_per_submit} to {dimensions.max_episodes_per_submit}"
+
+    @property
     def score(self) -> float | None:
         """Held-out mean return of the selected checkpoint; None with no ok submit."""
         return self.record.outcome.final_score

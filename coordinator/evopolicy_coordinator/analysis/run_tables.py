@@ -152,7 +152,7 @@ def _environments(study: Study) -> Table:
                 "demand": demand_of(env),
                 "steps": known.max_episode_steps if known is not None else None,
                 "budget": told(runs, lambda run: run.budget),
-                "submit": told(runs, _episodes_per_submit),
+                "submit": told(runs, lambda run: run.submit_size),
                 "validation": told(runs, lambda run: run.record.experiment_dimensions.n_validation),
                 "heldout": told(runs, lambda run: run.record.experiment_dimensions.n_heldout),
                 "scope": told(runs, lambda run: run.record.experiment_dimensions.policy_scope),
@@ -177,11 +177,6 @@ def _environments(study: Study) -> Table:
         ),
         rows=tuple(rows),
     )
-
-
-def _episodes_per_submit(run: Run) -> str:
-    dimensions = run.record.experiment_dimensions
-    return f"{dimensions.min_episodes_per_submit} to {dimensions.max_episodes_per_submit}"
 
 
 def submits_of(trace: Trace) -> list[dict[str, Any]]:

@@ -225,6 +225,7 @@ class _Walker:
         if isinstance(node, _DECLARATIONS):
             if isinstance(node, ast.Global):
                 unit.globals.update(node.names)
+                self.names.global_names.update(node.names)
                 self.state.update(("", name) for name in node.names)
             return
         if isinstance(node, ast.Assign):

@@ -71,9 +71,12 @@ def write_report(
     figures, figure_data = _write_figures(study, out, tell)
     if traces:
         submits: list[dict[str, Any]] = []
+        by_env: dict[str, list[Run]] = {}
+        for run in study.runs:
+            by_env.setdefault(run.env, []).append(run)
         for done, run in enumerate(study.runs, start=1):
             found = trace(run)
-            _write_trace(found, out, look, _beside(run, study.runs))
+            _write_trace(found, out, look, _beside(run, by_env[run.env]))
             submits += submits_of(found)
             tell("run pages", done, len(study.runs))
         tables.append(feedback_use(submits))
@@ -154,10 +157,10 @@ class _Html(str):
 
 
 def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
-    """A run of each other agent on the same environment, of the same repeat where there is one."""
+    """A run of each other agent among those of its environment, of the same repeat where there is one."""
     found: dict[str, Run] = {}
     for other in runs:
-        if other.env == run.env and other.entry != run.entry:
+        if other.entry != run.entry:
             chosen = found.setdefault(other.entry, other)
             if chosen.record.repeat != run.record.repeat == other.record.repeat:
                 found[other.entry] = other

@@ -185,7 +185,10 @@ def test_held_out_recordings_follow_the_feedbacks_option_unless_they_have_their_
 
 
 def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Path, tmp_path: Path) -> None:
-    told = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path / "report"), "--jobs", "1", "--json"])
+    arguments = [str(runs), "--out", str(tmp_path / "report"), "--jobs", "1", "--json"]
+    refused = CliRunner().invoke(app, arguments)
+    assert "videos in feedback on toy/line" in refused.output
+    told = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
     assert told.exit_code == 0, told.output
     pages = sorted((tmp_path / "report/replays").glob("*.html"))
     assert [page.stem for page in pages] == ["gymnasium-FetchPickAndPlace-v4", "toy-line"]
@@ -208,7 +211,8 @@ def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Pa
 
 
 def test_report_says_which_recordings_there_are(runs: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path / "report"), "--no-pages"])
+    arguments = [str(runs), "--out", str(tmp_path / "report"), "--no-pages", "--allow-mixed"]
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "report/index.html").read_text()
     assert 'href="replays/toy-line.html"' in text

@@ -190,6 +190,24 @@ def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: di
 
 
 @pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"observations": "lists"}, "observation form"),
+        ({"max_episodes_per_submit": 1}, "episodes a submit"),
+        ({"limits": {"cpu_s": 1.0}}, "policy limits"),
+        ({"video": "all"}, "videos in feedback"),
+    ],
+)
+def test_runs_whose_agents_had_other_means_are_refused(tmp_path: Path, change: dict, what: str) -> None:
+    write_run(tmp_path, VERSIONS)
+    run = write_run(tmp_path, VERSIONS, entry="Agent B")
+    record = json.loads((run / "run.json").read_text())
+    record["experiment_dimensions"] |= change
+    (run / "run.json").write_text(json.dumps(record))
+    assert [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)] == [what]
+
+
+@pytest.mark.parametrize(
     ("found", "refused"),
     [
         ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4}, False),
