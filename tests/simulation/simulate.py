@@ -1,4 +1,4 @@
-"""`make sim`: many seeds of the simulation, or one again: `python tests/simulation/simulate.py --seed 17 --trace`."""
+"""`make sim`: many seeds of the simulation, or one again: `make sim ARGS="--seed 17 --trace"`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def play(seed: int, size: Size = SMALL, *, trace: bool = False) -> Simulation:
 
 def replay_command(seed: int, *, nightly: bool = False) -> str:
     """What to type to see a seed again."""
-    return f"python tests/simulation/simulate.py --seed {seed} --trace{' --nightly' if nightly else ''}"
+    return f"make sim ARGS=\"--seed {seed} --trace{' --nightly' if nightly else ''}\""
 
 
 def main() -> int:

@@ -52,6 +52,7 @@ class Mark(NamedTuple):
 
 
 def mark_of(outcome: EpisodeOutcome) -> Mark:
+    """The mark of an outcome."""
     return Mark(
         outcome.episode_return,
         outcome.length,
@@ -173,6 +174,7 @@ class JobGroup:
 
     @property
     def done(self) -> int:
+        """Episodes that have their outcome."""
         return len(self.marks)
 
     def returns(self) -> tuple[float, ...]:

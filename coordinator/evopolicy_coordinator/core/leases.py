@@ -69,6 +69,7 @@ class Lease:
 
 
 def lease_id(job_id: str, attempt: int) -> str:
+    """Names a lease by what it is of: equal in every incarnation."""
     return f"{job_id}#{attempt}"
 
 

@@ -49,6 +49,7 @@ class Rate:
         self._seconds: deque[list[int]] = deque(maxlen=RATE_S)
 
     def count(self, n: int, now: float) -> None:
+        """`n` more are done."""
         self.total += n
         second = int(now)
         if self._seconds and self._seconds[-1][0] == second:
@@ -81,6 +82,7 @@ def _a_worker(flow: Flow) -> str:
 
 
 def status(core: Core, now: float) -> CoreStatus:
+    """The core's part of a `StatusReply`."""
     workers = tuple(_worker(core, worker, now) for worker in core.fleet.workers.values())
     runs = tuple(_run(core, run) for run in core.runs.values())
     audits: dict[str, int] = {}
