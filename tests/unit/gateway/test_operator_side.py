@@ -119,6 +119,12 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     assert record.versions.fingerprint_overrides == ("a → b: the old workers are gone",)
 
 
+def test_an_environment_that_does_not_repeat_itself_is_marked_in_the_record(tmp_path: Path) -> None:
+    for deterministic in (True, False):
+        record = run_record(plan(tmp_path), finished(deterministic=deterministic), STAGED, [], Times())
+        assert record.versions.env_deterministic is deterministic
+
+
 @pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])
 def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())

@@ -72,6 +72,13 @@ class GymnasiumFamily:
         """True when a reused environment may play another episode than a fresh one of the same case."""
         return False
 
+    def deterministic(self, entry: Entry) -> bool:
+        """False when even a fresh environment may play another episode of the same case and actions.
+
+        An environment whose registration says so itself is marked in any case.
+        """
+        return True
+
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The plain part of a step's `info`."""
         return plain_info(info) if info else {}
@@ -120,6 +127,8 @@ class GymnasiumEnvironment(Environment):
             max_episode_steps=self._limit,
             reward_components=tuple(family.components.get(entry.gymnasium_id or "", ())),
             task_text=task_text(entry.id),
+            deterministic=family.deterministic(entry)
+            and not (self._env.spec is not None and self._env.spec.nondeterministic),
             renders="rgb_array" in self._env.metadata.get("render_modes", ()),
         )
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import core_rig
 import hypothesis.strategies as st
+import msgspec
 import pytest
 from core_rig import BUNDLE, Rig, done, result, split_of
 from hypothesis import given, settings
@@ -40,6 +42,24 @@ def test_the_best_on_hidden_validation_is_selected() -> None:
     rig.work_off(session, value_of)
     assert rig.finished().best_submit_index == 1
     assert rig.finished().policy_failures == {"validation": 0, "heldout": 0}
+
+
+def test_a_run_tells_whether_its_environment_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = core_rig.describe
+    for mark in (True, False):
+        monkeypatch.setattr(
+            core_rig,
+            "describe",
+            lambda env, mark=mark: msgspec.structs.replace(honest(env), deterministic=mark),
+        )
+        rig = Rig()
+        session = rig.register()
+        rig.create()
+        rig.submit(0)
+        rig.work_off(session)
+        rig.close()
+        rig.work_off(session)
+        assert rig.finished().deterministic is mark
 
 
 def test_closing_with_a_submit_in_flight_waits_for_it() -> None:

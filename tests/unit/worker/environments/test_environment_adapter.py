@@ -142,3 +142,13 @@ def test_an_entry_without_an_adapter_is_not_offered(monkeypatch: pytest.MonkeyPa
     assert registry.offered() == []
     with pytest.raises(WorkerError, match="no adapter"):
         make(ENTRY.id)
+
+
+def test_an_environment_that_does_not_repeat_itself_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert make("gym/acrobot").description.deterministic
+    monkeypatch.setattr(gymnasium.spec("Acrobot-v1"), "nondeterministic", True)
+    assert not make("gym/acrobot").description.deterministic
+    monkeypatch.undo()
+    monkeypatch.setattr(GymnasiumFamily, "deterministic", lambda self, entry: entry.id != "gym/acrobot")
+    assert not make("gym/acrobot").description.deterministic
+    assert make("gym/continuouscar").description.deterministic
