@@ -7,12 +7,13 @@ need not be durable, as it is written again after a crash: one flush of the file
 
 from __future__ import annotations
 
+import errno
 import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 from evopolicy_common.blobs import fsync_directory, sync_filesystem
+from evopolicy_common.scratch import give_back_rights, remove_tree
 
 SUMMARY = "summary.json"
 
@@ -34,6 +35,7 @@ class SubmitTree:
 
     def begin(self) -> None:
         """An empty `.partial` folder, whatever was there before."""
+        give_back_rights(self._feedback.parent)
         if self._feedback.is_symlink() or not self._feedback.is_dir():
             _remove(self._feedback)
             self._feedback.mkdir(parents=True)
@@ -75,6 +77,8 @@ def _write(path: Path, data: bytes) -> None:
 
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        remove_tree(path)
+        if path.exists():
+            raise OSError(errno.ENOTEMPTY, "cannot be removed", str(path))
     else:
         path.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ from evopolicy_common.run_record import (
     encode_checkpoint_metrics,
     encode_run_record,
 )
-from evopolicy_common.scratch import remove_tree
+from evopolicy_common.scratch import give_back_rights, remove_tree
 from evopolicy_common.summary import utc_text
 from evopolicy_gateway import replays
 from evopolicy_gateway.formatting import submit_id
@@ -267,11 +267,13 @@ def _write_checkpoint(
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
-    """Replaces `system` by the bundle."""
-    if system.is_symlink() or system.is_file():
-        system.unlink()
-    elif system.exists():
+    """Replaces `system`, whatever its agent has left there, by the bundle."""
+    give_back_rights(system.parent)
+    # Only a folder is removed as one: to open a pipe would wait for its other end.
+    if system.is_dir() and not system.is_symlink():
         remove_tree(system)
+    else:
+        system.unlink(missing_ok=True)
     bundles.unpack(bundle, system)
 
 

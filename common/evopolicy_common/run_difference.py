@@ -6,11 +6,14 @@ the same run whatever the number of workers, their order, and the failures on th
 
 from __future__ import annotations
 
+import filecmp
 import fnmatch
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from evopolicy_common.left_files import left_files
 
 EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",
@@ -39,6 +42,11 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
 }
 """Fields that are not compared, by the name of their file, and why. The text files hold JSON lines."""
 
+MAX_PARSED_BYTES = 64 << 20
+"""A file above this is an agent's, whatever its name, and compared as it is."""
+MAX_COMPARED_BYTES = 1 << 30
+"""An agent may leave files of any size that take no room."""
+
 
 def differences(left: Path, right: Path) -> list[str]:
     """One line for each file or field in which two run directories differ; empty when they are the same run."""
@@ -46,13 +54,13 @@ def differences(left: Path, right: Path) -> list[str]:
     found = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
     found += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
     for name in sorted(ours.keys() & theirs.keys()):
-        found += _file_differences(name, ours[name].read_bytes(), theirs[name].read_bytes())
+        found += _file_differences(name, ours[name], theirs[name])
     return found
 
 
 def _files(root: Path) -> dict[str, Path]:
     """Regular files by their path in the run, those that are excluded aside."""
-    paths = {str(path.relative_to(root)): path for path in root.rglob("*") if path.is_file()}
+    paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
     return {
         name: path
         for name, path in paths.items()
@@ -60,14 +68,17 @@ def _files(root: Path) -> dict[str, Path]:
     }
 
 
-def _file_differences(name: str, left: bytes, right: bytes) -> list[str]:
-    if left == right:
+def _file_differences(name: str, left: Path, right: Path) -> list[str]:
+    sizes = [path.stat().st_size for path in (left, right)]
+    if min(sizes) > MAX_COMPARED_BYTES:
+        return [f"{name}: {sizes[0]} and {sizes[1]} bytes, too many to compare"]
+    if filecmp.cmp(left, right, shallow=False):
         return []
     excluded = EXCLUDED_FIELDS.get(name.rpartition("/")[2])
-    if excluded is None:
-        return [f"{name}: {len(left)} and {len(right)} bytes that are not the same"]
+    if excluded is None or max(sizes) > MAX_PARSED_BYTES:
+        return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
     try:
-        ours, theirs = (_parse(name, data) for data in (left, right))
+        ours, theirs = (_parse(name, path.read_bytes()) for path in (left, right))
     except ValueError as error:
         return [f"{name}: cannot be read: {error}"]
     return [

@@ -65,6 +65,17 @@ def remove_tree(folder: Path) -> None:
             _flatten_away(folder)
 
 
+def give_back_rights(folder: Path) -> None:
+    """Lets this user list, enter and write to its own folder again, where a program that worked in it took that away.
+
+    What is not there is no error.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & stat.S_IRWXU != stat.S_IRWXU:
+            folder.chmod(mode | stat.S_IRWXU)
+
+
 def _flatten_away(folder: Path) -> None:
     """Brings what is in folders up into `folder`, level by level, and removes it there."""
     folder.chmod(0o700)

@@ -7,12 +7,13 @@ the policy changed, and what came of it. Sources and images stay on disk until a
 from __future__ import annotations
 
 import difflib
-import os
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.left_files import left_files
 from evopolicy_coordinator.analysis.agent_log import Evidence, LogReading, read_agent_log
 from evopolicy_coordinator.analysis.edits import Transition, classify
 from evopolicy_coordinator.analysis.records import Run, Submit, checkpoint_folder
@@ -145,19 +146,9 @@ def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
 
 
 def _image_files(folder: Path, limit: int, skip: str | None = None) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    out: list[Path] = []
-    for root, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if name != skip and not name.startswith("."))
-        for name in sorted(names):
-            path = Path(root, name)
-            if (
-                path.suffix.lower() in IMAGE_SUFFIXES
-                and not path.is_symlink()
-                and path.stat().st_size <= MAX_IMAGE_BYTES
-            ):
-                out.append(path)
-                if len(out) >= limit:
-                    return out
-    return out
+    found = (
+        path
+        for path, size in left_files(folder, enter=lambda name: name != skip and not name.startswith("."))
+        if path.suffix.lower() in IMAGE_SUFFIXES and size <= MAX_IMAGE_BYTES
+    )
+    return list(itertools.islice(found, limit))

@@ -1,0 +1,62 @@
+"""What an agent leaves in its workspace does not keep its run from being scored, nor lead anybody astray who reads it."""
+
+from __future__ import annotations
+
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cheated import PATIENCE_S, Cheated
+
+from evopolicy_common.run_difference import differences
+from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.scratch import remove_tree
+
+AGENT = Path(__file__).parent / "parting_agent.py"
+
+
+@pytest.mark.parametrize("how", ["as it is", "pipe", "socket", "link", "deep"])
+def test_traps_that_an_agent_leaves_catch_nobody(
+    cheated: Cheated, tmp_path: Path, how: str, request: pytest.FixtureRequest
+) -> None:
+    outside = cheated.root / f"outside {how}"
+    outside.mkdir()
+    (outside / "plot.png").write_bytes(b"not the agent's")
+    words = f"command:{sys.executable} {AGENT} '{how}' '{outside}'"
+    # The link is of use to an agent that does not see where it leads, too.
+    code, said, folder = cheated.play(words, f"parting {how}".replace(" ", "-"))
+    request.addfinalizer(lambda: remove_tree(folder / "workspace"))
+    assert code == 0, said
+    outcome = decode_run_record((folder / "run.json").read_bytes()).outcome
+    assert (outcome.status, outcome.budget_used) == ("completed", 1)
+    assert not (folder / ".gateway").exists()
+    assert [path.name for path in outside.iterdir()] == ["plot.png"]
+    workspace = folder / "workspace"
+    assert stat.S_IMODE(workspace.stat().st_mode) & 0o700 == 0o700
+    submitted = {
+        path.name: path.read_bytes() for path in (folder / "checkpoints/submit_000/system").iterdir()
+    }
+    assert {path.name: path.read_bytes() for path in (workspace / "system").iterdir()} == submitted
+    assert set(submitted) == {"policy.py", ".bashrc"}
+    if how == "as it is":  # the rest of the workspace is the same in all of them
+        check_readers(folder, tmp_path / "report")
+
+
+def check_readers(folder: Path, report: Path) -> None:
+    """Who reports the run, or compares it, comes to an end and shows nothing of this machine."""
+    done = subprocess.run(
+        [sys.executable, "-m", "evopolicy_gateway.cli", "report", str(folder), "--out", str(report)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    page = "".join(path.read_text() for path in report.rglob("*.html"))
+    assert page
+    assert "root:x:0" not in page
+    (told,) = differences(folder, folder)
+    assert told.startswith("workspace/huge.png: ")
+    assert told.endswith("too many to compare")
