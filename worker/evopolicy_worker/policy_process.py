@@ -33,6 +33,8 @@ _DENIED = frozenset(
 _GRACE_S = 1.0
 _SEAL_S = 60.0
 """For what is our own work before the bundle is imported."""
+_SHIM_BROKEN = 70
+"""The status with which `inside/zygote.py` ends a process that it should never come back from."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
 """Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
 _MAX_MESSAGE = 2000
@@ -321,7 +323,13 @@ class PolicyProcess:
                 "file_limit",
                 limits.file_bytes,
                 limits.file_bytes,
-                f"files: {limits.file_bytes:,} bytes written are the limit, {limits.files:,} files",
+                f"files: {limits.file_bytes:,} bytes written are the limit",
+            ),
+            "inodes": (
+                "file_limit",
+                limits.files,
+                limits.files,
+                f"files: {limits.files:,} files and folders are the limit",
             ),
             "descriptors": (
                 "file_limit",
@@ -379,7 +387,10 @@ class PolicyProcess:
         if os.WIFSIGNALED(exit_.status) and used > self._limits.cpu_s:
             text = f"the policy used more than {self._limits.cpu_s:g} s of CPU time"
             return self._failed(self._fatal("cpu_limit"), text, limit=self._limits.cpu_s, used=used)
-        return self._failed(self._fatal("killed"), f"the policy's process {exit_.describe()}")
+        text = f"the policy's process {exit_.describe()}"
+        if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
+            text += ", as it does when the code in it that answers for the policy was broken"
+        return self._failed(self._fatal("killed"), text)
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:
         """Before there is a Policy, whatever ends the process means that the bundle yields none."""

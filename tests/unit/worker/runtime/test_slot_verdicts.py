@@ -184,7 +184,10 @@ def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
     few = limits(open_files=40, files=20, action_bytes=512)
     sources = {
         policy(act="self.f = [open('/dev/null') for _ in range(60)]"): ("file_limit", "40 open descriptors"),
-        policy(act="[open(f'f{k}', 'w') for k in range(60)]"): ("file_limit", "20 files"),
+        policy(act="[open(f'f{k}', 'w') for k in range(60)]"): (
+            "file_limit",
+            "20 files and folders are the limit",
+        ),
         policy(act="return [0.0] * 99"): ("act_error", "more than 528 bytes"),
     }
     for source, (category, words) in sources.items():
@@ -193,6 +196,17 @@ def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
         assert failure is not None
         assert failure.category == category
         assert words in failure.message
+
+
+def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slots) -> None:
+    failure = slots.play(policy(act="os.dup2(3, 4)")).failure
+    assert failure is not None
+    assert "answers for the policy was broken" in failure.message
+
+
+def test_a_limit_beyond_the_machines_own_is_the_machines(slots: Slots) -> None:
+    vast = limits(open_files=1 << 40, processes=1 << 40, files=1 << 20, memory_bytes=1 << 60)
+    assert slots.play(HONEST, limits=vast).failure is None
 
 
 def test_a_forged_action_beyond_the_limit_ends_the_policy(slots: Slots) -> None:

@@ -353,6 +353,8 @@ def kind_of(error: BaseException | None) -> str | None:
         if isinstance(error, MemoryError):
             return "memory"
         if isinstance(error, OSError):
+            if error.errno == errno.ENOSPC and os.statvfs(os.environ["HOME"]).f_ffree == 0:
+                return "inodes"
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
                 return "files"
             if error.errno in (errno.EMFILE, errno.ENFILE):

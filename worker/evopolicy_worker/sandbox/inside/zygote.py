@@ -267,7 +267,12 @@ def seal(config: dict[str, Any], init: dict[str, Any]) -> None:
     """From here on this process can do less than any other; nothing of it can be undone."""
     if config["limits"]:
         for name, value in init["limits"].items():
-            resource.setrlimit(getattr(resource, name), (value, value))
+            kind = getattr(resource, name)
+            _, most = resource.getrlimit(kind)
+            if most != resource.RLIM_INFINITY:
+                # What this machine allows to nobody is not asked for.
+                value = min(value, most)
+            resource.setrlimit(kind, (value, value))
     if config["seals"]:
         drop_capabilities()
         check(libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
