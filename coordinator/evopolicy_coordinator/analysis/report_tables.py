@@ -182,6 +182,7 @@ def _normalised(suite: Suite) -> Table:
     cells = suite.normalised.cells
     groups = {(group.entry, group.demand): group for group in suite.normalised.groups}
     rows: list[dict[str, Any]] = []
+    bold: dict[tuple[int, str], int] = {}
     for demand in (*DEMANDS, None):
         envs = [env for env in suite.table.environments if demand_of(env) == demand]
         for env in envs:
@@ -189,18 +190,21 @@ def _normalised(suite: Suite) -> Table:
             rows.append({"demand": demand or "neither", "env": title_of(env), **values})
         if envs and demand is not None:
             means = {a: groups[a, demand].value for a in agents}
+            bold |= {(len(rows), a): 1 for a in agents}
             rows.append({"demand": demand, "env": f"{demand.capitalize()} mean", **means})
     return Table(
         name=f"normalised_{suite.name}",
         title=f"{suite_title(suite.name)} normalised performance",
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
-        "on the same cases, 1 the best agent on that environment. A dash: no agent beats random, no reference, or no score.",
+        "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
+        "reference, or no score.",
         columns=(
             ENV,
             _DEMAND,
             *(Column(key=agent, title=agent, kind="number", digits=2) for agent in agents),
         ),
         rows=tuple(rows),
+        marks=bold,
     )
 
 

@@ -166,7 +166,6 @@ def _environments(study: Study) -> Table:
             ENV,
             Column(key="family", title="Family"),
             Column(key="id", title="Suite id"),
-            Column(key="version", title="Version"),
             Column(key="demand", title="Demand"),
             Column(key="steps", title="Longest episode (steps)", kind="integer"),
             Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."),
@@ -174,6 +173,7 @@ def _environments(study: Study) -> Table:
             Column(key="validation", title="Validation cases", kind="integer"),
             Column(key="heldout", title="Held-out cases", kind="integer"),
             Column(key="scope", title="Policy scope", note="How long one policy object lives."),
+            Column(key="version", title="Version"),
         ),
         rows=tuple(rows),
     )

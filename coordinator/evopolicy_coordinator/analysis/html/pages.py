@@ -21,6 +21,8 @@ from evopolicy_coordinator.analysis.trace import Trace, TraceRow, diff, sources
 
 _FILTER_FROM = 9
 """Rows from which a table has a filter."""
+_LONG = 60
+"""Characters from which a cell of text is broken into lines."""
 FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
 """Written forms of a table, and their suffixes."""
 
@@ -209,7 +211,7 @@ def _table_view(table: Table) -> dict[str, Any]:
         "folded": False,
         "columns": [
             {
-                "title": column.title.replace(" /", "\u00a0/"),
+                "title": column.title.replace(" /", "\u00a0/").replace("-", "\u2011"),
                 "numeric": column.kind != "text",
                 "note": column.note,
             }
@@ -228,6 +230,8 @@ def _cell(table: Table, number: int, column: Column, value: Any) -> dict[str, An
     classes = (["n"] if numeric else []) + [["first", "second"][mark - 1]] * bool(mark)
     if value is None and not numeric:
         classes.append("none")
+    if not numeric and len(str(value)) > _LONG:
+        classes.append("long")
     return {
         "text": shown(value, column),
         "value": ("" if value is None else value) if numeric else None,

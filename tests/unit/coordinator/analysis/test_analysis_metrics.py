@@ -158,6 +158,9 @@ def test_audit_signals_of_a_run_are_as_counted_by_hand(tmp_path: Path) -> None:
     assert signals.complexity_growth is not None
     assert signals.complexity_growth > 1.0
     assert signals.rollout_s == 16.0 * 9
+    assert (signals.agent_s, signals.queue_s, signals.feedback_s) == (60.0 * 9, 1.5 * 9, 2.5 * 9)
+    assert (signals.finalise_s, signals.turns, signals.retries) == (90.0, 9, 0)
+    assert (signals.budget, signals.failed_episodes) == (128, 0)
 
 
 def test_tokens_are_in_millions_and_missing_ones_are_none(tmp_path: Path) -> None:
@@ -171,6 +174,14 @@ def test_tokens_are_in_millions_and_missing_ones_are_none(tmp_path: Path) -> Non
     told, silent = token_use(load_runs([tmp_path]).runs)
     assert (told.input_noncached, told.cache, told.output, told.cost) == (2.0, 1.5, 0.2, None)
     assert (told.n_runs, silent.n_runs, silent.output) == (2, 0, None)
+
+
+def test_cost_is_the_mean_of_runs_that_all_have_a_price(tmp_path: Path) -> None:
+    for repeat, cost in enumerate((2.0, 5.0)):
+        tokens = Tokens(input_noncached=0, cache_read=0, cache_creation=0, output=1, cost=cost)
+        write_run(tmp_path, VERSIONS[:1], tokens=tokens, repeat=repeat)
+    (told,) = token_use(load_runs([tmp_path]).runs)
+    assert told.cost == 3.5
 
 
 def test_random_reference_of_one_split_counts_once(tmp_path: Path) -> None:

@@ -124,6 +124,9 @@ def test_repeats_give_mean_and_intervals_that_hold_it() -> None:
 def test_interval_needs_two_runs_with_scores() -> None:
     assert bootstrap_mean((1.0,)) is None
     assert bootstrap_mean((1.0, None)) is None
+    even = bootstrap_mean((0.0, 1.0))  # a quarter of the resamples is 0 twice, a quarter 1 twice
+    assert even is not None
+    assert (even.low, even.high) == (0.0, 1.0)
     same = bootstrap_mean((2.0, 2.0, 2.0))
     assert same is not None
     assert (same.low, same.high) == (2.0, 2.0)
