@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,8 +26,8 @@ class BundleAttack(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
     words: str
     """In the verdict's message."""
-    copied: bool = False
-    """Whether a plain copy of the folder holds the secret."""
+    harm: Callable[[Path], bool] | None = None
+    """Whether somebody who copies and reads such a folder without looking is harmed; None where to see it is not safe."""
 
 
 def _link(system: Path, secret: Path) -> None:
@@ -72,49 +73,82 @@ def _huge(system: Path, secret: Path) -> None:
         file.truncate(1 << 40)
 
 
+def _copied(system: Path) -> Path:
+    return Path(shutil.copytree(system, system.with_name("copy")))
+
+
+def _tells_the_secret(system: Path) -> bool:
+    return any(SECRET in path.read_bytes() for path in _copied(system).rglob("*") if path.is_file())
+
+
+def _copies_thousands(system: Path) -> bool:
+    return len(list(_copied(system).iterdir())) > bundles.MAX_FILES
+
+
+def _copies_every_depth(system: Path) -> bool:
+    return max(len(path.parts) for path in _copied(system).rglob("*")) > len(system.parts) + bundles.MAX_DEPTH
+
+
+def _waits_for_ever(system: Path) -> bool:
+    try:
+        subprocess.run(["cat", system / "data"], timeout=0.5, check=False)
+    except subprocess.TimeoutExpired:
+        return True
+    return False
+
+
 BUNDLES = (
     BundleAttack(
         name="a bundle with a symbolic link to a file outside",
         spoil=_link,
         verdict="import_error",
         words="data is a symbolic link",
-        copied=True,
+        harm=_tells_the_secret,
     ),
     BundleAttack(
         name="a bundle with a symbolic link to a folder outside",
         spoil=_folder_link,
         verdict="import_error",
         words="data is a symbolic link",
-        copied=True,
+        harm=_tells_the_secret,
     ),
     BundleAttack(
         name="a symbolic link in place of policy.py",
         spoil=_policy_link,
         verdict="missing_policy",
         words="symbolic link",
-        copied=True,
+        harm=_tells_the_secret,
     ),
     BundleAttack(
         name="a bundle with a hard link to a file outside",
         spoil=_hard_link,
         verdict="import_error",
         words="data",
-        copied=True,
+        harm=_tells_the_secret,
     ),
     BundleAttack(
         name="a bundle with a named pipe, which nobody writes to",
         spoil=_pipe,
         verdict="import_error",
         words="named pipe",
+        harm=_waits_for_ever,
     ),
     BundleAttack(
         name="a bundle with a device file", spoil=_device, verdict="import_error", words="data is a"
     ),
     BundleAttack(
-        name="a bundle of thousands of files", spoil=_thousands, verdict="import_error", words="2000"
+        name="a bundle of thousands of files",
+        spoil=_thousands,
+        verdict="import_error",
+        words="2000",
+        harm=_copies_thousands,
     ),
     BundleAttack(
-        name="a bundle of folders nested 40 deep", spoil=_deep, verdict="import_error", words="deep"
+        name="a bundle of folders nested 40 deep",
+        spoil=_deep,
+        verdict="import_error",
+        words="deep",
+        harm=_copies_every_depth,
     ),
     BundleAttack(
         name="a bundle with a file of a terabyte of nothing",
@@ -124,12 +158,6 @@ BUNDLES = (
     ),
 )
 PATHS = ("../evil", "a/../../evil", "/tmp/evopolicy-evil", "..")
-
-
-def plain_copy_reads(system: Path, secret: Path, target: Path) -> bool:
-    """Whether the secret is in a copy that is made of the folder without looking."""
-    shutil.copytree(system, target)
-    return any(SECRET in path.read_bytes() for path in target.rglob("*") if path.is_file())
 
 
 def packed(path: str) -> bundles.Bundle:

@@ -135,8 +135,7 @@ def document() -> str:
         rows.append((breaker.name, verdict, ", ".join(ways) or "-"))
     rows += [(what, "nothing is found", "with tier `none`") for what in PAIRS]
     rows += [
-        (bundle.name, f"`{bundle.verdict}`", "by a plain copy" if bundle.copied else "-")
-        for bundle in BUNDLES
+        (bundle.name, f"`{bundle.verdict}`", "by a plain copy" if bundle.harm else "-") for bundle in BUNDLES
     ]
     rows.append(
         ("a packed bundle with `..` or a root in a path", "the worker refuses it", "by a plain write")
