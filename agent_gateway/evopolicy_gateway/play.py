@@ -135,12 +135,11 @@ class RunPlay:
         watch: Watch,
         *,
         name: str | None = None,
-        key: str | None = None,
         stays_open: bool = False,
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
-        `name`: how the watch knows the run, its environment otherwise. `key`: the same key opens the same run again.
+        `name`: how the watch knows the run, its environment otherwise.
         `stays_open`: when this is cancelled the run is left as it is, to be resumed.
         """
         self._plan = plan
@@ -149,7 +148,6 @@ class RunPlay:
         self._credentials = gateway
         self._watch = watch
         self._name = name or plan.settings.env
-        self._key = key or uuid.uuid4().hex
         self._stays_open = stays_open
         self.run = ""
         """The cluster's id of the run, once it is open."""
@@ -172,11 +170,12 @@ class RunPlay:
         plan = self._plan
         plan.claim()
         self._folder.state.mkdir(mode=0o700)
-        save(self._folder.intended, IntendedRun(key=self._key, settings=plan.settings))
+        key = uuid.uuid4().hex
+        save(self._folder.intended, IntendedRun(key=key, settings=plan.settings))
         if plan.door is not None:
             save(self._folder.door, plan.door)
         try:
-            run = await self._open(self._key)
+            run = await self._open(key)
         except BaseException:
             shutil.rmtree(self._folder.root)
             raise

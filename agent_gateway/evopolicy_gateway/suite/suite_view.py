@@ -22,6 +22,8 @@ from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 from evopolicy_gateway.watch import PHASES, first_line, harmless
 
 _SHOWN_ROWS = 24
+_WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 27}
+_LEAST_NAME, _LEAST_ACTION, _GAP = 20, 11, 2
 _STYLES = ("bold", "red", "dim", "dim", "")
 """Of rows by `_order`: running, failed, with another host, waiting, ended."""
 
@@ -205,12 +207,17 @@ class TableView(LinesView):
 
     def render(self) -> Group:
         """The table as it is now."""
-        table = Table(box=None, pad_edge=False)
-        for title in ("run", "budget", "submits", "best mean", "tokens", "state", "last action"):
-            table.add_column(title, no_wrap=True, overflow="ellipsis", justify="left")
+        table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         # Of those that ended, the last come first.
         newest = sorted(self.rows, key=lambda name: _ended(self.rows[name]), reverse=True)
         names = sorted(newest, key=lambda name: _order(self.rows[name]))
+        # Names and actions share what the other columns leave.
+        room = self._console.width - sum(_WIDTHS.values()) - _GAP * (len(_WIDTHS) + 1)
+        longest = max((len(name) for name in names[:_SHOWN_ROWS]), default=0)
+        for_names = max(_LEAST_NAME, min(longest, room - _LEAST_ACTION))
+        columns = {"run": for_names, **_WIDTHS, "last action": max(_LEAST_ACTION, room - for_names)}
+        for title, width in columns.items():
+            table.add_column(title, no_wrap=True, overflow="ellipsis", justify="left", width=width)
         for name in names[:_SHOWN_ROWS]:
             style = _STYLES[_order(self.rows[name])]
             table.add_row(*(Text(cell, style) for cell in (name, *_cells(self.rows[name]))))

@@ -73,7 +73,7 @@ class Sweep:
         self._paused_until: dict[str, float] = {}
         self._ending: set[str] = set()
         """Runs that have been cancelled and are not done with it."""
-        self._saved = 0.0
+        self._unsaved = False
         view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
@@ -111,6 +111,8 @@ class Sweep:
             for task in self._active.values():
                 task.cancel()
             await asyncio.gather(renewing, *self._active.values(), return_exceptions=True)
+            with contextlib.suppress(EvopolicyError):
+                self._save()
 
     def _startable(self, todo: list[Decision], by_name: dict[str, Decision]) -> list[Decision]:
         """Runs that the limits let begin now."""
@@ -236,7 +238,6 @@ class Sweep:
             self._gateway,
             self._view,
             name=run.name,
-            key=f"{self._suite.name}/{run.digest}/{self._holder}/{run.name}/{decision.attempt}"[:200],
             stays_open=True,
         )
         self._plays[run.name] = play
@@ -248,6 +249,10 @@ class Sweep:
         told: dict[str, tuple[str, float]] = {}
         while True:
             await asyncio.sleep(min(_LOOK_S, every_s))
+            if self._unsaved:
+                # Claims are renewed whatever the disk says.
+                with contextlib.suppress(EvopolicyError):
+                    self._save()
             for name, task in list(self._active.items()):
                 run = by_name[name].run
                 known, at = told.get(name, ("", 0.0))
@@ -311,9 +316,9 @@ class Sweep:
     def _on_doing(self, name: str, doing: AgentDoing) -> None:
         entry = self._index.runs.get(name)
         if entry is not None and doing.tokens is not None:
+            # Written with the next look: a stream may tell it many times a second.
             self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
-            if time.monotonic() - self._saved >= _LOOK_S:
-                self._save()
+            self._unsaved = True
         if doing.provider:
             self._paused_until[doing.provider] = time.monotonic() + doing.paused_s
 
@@ -332,7 +337,7 @@ class Sweep:
 
     def _save(self) -> None:
         suite_index.save(self._root, self._index)
-        self._saved = time.monotonic()
+        self._unsaved = False
 
 
 def _anew(decision: Decision) -> Decision:

@@ -83,7 +83,6 @@ class Stage:
                 watch: object,
                 *,
                 name: str,
-                key: str,
                 stays_open: bool,
             ) -> None:
                 self.plan, self.name, self.run, self.agent_at_work = plan, name, f"run of {name}", True
