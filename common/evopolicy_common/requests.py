@@ -29,10 +29,12 @@ Wanted = TypeVar("Wanted")
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 FIRST_PAUSE_S = 0.05
-LONGEST_PAUSE_S = 2.0
+LONGEST_PAUSE_S = 0.5
+"""So that whoever waits goes on within a second of the coordinator's return."""
 ANSWER_S = 5.0
 """How long one request may go unanswered before it is sent again, beyond the time that a long poll asks for."""
 WARN_AFTER_S = 5.0
+"""A request that has waited so long is logged, and again each time that it has waited twice as long."""
 
 
 class Requester(Generic[Reply]):
@@ -62,13 +64,9 @@ class Requester(Generic[Reply]):
         *,
         wait_s: float = 0.0,
         patience_s: float | None = None,
-        on_wait: Callable[[str], None] | None = None,
     ) -> Wanted:
-        """`once`, sent again until answered; TransportError when `patience_s` seconds went by without (None: never).
-
-        `on_wait` is told why, in words, when it takes longer than a few seconds.
-        """
-        pause = FIRST_PAUSE_S
+        """`once`, sent again until answered; TransportError when `patience_s` seconds went by without (None: never)."""
+        pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
         started = time.monotonic()
         while True:
             try:
@@ -77,12 +75,11 @@ class Requester(Generic[Reply]):
                 waited = time.monotonic() - started
                 if patience_s is not None and waited > patience_s:
                     raise
-                if waited > WARN_AFTER_S:
+                if waited > warn_after_s:
+                    warn_after_s = 2.0 * waited
                     log.warning(
                         "still waiting for the coordinator", verb=verb, waited_s=round(waited), why=str(error)
                     )
-                    if on_wait is not None:
-                        on_wait(str(error))
             await asyncio.sleep(pause * random.uniform(0.5, 1.5))
             pause = min(LONGEST_PAUSE_S, pause * 2)
 

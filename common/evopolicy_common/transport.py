@@ -395,6 +395,8 @@ _COMMON: dict[str, Any] = {
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     "adminspace": {"enabled": False},
+    # A router that went is looked for by Zenoh itself: so often that whoever it served is back within a second.
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
 }
 
 

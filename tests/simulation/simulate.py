@@ -30,7 +30,7 @@ def play(seed: int, size: Size = SMALL, *, trace: bool = False) -> Simulation:
 
 def replay_command(seed: int, *, nightly: bool = False) -> str:
     """What to type to see a seed again."""
-    return f"make sim ARGS=\"--seed {seed} --trace{' --nightly' if nightly else ''}\""
+    return f'make sim ARGS="--seed {seed} --trace{" --nightly" if nightly else ""}"'
 
 
 def main() -> int:

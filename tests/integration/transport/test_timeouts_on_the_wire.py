@@ -11,6 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import structlog
+from structlog.testing import capture_logs
 
 from evopolicy_common import codec, keys, requests, transport
 from evopolicy_common.credentials import Credentials, Role
@@ -70,13 +72,15 @@ def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
 ) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
     monkeypatch.setattr(requests, "WARN_AFTER_S", 0.0)
-    told: list[str] = []
 
     async def scenario(link: Link) -> None:
         with pytest.raises(TransportError):
-            await asking(link).until_answered("wait", QUESTION, Done, patience_s=0.5, on_wait=told.append)
+            await asking(link).until_answered("wait", QUESTION, Done, patience_s=0.5)
 
-    run(tmp_path, "operator", scenario)
+    with capture_logs() as logs:
+        monkeypatch.setattr(requests, "log", structlog.get_logger())
+        run(tmp_path, "operator", scenario)
+    told = [entry["why"] for entry in logs if entry["event"] == "still waiting for the coordinator"]
     assert told
     assert all("no answer" in text for text in told)
 
