@@ -121,7 +121,7 @@ PROBES = (
 
 
 def document() -> str:
-    """The corpus as markdown: what docs/hostile-policies.md holds."""
+    """What docs/hostile-policies.md holds: the corpus as a table, and the words around it from `document.md`."""
     rows = []
     for probe in PROBES:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
@@ -141,7 +141,8 @@ def document() -> str:
         ("a packed bundle with `..` or a root in a path", "the worker refuses it", "by a plain write")
     )
     lines = [f"| {what} | {verdict} | {off} |" for what, verdict, off in rows]
-    return "\n".join([HEAD, *lines, TAIL])
+    table = "\n".join(["| attack | verdict | succeeds |", "|---|---|---|", *lines])
+    return Path(__file__).with_name("document.md").read_text().replace("{table}", table)
 
 
 PAIRS = (
@@ -149,35 +150,7 @@ PAIRS = (
     "Two policies in parallel slots talk by files, shared memory, sockets, locks, a page of a shared file or a device's times",
     "Searches all objects, frames and generators for the case's seed",
 )
-HEAD = """# Hostile policies
 
-What the tests in `tests/conformance/hostile/` do to a slot of tier `bwrap`, and what comes of it. After each of them the
-slot plays an honest episode. The last column says how the attack was seen to succeed with its defence off: in a sandbox of
-tier `none`, in one whose process is not sealed, under a higher limit, or with the policy in the environment's own process,
-without a sandbox, pipes or checks. Made by `python tests/conformance/hostile/corpus.py`.
-
-| attack | verdict | succeeds |
-|---|---|---|"""
-TAIL = """
-A limit's verdict names the limit, its value and what was used (`limit`, `used`). All limits are in `/info`.
-
-## The weaker tier
-
-`landlock` needs no namespaces. The same probes find open, in it, only what namespaces hide: the ids of other processes of
-the machine, its network interfaces' names, and whether a path that is known exists, with its size: two policies at a time
-could talk by that. Nothing of other files can be read or changed. Calls that set modes and times of files do nothing. What a
-policy may write is limited file by file, not in sum.
-
-## What is not stopped
-
-- **The clock.** A policy can read the time of day, so one whose agent told it when the run ends can tell hidden episodes
-  from train ones. It can tell nobody, and whatever it then does differently is what is scored; such a policy does not repeat
-  itself, which `evopolicy verify` shows.
-- **Computing beside its turn.** A policy's threads go on while the environment steps. That CPU time counts.
-- **Contention.** Policies of one machine share its caches and memory bus, and what of the interpreter's files is in memory;
-  who measures how long things take may learn that others are at work. Nothing of the sort reaches an agent from a hidden
-  episode.
-"""
 
 if __name__ == "__main__":
     print(document(), end="")
