@@ -6,6 +6,7 @@ python examples/smoke-report/capture_view.py VIEW.svg SUITE.toml [options of `ev
 from __future__ import annotations
 
 import io
+import os
 import re
 import sys
 import time
@@ -17,7 +18,7 @@ from rich.console import Console, Group
 from evopolicy_gateway.suite import suite_cli, suite_view
 
 EVERY_S = 5.0
-WIDTH = 118
+WIDTH = 140
 FETCHED_FONT = re.compile(r"\s*@font-face \{.*?\}", re.DOTALL)
 """A picture needs no network: its text is drawn in the reader's own monospaced font, letters spread as they were."""
 
@@ -25,6 +26,8 @@ FETCHED_FONT = re.compile(r"\s*@font-face \{.*?\}", re.DOTALL)
 def main() -> None:
     """Plays the suite; the picture shows at most the last moment at which runs went on."""
     picture, arguments = Path(sys.argv[1]), sys.argv[2:]
+    # The view fits itself to its terminal, and is there without one too.
+    os.environ |= {"COLUMNS": str(WIDTH), "FORCE_COLOR": "1"}
     render = suite_view.TableView.render
     written = [0.0]
 

@@ -22,7 +22,7 @@ from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 from evopolicy_gateway.watch import PHASES, first_line, harmless
 
 _SHOWN_ROWS = 24
-_WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 27}
+_WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30}
 _LEAST_NAME, _LEAST_ACTION, _GAP = 20, 11, 2
 _STYLES = ("bold", "red", "dim", "dim", "")
 """Of rows by `_order`: running, failed, with another host, waiting, ended."""
