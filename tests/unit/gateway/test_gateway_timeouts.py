@@ -71,7 +71,9 @@ time.sleep(1000)
         ending, _, turns = test_harnesses.play(tmp_path, code)
         assert (ending.reason, turns) == ("agent_stopped", [(1, "")])
     finally:
-        os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+        # Closing the pipes to it kills it: by now it may be gone.
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
 
 
 def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
