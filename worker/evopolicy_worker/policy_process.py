@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import signal
 import sys
 import threading
 import time
@@ -341,7 +342,8 @@ class PolicyProcess:
                 "process_limit",
                 limits.processes,
                 limits.processes,
-                f"processes: {limits.processes} threads are the limit, and no process may be started",
+                f"processes: {limits.processes} threads are the limit, whose stacks count as memory, and no process may"
+                " be started",
             ),
         }
         message = report.message
@@ -390,6 +392,8 @@ class PolicyProcess:
         text = f"the policy's process {exit_.describe()}"
         if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
             text += ", as it does when the code in it that answers for the policy was broken"
+        if os.WIFSIGNALED(exit_.status) and os.WTERMSIG(exit_.status) == signal.SIGBUS:
+            text += f", as for writing to a mapped file when its files have {self._limits.file_bytes:,} bytes, the limit"
         return self._failed(self._fatal("killed"), text)
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:

@@ -88,7 +88,7 @@ def played_on_with_random_actions(outcome: EpisodeOutcome, step: int) -> bool:
             3,
             "8 threads",
         ),
-        (policy(act="os.fork()"), "process_limit", 3, "no process may be started"),
+        (policy(act="os.fork()"), "process_limit", 3, "may be started"),
         (policy(act="return [None] * 2000"), "act_error", 3, "2,001 values; 1,025 are the limit"),
         (policy(act="return np.zeros(5000)"), "act_error", 3, "40,000 bytes; 16,400 are the limit"),
         (policy(act="raise ValueError('\\ud800')"), "act_error", 3, "ValueError: \\ud800"),
@@ -202,6 +202,19 @@ def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slo
     failure = slots.play(policy(act="os.dup2(3, 4)")).failure
     assert failure is not None
     assert "answers for the policy was broken" in failure.message
+
+
+def test_a_full_file_system_is_told_whatever_way_it_was_filled(slots: Slots) -> None:
+    mapped = "import mmap; k = os.open('s', 66); os.truncate(k, 4 << 20); m = mmap.mmap(k, 4 << 20); "
+    filled = "open('t', 'wb').write(bytes(3 << 20)); m[:] = bytes(4 << 20)"
+    failure = slots.play(policy(act=mapped + filled)).failure
+    assert failure is not None
+    assert (failure.category, "SIGBUS" in failure.message) == ("killed", True)
+    assert "4,194,304 bytes, the limit" in failure.message
+    lost = "os.environ.clear(); os.chdir('/'); [open(f'/tmp/{k}', 'w').close() for k in range(60)]"
+    failure = slots.play(policy(act=lost), limits=limits(files=20)).failure
+    assert failure is not None
+    assert (failure.category, failure.limit) == ("file_limit", 20)
 
 
 def test_a_limit_beyond_the_machines_own_is_the_machines(slots: Slots) -> None:

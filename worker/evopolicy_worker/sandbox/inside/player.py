@@ -34,6 +34,8 @@ MAX_TEXT = 16_000
 libc = ctypes.CDLL(None, use_errno=True)
 action_bytes = 16 << 10
 """What one action may take, bytes; told with the policy."""
+home = ""
+"""The policy's own folder; told with it."""
 
 Reader = Callable[[Any, Any], Any]
 """From the buffer (and where the next text begins, or the payload's length) to the observation or a part of it."""
@@ -41,8 +43,8 @@ Reader = Callable[[Any, Any], Any]
 
 def play(init: dict[str, Any]) -> NoReturn:
     """Builds the Policy and answers for it until told to end."""
-    global action_bytes
-    action_bytes = init["action_bytes"]
+    global action_bytes, home
+    action_bytes, home = init["action_bytes"], init["home"]
     seed_generators(bytes.fromhex(init["seed"]))
     os.environ.pop("PWD", None)
     os.environ["HOME"] = init["home"]
@@ -353,7 +355,7 @@ def kind_of(error: BaseException | None) -> str | None:
         if isinstance(error, MemoryError):
             return "memory"
         if isinstance(error, OSError):
-            if error.errno == errno.ENOSPC and os.statvfs(os.environ["HOME"]).f_ffree == 0:
+            if error.errno == errno.ENOSPC and os.statvfs(home).f_ffree == 0:
                 return "inodes"
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
                 return "files"
