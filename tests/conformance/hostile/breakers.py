@@ -143,7 +143,7 @@ BREAKERS = (
     ),
     Breaker(
         name="folders nested deeper than Python recurses, which nobody may open",
-        act="[(os.mkdir('d'), os.chdir('d')) for _ in range(1500)]; os.chmod('/tmp', 0)",
+        act="[(os.mkdir('d'), os.chdir('d')) for _ in range(1500)]; os.chmod('..', 0)",
         verdict=None,
         harmless_anywhere=True,
     ),

@@ -131,6 +131,28 @@ def test_a_breaker_gets_its_verdict(slots: Slots, attack: Breaker) -> None:
     assert serves_honestly(slots)
 
 
+WEAKER: dict[str, set[str | None]] = {
+    # Its /tmp is the machine's, which it may not write to.
+    "disk filling": {"act_error"},
+    # What it writes is limited file by file.
+    "disk filling by many files": {None},
+    "thousands of files": {None},
+    # Threads are counted ten times a second, and only while it owes an answer.
+    "thread bomb": {None, "process_limit"},
+    # It is no process 1, which signals without a handler do not reach.
+    "a signal of an illegal instruction": {"killed"},
+}
+"""Where the weaker tier comes to another verdict."""
+
+
+@pytest.mark.parametrize("attack", BREAKERS, ids=lambda attack: attack.name)
+def test_a_breaker_does_no_harm_in_the_weaker_tier(slots: Slots, attack: Breaker) -> None:
+    outcome = slots.play(attack.source, limits=attack.limits, tier="landlock")
+    verdict = outcome.failure.category if outcome.failure else None
+    assert verdict in WEAKER.get(attack.name, {attack.verdict}), outcome.failure
+    assert serves_honestly(slots, "landlock")
+
+
 @pytest.mark.parametrize(
     "attack", [attack for attack in BREAKERS if attack.off], ids=lambda attack: attack.name
 )
