@@ -7,20 +7,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
 from coordinator_harness import Coordinator
+from waiting import PATIENCE_S, wait_until
 
 from evopolicy_common.run_record import RunRecord, decode_run_record
 
-T = TypeVar("T")
-
 MARK = "EVOTEST_MARK"
-PATIENCE_S = 150.0
 SMALL = ["--budget", "6", "--validation", "2", "--heldout", "2"]
 
 AGENT = """
@@ -50,15 +46,6 @@ def agent(folder: Path, code: str) -> str:
     path = folder / "agent.py"
     path.write_text(AGENT + code)
     return f"command:{sys.executable} {path}"
-
-
-def wait_until(what: Callable[[], T], told: Callable[[], str] = lambda: "it did not come true") -> T:
-    """The first value that counts as true; AssertionError with what is `told` when none comes."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := what()):
-        assert time.monotonic() < deadline, told()
-        time.sleep(0.05)
-    return value
 
 
 class Command:

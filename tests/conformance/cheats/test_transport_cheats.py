@@ -6,7 +6,6 @@ import asyncio
 import json
 import sys
 import threading
-import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -22,6 +21,7 @@ from coordinator_harness import (
     operator_of,
     working,
 )
+from waiting import wait_until
 
 from evopolicy_common import codec, keys
 from evopolicy_common.errors import RefusedError
@@ -30,13 +30,6 @@ from evopolicy_common.messages.worker import Refused
 from evopolicy_common.run_record import decode_run_record
 
 EAVESDROPPER = Path(__file__).parent / "eavesdropping_agent.py"
-
-
-def until(condition: Any) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 class Eavesdropped:
@@ -53,7 +46,7 @@ class Eavesdropped:
         thread = threading.Thread(target=eavesdrop)
         thread.start()
         try:
-            until(lambda: (workspace / "listening").exists() or played)
+            wait_until(lambda: (workspace / "listening").exists() or played)
             assert not played, played
             self.code, self.said, self.honest = cheated.play("evolve", "overheard")
             (workspace / "enough").touch()

@@ -11,13 +11,14 @@ import asyncio
 import json
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from coordinator_harness import Coordinator, OperatorClient, bundle_of, gateway_of, operator_of
 from typer.testing import CliRunner
+from waiting import eventually
 
 from evopolicy_common.messages import operator
 from evopolicy_common.run_record import decode_run_record
@@ -64,7 +65,7 @@ class Workers:
 
     async def ended(self, name: str) -> int:
         """The exit code, once there is one."""
-        await until(lambda: _now(self._processes[name].poll() is not None), f"{name} ends")
+        await eventually(lambda: self._processes[name].poll() is not None, f"{name} ends")
         return self._processes[name].wait()
 
     def stop(self) -> None:
@@ -89,20 +90,6 @@ def cluster(root: Path, *args: str) -> Iterator[tuple[Coordinator, Workers]]:
         coordinator.stop()
 
 
-async def _now(value: bool) -> bool:
-    return value
-
-
-async def until(condition: Callable[[], Awaitable[bool]], what: str) -> None:
-    """Waits for as long as a slow machine may take."""
-    try:
-        async with asyncio.timeout(PATIENCE_S):
-            while not await condition():
-                await asyncio.sleep(0.05)
-    except TimeoutError:
-        raise AssertionError(f"never: {what}") from None
-
-
 async def created(client: OperatorClient, name: str) -> operator.RunCreated:
     return await client.create(name, budget=EPISODES, n_validation=HIDDEN, n_heldout=HIDDEN)
 
@@ -113,7 +100,7 @@ async def registered(client: OperatorClient, *names: str) -> None:
     async def there() -> bool:
         return set(names) <= {one.worker for one in (await client.status()).workers}
 
-    await until(there, f"{names} register")
+    await eventually(there, f"{names} register")
 
 
 async def shown(coordinator: Coordinator) -> str:
@@ -137,7 +124,7 @@ def test_forger_among_three_workers_is_caught_named_and_gets_no_more_work(tmp_pa
                 async def caught() -> bool:
                     return bool((await client.status()).quarantined)
 
-                await until(caught, "a forger is named")
+                await eventually(caught, "a forger is named")
                 assert list((await client.status()).quarantined) == ["forger"]
                 assert "forger is quarantined: forged results" in await shown(coordinator)
                 assert await workers.ended("forger") != 0
@@ -227,7 +214,7 @@ def test_audits_go_on_after_the_coordinator_was_killed(tmp_path: Path) -> None:
             async def drawn() -> bool:
                 return (await client.status()).audits.get("open", 0) >= EPISODES
 
-            await until(drawn, "the episodes are drawn")
+            await eventually(drawn, "the episodes are drawn")
         return run
 
     async def after(coordinator: Coordinator, workers: Workers, run: operator.RunCreated) -> None:
@@ -301,7 +288,7 @@ def test_worker_of_old_code_gets_no_work_of_a_run_and_is_told_why(tmp_path: Path
                 await gateway.results(0)
                 workers.start("old", "old-code")
                 why = "evopolicy-worker cheats there, old here"
-                await until(lambda: _now(why in workers.said("old")), "it is told why")
+                await eventually(lambda: why in workers.said("old"), "it is told why")
                 await gateway.submit(bundle_of(CLOCK_POLICY), (0, 1, 2), "second")
                 await gateway.results(1)
                 workers_shown = {one.worker: one for one in (await client.status()).workers}

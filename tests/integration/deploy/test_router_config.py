@@ -11,8 +11,10 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
+from eavesdropper import eavesdropping
 from own_certs import CLUSTER, OwnCerts, free_port
 from typer.testing import CliRunner
+from waiting import eventually
 
 from evopolicy_common import credentials, keys, transport
 from evopolicy_common.credentials import Role
@@ -135,27 +137,16 @@ def test_a_machine_of_another_site_is_not_let_in(site: Site) -> None:
 
 def test_no_machine_answers_or_overhears_another_behind_the_same_router(site: Site) -> None:
     async def scenario() -> None:
-        overheard: list[str] = []
-
-        def overhear(query: zenoh.Query) -> None:
-            overheard.append(str(query.key_expr))
-            with query:
-                query.reply(query.key_expr, b"impostor")
-
-        async with site.up(), site.link("gateway") as honest:
-            found = credentials.find("gateway", (site.endpoint,), site.folders["gateway"])
-            impostor = await asyncio.to_thread(zenoh.open, transport.client_config(found))
-            held = [
-                impostor.declare_queryable("**", overhear, complete=True),
-                impostor.declare_queryable(keys.gateway_expr(CLUSTER), overhear, complete=True),
-                impostor.declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr))),
-            ]
+        found = credentials.find("gateway", (site.endpoint,), site.folders["gateway"])
+        async with (
+            site.up(),
+            site.link("gateway") as honest,
+            eavesdropping(found, keys.gateway_expr(CLUSTER)) as overheard,
+        ):
             assert await answered(honest, OWN_KEY["gateway"], attempts=300)
             for _ in range(20):
                 assert await answered(honest, OWN_KEY["gateway"])
             assert overheard == []
-            del held
-            await asyncio.to_thread(impostor.close)
 
     asyncio.run(scenario())
 
@@ -169,8 +160,8 @@ def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(site: 
                 assert await answered(pretender, OWN_KEY["gateway"], attempts=300)
                 pretender.declare_alive(false)
                 worker.declare_alive(true)
-                await until(lambda: alive == [(true, True)])
-            await until(lambda: alive == [(true, True), (true, False)])
+                await eventually(lambda: alive == [(true, True)])
+            await eventually(lambda: alive == [(true, True), (true, False)])
 
     asyncio.run(scenario())
 
@@ -204,7 +195,7 @@ def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site)
             assert not await answered(link, OWN_KEY["gateway"])
             key = keys.liveliness_key(CLUSTER, "elsewhere")
             link.declare_alive(key)
-            await until(lambda: alive == [(key, True)])
+            await eventually(lambda: alive == [(key, True)])
             async with site.link("worker") as other:
                 assert await answered(other, OWN_KEY["worker"], attempts=300)
 
@@ -272,12 +263,3 @@ def test_a_revoked_router_gets_no_file(site: Site) -> None:
     site.certs.revoke("router/site")
     with pytest.raises(ConfigError, match="not admitted"):
         write_router_config(site.certs.state, "site", site.folder, listen=(), connect=())
-
-
-async def until(condition: object, attempts: int = 1200) -> None:
-    assert callable(condition)
-    for _ in range(attempts):
-        if condition():
-            return
-        await asyncio.sleep(0.025)
-    raise AssertionError("did not happen")

@@ -8,7 +8,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from commands import SMALL, agent, command, record_in, run_dir, wait_until
+from commands import SMALL, agent, command, record_in, run_dir
+from waiting import wait_until
 
 from evopolicy_common import scratch
 from evopolicy_common.run_record import decode_checkpoint_metrics

@@ -11,7 +11,8 @@ import sys
 import urllib.request
 from pathlib import Path
 
-from commands import PATIENCE_S, agent, command, record_in, run_arguments, run_dir, run_on, wait_until
+from commands import agent, command, record_in, run_arguments, run_dir, run_on
+from waiting import PATIENCE_S, wait_until
 
 
 def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Command, command, toy_cluster, wait_until
+from commands import Command, command, toy_cluster
+from waiting import wait_until
 
 from evopolicy_common.run_record import decode_run_record
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from eavesdropper import eavesdropping
+from waiting import eventually
 
 from evopolicy_common import keys, transport
 from evopolicy_common.credentials import Credentials, Role
@@ -101,28 +103,16 @@ def test_a_session_without_password_is_not_let_in(tmp_path: Path) -> None:
 
 def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> None:
     async def scenario() -> None:
-        overheard: list[str] = []
-
-        def overhear(query: zenoh.Query) -> None:
-            overheard.append(str(query.key_expr))
-            with query:
-                query.reply(query.key_expr, b"impostor")
-
-        async with coordinator(tmp_path), transport.connect(credentials(tmp_path, "gateway")) as honest:
-            impostor = await asyncio.to_thread(
-                zenoh.open, transport.client_config(credentials(tmp_path, "gateway"))
-            )
-            held = [
-                impostor.declare_queryable(keys.gateway_expr(CLUSTER), overhear, complete=True),
-                impostor.declare_queryable("**", overhear, complete=True),
-                impostor.declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr))),
-            ]
+        own = credentials(tmp_path, "gateway")
+        async with (
+            coordinator(tmp_path),
+            transport.connect(own) as honest,
+            eavesdropping(own, keys.gateway_expr(CLUSTER)) as overheard,
+        ):
             await asyncio.sleep(0.3)
             for _ in range(20):
                 assert await answered(honest, OWN_KEY["gateway"])
             assert overheard == []
-            del held
-            await asyncio.to_thread(impostor.close)
 
     asyncio.run(scenario())
 
@@ -148,8 +138,8 @@ def test_only_a_worker_can_claim_to_be_alive(tmp_path: Path) -> None:
                 assert seen == []
             async with transport.connect(credentials(tmp_path, "worker")) as link:
                 link.declare_alive(key)
-                await wait_until(lambda: seen == [(key, True)])
-            await wait_until(lambda: seen == [(key, True), (key, False)])
+                await eventually(lambda: seen == [(key, True)])
+            await eventually(lambda: seen == [(key, True), (key, False)])
 
     asyncio.run(scenario())
 
@@ -162,7 +152,7 @@ def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: Path) 
                 assert await answered(link, OWN_KEY["worker"])
             assert not await answered(link, OWN_KEY["worker"])
             async with coordinator(tmp_path):
-                await wait_until(lambda: link.connected)
+                await eventually(lambda: link.connected)
                 for _ in range(100):
                     if await answered(link, OWN_KEY["worker"]):
                         return
@@ -170,12 +160,3 @@ def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: Path) 
                 raise AssertionError("not answered after the restart")
 
     asyncio.run(scenario())
-
-
-async def wait_until(condition: object, attempts: int = 400) -> None:
-    assert callable(condition)
-    for _ in range(attempts):
-        if condition():
-            return
-        await asyncio.sleep(0.025)
-    raise AssertionError("did not happen")

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import datetime as dt
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import msgspec
 import pytest
 import zenoh
 from own_certs import CLUSTER, DAYS, OwnCerts, now, of
+from waiting import eventually
 
 from evopolicy_common import keys, transport
 from evopolicy_common.credentials import Credentials, Role
@@ -61,14 +62,6 @@ async def gets_in(credentials: Credentials, patience_s: float = 0.5) -> bool:
 
 async def stops_being_answered(link: Link) -> bool:
     return not await answered(link, KEYS["worker"])
-
-
-async def until(condition: Callable[[], Awaitable[bool]], attempts: int = 200) -> None:
-    for _ in range(attempts):
-        if await condition():
-            return
-        await asyncio.sleep(0.05)
-    raise AssertionError("did not happen")
 
 
 @pytest.fixture(scope="module")
@@ -240,11 +233,11 @@ def test_a_machine_is_admitted_and_revoked_while_the_coordinator_listens(tmp_pat
         async with coordinator(certs) as asked, transport.connect(honest) as link:
             late = of(certs.issue("worker", "late"))
             async with transport.connect(late, timeout_s=30) as cheat:
-                await until(lambda: answered(cheat, KEYS["worker"]))
-                await until(lambda: answered(link, KEYS["worker"]))
+                await eventually(lambda: answered(cheat, KEYS["worker"]))
+                await eventually(lambda: answered(link, KEYS["worker"]))
                 certs.revoke("late")
-                await until(lambda: stops_being_answered(cheat))
-                await until(lambda: answered(link, KEYS["worker"]))
+                await eventually(lambda: stops_being_answered(cheat))
+                await eventually(lambda: answered(link, KEYS["worker"]))
                 asked.clear()
                 for _ in range(5):
                     assert not await answered(cheat, KEYS["worker"])
@@ -310,7 +303,7 @@ def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
                     async with transport.connect(brief, timeout_s=life_s) as ending:
                         while now() < made + dt.timedelta(days=DAYS):
                             if await answered(ending, KEYS["worker"]):
-                                await until(partial(stops_being_answered, ending), 4000)
+                                await eventually(partial(stops_being_answered, ending), patience_s=200.0)
                                 assert now() >= made + dt.timedelta(days=DAYS)
                                 assert await answered(link, KEYS["worker"])
                                 return

@@ -211,6 +211,22 @@ def test_a_restarted_coordinator_is_registered_with_again(tmp_path: Path) -> Non
         coordinator.stop()
 
 
+async def leaves_in_the_middle(
+    coordinator: Coordinator,
+    tmp_path: Path,
+    script: Callable[[ScriptedSlot, Job], Awaitable[None]],
+    reached: asyncio.Event,
+    **options: float,
+) -> None:
+    """A worker is drained once its slot has `reached` the middle of a run, and another plays that run to its end."""
+    async with supervising(coordinator, tmp_path, script, name="leaver", **options) as leaver:
+        run_task = asyncio.create_task(whole_run(coordinator))
+        await reached.wait()
+        leaver.drain()
+    async with supervising(coordinator, tmp_path, name="stayer"):
+        assert (await run_task)["status"] == "completed"
+
+
 def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordinator, tmp_path: Path) -> None:
     reached = asyncio.Event()
 
@@ -219,16 +235,7 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
         await slot.stopped.wait()
         raise SandboxError("cancelled")
 
-    async def scenario() -> None:
-        run_task = None
-        async with supervising(coordinator, tmp_path, stuck, name="leaver") as leaver:
-            run_task = asyncio.create_task(whole_run(coordinator))
-            await reached.wait()
-            leaver.drain()
-        async with supervising(coordinator, tmp_path, name="stayer"):
-            assert (await run_task)["status"] == "completed"
-
-    run(scenario)
+    run(lambda: leaves_in_the_middle(coordinator, tmp_path, stuck, reached))
 
 
 def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
@@ -241,15 +248,7 @@ def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
         reached.set()
         await asyncio.sleep(1000)
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, deaf, name="leaver", grace_s=0.2) as leaver:
-            run_task = asyncio.create_task(whole_run(coordinator))
-            await reached.wait()
-            leaver.drain()
-        async with supervising(coordinator, tmp_path, name="stayer"):
-            assert (await run_task)["status"] == "completed"
-
-    run(scenario)
+    run(lambda: leaves_in_the_middle(coordinator, tmp_path, deaf, reached, grace_s=0.2))
 
 
 def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
