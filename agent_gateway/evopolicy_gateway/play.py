@@ -12,7 +12,6 @@ import asyncio
 import contextlib
 import fcntl
 import os
-import shutil
 import sys
 import time
 import uuid
@@ -27,6 +26,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import children, control, record
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
@@ -116,7 +116,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         """Makes the run's folder, empty. ConfigError as `check`."""
         self.check()
         if self.folder.root.exists():
-            shutil.rmtree(self.folder.root)
+            remove_tree(self.folder.root)
         self.folder.root.mkdir(parents=True)
 
 
@@ -177,7 +177,7 @@ class RunPlay:
         try:
             run = await self._open(key)
         except BaseException:
-            shutil.rmtree(self._folder.root)
+            remove_tree(self._folder.root)
             raise
         return await self._to_the_end(run, agents_side=True)
 
@@ -194,7 +194,7 @@ class RunPlay:
         folder = self._folder
         if folder.run_json.exists():
             # Killed between the two, the command has left the gateway's folder.
-            shutil.rmtree(folder.state, ignore_errors=True)
+            remove_tree(folder.state)
             return decode_run_record(folder.run_json.read_bytes())
         intended = self._plan.intended()
         if intended is None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import shutil
 import socket
 import time
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.control import AgentDoing
 from evopolicy_gateway.harnesses import session
@@ -293,7 +293,7 @@ class Sweep:
         while target.exists():
             target = target.with_name(f"{target.name}+")
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(folder.state, ignore_errors=True)
+        remove_tree(folder.state)
         folder.root.rename(target)
 
     async def _forget(self, run: str) -> None:

@@ -42,6 +42,10 @@ def test_traps_that_an_agent_leaves_catch_nobody(
     assert set(submitted) == {"policy.py", ".bashrc"}
     if how == "as it is":  # the rest of the workspace is the same in all of them
         check_readers(folder, tmp_path / "report")
+    if how == "deep":
+        code, said, again = cheated.play("random", folder.name, "--overwrite")
+        assert (code, again) == (0, folder), said
+        assert not (workspace / "d").exists()
 
 
 def check_readers(folder: Path, report: Path) -> None:
