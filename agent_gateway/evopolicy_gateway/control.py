@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_gateway.jail.jail import JailOrder
 
 
@@ -146,7 +146,7 @@ def event_of(data: bytes) -> AnyEvent:
     """The event in a line; ProtocolError for anything else."""
     try:
         return _events.decode(data)
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise ProtocolError(f"not an event of a child process: {data[:200]!r} ({error})") from error
 
 
@@ -180,7 +180,7 @@ class Orders:
             for data in stdin:
                 try:
                     order = _orders.decode(data)
-                except msgspec.DecodeError:
+                except DECODE_ERRORS:
                     continue
                 loop.call_soon_threadsafe(self._queue.put_nowait, order)
         loop.call_soon_threadsafe(self._queue.put_nowait, None)

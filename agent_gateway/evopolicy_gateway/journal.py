@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.blobs import fsync_directory
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import DECODE_ERRORS, StorageError
 from evopolicy_common.messages.episode import PolicyFailure
 
 
@@ -119,7 +119,7 @@ class Journal:
         for number, line in enumerate(data[:whole].splitlines(), start=1):
             try:
                 self.entries.append(_decoder.decode(line))
-            except msgspec.DecodeError as error:
+            except DECODE_ERRORS as error:
                 raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error
         if whole != len(data):
             os.ftruncate(self._file.fileno(), whole)

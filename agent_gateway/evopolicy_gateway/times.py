@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import DECODE_ERRORS, StorageError
 from evopolicy_gateway.layout import save
 
 
@@ -93,5 +93,5 @@ class Stopwatch:
 def _load(path: Path) -> Times:
     try:
         return msgspec.json.decode(path.read_bytes(), type=Times)
-    except (OSError, msgspec.DecodeError):
+    except (OSError, *DECODE_ERRORS):
         return Times()

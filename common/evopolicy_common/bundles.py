@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import msgspec
 
 from evopolicy_common.blobs import digest_of
-from evopolicy_common.errors import BundleError
+from evopolicy_common.errors import DECODE_ERRORS, BundleError
 
 MAX_FILES = 2000
 MAX_ENTRIES = 5000
@@ -81,7 +81,7 @@ def load(packed: bytes, digest: str) -> Bundle:
         raise BundleError(f"bundle is not {digest}")
     try:
         files = _files_decoder.decode(packed)
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise BundleError(f"not a bundle: {error}") from error
     _check(files)
     return Bundle(digest, packed, files)

@@ -16,6 +16,7 @@ from typing import Self
 
 import msgspec
 
+from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.leash import leashed
 
 _LINE_LIMIT = 4 << 20
@@ -111,6 +112,6 @@ def _said(line: str) -> str:
     """A log line for people: of a JSON line what happened and why."""
     try:
         entry = msgspec.json.decode(line, type=_LogLine)
-    except msgspec.DecodeError:
+    except DECODE_ERRORS:
         return line.removeprefix("error: ")
     return f"{entry.event}: {entry.error}" if entry.error else entry.event

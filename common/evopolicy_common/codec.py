@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.gateway import GatewayReply, GatewayRequest
 from evopolicy_common.messages.operator import OperatorReply, OperatorRequest
 from evopolicy_common.messages.worker import Message, WorkerReply, WorkerRequest
@@ -44,7 +44,7 @@ def decode(decoder: msgspec.msgpack.Decoder[T], data: bytes) -> T:
     """The message in `data`; ProtocolError when it is none that `decoder` knows."""
     try:
         return decoder.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except DECODE_ERRORS as error:
         raise ProtocolError(
             f"{len(data)} bytes are not a message of wire version {WIRE_VERSION}: {error}"
         ) from error

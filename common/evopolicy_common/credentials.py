@@ -23,7 +23,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.blobs import digest_of, write_atomically
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 
 Role = Literal["worker", "gateway", "operator"]
 MachineRole = Literal["worker", "gateway", "operator", "router"]
@@ -79,7 +79,7 @@ def read(path: Path) -> Credentials:
     data = _read_private(path)
     try:
         found = msgspec.json.decode(data, type=Credentials)
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is not a credentials file: {error}") from error
     if found.tls is None:
         return found

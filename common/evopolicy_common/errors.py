@@ -6,6 +6,12 @@ the others are for operators and never cross the visibility boundary.
 
 from __future__ import annotations
 
+import msgspec
+
+DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+"""What msgspec raises for bytes that are not what was expected: malformed or of another shape, text that is not UTF-8
+inside, or nested without end."""
+
 
 class EvopolicyError(Exception):
     """Base of every error this project raises on purpose."""

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
@@ -267,7 +267,7 @@ def decode_run_record(data: bytes) -> RunRecord:
     """The record in `data`; ProtocolError when it is none that this version reads."""
     try:
         record = _runs.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except DECODE_ERRORS as error:
         raise ProtocolError(f"not a run record: {error}") from error
     _refuse_newer("run.json", record.schema_version)
     return record
@@ -282,7 +282,7 @@ def decode_checkpoint_metrics(data: bytes) -> CheckpointMetrics:
     """The metrics in `data`; ProtocolError when they are none that this version reads."""
     try:
         metrics = _metrics.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except DECODE_ERRORS as error:
         raise ProtocolError(f"not a checkpoint's metrics: {error}") from error
     _refuse_newer("metrics.json", metrics.schema_version)
     return metrics

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.gateway import SubmitStatus
 
 SCHEMA_VERSION = 1
@@ -71,7 +71,7 @@ def decode_summary(data: bytes) -> Summary:
     """The summary in `data`, unknown fields skipped; ProtocolError when it is none that this version reads."""
     try:
         summary = _decoder.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except DECODE_ERRORS as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
     if summary.schema_version > SCHEMA_VERSION:
         raise ProtocolError(

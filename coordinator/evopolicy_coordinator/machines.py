@@ -32,7 +32,7 @@ import structlog
 from evopolicy_common import credentials, keys
 from evopolicy_common.blobs import write_atomically
 from evopolicy_common.credentials import Credentials, MachineRole, Role, TlsFiles
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_coordinator import certs
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -309,7 +309,7 @@ def _read(path: Path) -> list[Machine]:
         return msgspec.json.decode(path.read_bytes(), type=list[Machine])
     except FileNotFoundError:
         return []
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is damaged: {error}; restore it from a backup") from error
 
 

@@ -27,7 +27,7 @@ import msgspec
 from evopolicy_common import credentials, keys
 from evopolicy_common.blobs import write_atomically
 from evopolicy_common.credentials import Credentials, Role
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET_PATH_LIMIT = 100
@@ -181,7 +181,7 @@ def _identity(root: Path, cluster: str | None) -> Identity:
             operator_token=secrets.token_urlsafe(32),
         )
         write_atomically(path, msgspec.json.encode(identity), mode=0o600)
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is damaged: {error}; restore it from a backup") from error
     if cluster is not None and identity.cluster != cluster:
         raise ConfigError(f"state folder {root} is of cluster {identity.cluster!r}, not {cluster!r}")

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core import records
@@ -302,7 +302,7 @@ def _guard(path: Path, work: Callable[[], T]) -> T:
         raise StorageError(f"{path} refuses a row that contradicts another: {error}") from error
     except sqlite3.DatabaseError as error:
         raise StorageError(f"{path} cannot be used: {error}; restore it from a backup") from error
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise StorageError(f"{path} holds a row that cannot be read: {error}") from error
 
 

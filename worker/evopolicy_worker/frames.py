@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_common.errors import WorkerError
+from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
 
 INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
@@ -199,7 +199,7 @@ def report(payload: bytes) -> Report:
     """The failure in a FAILED frame; BadReplyError when it is none."""
     try:
         return _report_decoder.decode(payload)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except DECODE_ERRORS as error:
         raise BadReplyError(f"its report of a failure cannot be read: {error}") from error
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_gateway.harnesses.usage import Prices
 
 
@@ -143,7 +143,7 @@ def read_agent(path: Path) -> AgentConfig:
         config = msgspec.toml.decode(path.read_bytes(), type=AgentConfig)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    except msgspec.DecodeError as error:
+    except DECODE_ERRORS as error:
         raise ConfigError(f"{path}: {error}") from error
     try:
         config.check()

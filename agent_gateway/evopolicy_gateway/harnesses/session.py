@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.blobs import write_atomically
+from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_gateway.harnesses.usage import Usage
 
 
@@ -54,7 +55,7 @@ def load(path: Path | None) -> SessionState:
         return SessionState()
     try:
         return msgspec.json.decode(path.read_bytes(), type=SessionState)
-    except (OSError, msgspec.DecodeError):
+    except (OSError, *DECODE_ERRORS):
         return SessionState()
 
 

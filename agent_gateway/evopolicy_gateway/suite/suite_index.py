@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.blobs import write_atomically
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.run_record import RunRecord
 from evopolicy_common.summary import utc_text
 from evopolicy_gateway.suite.suite_file import SuiteRun
@@ -72,7 +72,7 @@ def load(root: Path, suite: str) -> Index:
         index = msgspec.json.decode(path.read_bytes(), type=Index)
     except FileNotFoundError:
         return Index(suite=suite)
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, *DECODE_ERRORS) as error:
         raise ConfigError(f"{path} cannot be read: {error}; move it away to have it made anew") from error
     if index.schema_version > SCHEMA_VERSION:
         raise ConfigError(f"{path} is of a newer version of evopolicy: update this one")

@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_coordinator.analysis.records import Submit
 
 MAX_LOG_BYTES = 64 << 20
@@ -156,7 +157,7 @@ def _events(lines: Iterable[bytes]) -> Iterator[LogEvent]:
     for line in lines:
         try:
             value = msgspec.json.decode(line)
-        except (msgspec.DecodeError, RecursionError):
+        except DECODE_ERRORS:
             continue
         if isinstance(value, dict):
             yield from _events_of(value)
@@ -169,7 +170,7 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
         if isinstance(inner, str):
             try:
                 inner = msgspec.json.decode(inner)
-            except (msgspec.DecodeError, RecursionError):
+            except DECODE_ERRORS:
                 return
         if not isinstance(inner, dict):
             return

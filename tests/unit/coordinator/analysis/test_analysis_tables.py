@@ -214,6 +214,7 @@ def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
         b'{"type": "assistant", "message": [1]}',
         b"[" * 100_000,
         b'"text"',
+        b'{"type": "assistant", "message": {"content": "\xd6 "}}',
     ]
     strange.append(b'{"raw": "{\\"turn\\": 1, \\"text\\": \\"hello\\"}"}')
     strange.append(b'{"type": "item.completed", "item": {"type": "command_execution", "command": null}}')

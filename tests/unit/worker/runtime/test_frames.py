@@ -92,6 +92,12 @@ def test_impossible_arrays_and_nests_are_refused(payload: bytes) -> None:
             frames.action(tag, payload)
 
 
+def test_report_with_a_text_that_is_none_is_refused() -> None:
+    packed = b'{"stage": "act", "kind": null, "message": "\xd6 ", "traceback": ""}'
+    with pytest.raises(frames.BadReplyError, match="utf-8"):
+        frames.report(packed)
+
+
 def test_both_ends_agree_on_the_numbers() -> None:
     for name in (
         "INIT",
