@@ -280,7 +280,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def latest_time(snapshot: Snapshot) -> float:
-    """The latest Unix time, seconds, that the snapshot's unfinished runs and evaluations tell of; 0.0 for none."""
+    """The latest Unix time, seconds, that runs, submits and evaluations of the snapshot tell of; 0.0 for none."""
     times: list[float | None] = [row.created_at for row in snapshot.runs]
     times += [row.created_at for row in snapshot.evaluations]
     times += [row.closed_at for row in snapshot.states]
