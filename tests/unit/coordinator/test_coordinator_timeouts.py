@@ -6,8 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-import test_service
-from test_service import Asked, World
+from service_world import Asked, World, play
 
 from evopolicy_common import keys
 from evopolicy_common.errors import StorageError
@@ -30,7 +29,7 @@ def test_a_query_that_nobody_waits_for_any_more_is_let_go(
         world.ask(waiting)
         assert await waiting.message() is None
 
-    test_service.play(tmp_path, scenario)
+    play(tmp_path, scenario)
 
 
 def test_a_database_that_another_keeps_locked_is_told(

@@ -6,158 +6,20 @@ import asyncio
 import re
 import threading
 import time
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import structlog
+from service_world import Asked, World, play, register
 from structlog.testing import capture_logs
 
-from evopolicy_common import codec, keys
-from evopolicy_common.blobs import BlobStore
-from evopolicy_common.errors import StorageError
+from evopolicy_common import keys
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator import service
-from evopolicy_coordinator.answers import Answers
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.intake import Intake
-from evopolicy_coordinator.service import Service
-from evopolicy_coordinator.splits import SplitSource
-from evopolicy_coordinator.state import ROLES, Identity
-from evopolicy_coordinator.store import Store
-from evopolicy_coordinator.uploads import Uploads
-
-IDENTITY = Identity(
-    cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
-)
-SETTINGS = CoreSettings()
-FAILURE = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
-
-
-class Asked:
-    """A query as the transport hands it over, with its answer to be awaited."""
-
-    def __init__(self, key: str, message: Message) -> None:
-        self.key = key
-        self.payload = codec.encode(message)
-        self.arrived = time.monotonic()
-        self._loop = asyncio.get_running_loop()
-        self.answer: asyncio.Future[bytes | None] = self._loop.create_future()
-
-    def reply(self, payload: bytes, lane: int = 0) -> None:
-        self._loop.call_soon_threadsafe(self._settle, payload)
-
-    def drop(self) -> None:
-        self._loop.call_soon_threadsafe(self._settle, None)
-
-    def _settle(self, payload: bytes | None) -> None:
-        if not self.answer.done():
-            self.answer.set_result(payload)
-
-    async def message(self) -> Any:
-        """The answer; None when the query was ended without one."""
-        payload = await asyncio.wait_for(self.answer, 20)
-        if payload is None:
-            return None
-        decoder: Any = {"gw": codec.gateway_replies, "ops": codec.operator_replies}.get(
-            self.key.split("/")[3], codec.worker_replies
-        )
-        return codec.decode(decoder, payload)
-
-
-class World:
-    """A service on a store in a folder, asked directly."""
-
-    def __init__(self, root: Path, settings: CoreSettings) -> None:
-        self.root = root
-        self.store = Store(root / "db")
-        self.blobs = BlobStore(root / "blobs")
-        self.uploads = Uploads()
-        self.answers = Answers(root / "db", self.blobs, self.uploads)
-        source = SplitSource(data=None, secret=b"s" * 32)
-        intake = Intake(IDENTITY, self.blobs, source, self.uploads, allowed_imports=(), denied_imports=())
-        self.service = Service("c", self.store, self.answers, intake, settings)
-        self.writes = 0
-        self.full = False
-        write = self.store.write
-
-        def counted(rows: Any) -> None:
-            if self.full:
-                raise StorageError("database or disk is full")
-            self.writes += 1
-            write(rows)
-
-        self.store.write = counted  # type: ignore[method-assign]
-
-    def ask(self, *asked: Asked) -> None:
-        """One tick."""
-        self.service.on_queries(list(asked))  # type: ignore[arg-type]
-
-    async def create(self, key: str = "run") -> operator.RunCreated:
-        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", budget=100)
-        asked = Asked(
-            keys.operator_key("c", "create"), operator.CreateRun(token="operate", key=key, settings=settings)
-        )
-        self.ask(asked)
-        created = await asked.message()
-        assert isinstance(created, operator.RunCreated), created
-        return created
-
-    def submit(self, created: operator.RunCreated, key: str) -> Asked:
-        message = gateway.Submit(
-            run=created.run,
-            token=created.capability,
-            key=key,
-            env_instances=(0, 1),
-            bundle=None,
-            bundle_error=FAILURE,
-        )
-        return Asked(keys.gateway_key("c", created.run, "submit"), message)
-
-    def state(self, created: operator.RunCreated) -> Asked:
-        message = gateway.StateRequest(run=created.run, token=created.capability)
-        return Asked(keys.gateway_key("c", created.run, "state"), message)
-
-
-def register(world: World) -> Asked:
-    """A worker of one slot registers."""
-    description = EnvironmentDescription(
-        env="toy/line", env_version="1", obs_space={}, action_space={}, max_episode_steps=1, task_text=""
-    )
-    message = worker.Register(
-        worker="w",
-        token="join",
-        protocol=codec.WIRE_VERSION,
-        slots=1,
-        tiers=("bwrap",),
-        environments=(description,),
-        fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
-    )
-    asked = Asked(keys.worker_key("c", "register"), message)
-    world.ask(asked)
-    return asked
-
-
-def play(
-    root: Path, scenario: Callable[[World], Awaitable[None]], settings: CoreSettings = SETTINGS
-) -> World:
-    async def run() -> World:
-        world = World(root, settings)
-        await world.service.start()
-        try:
-            await asyncio.wait_for(scenario(world), 30)
-        finally:
-            await world.service.stop()
-            world.store.close()
-        return world
-
-    return asyncio.run(run())
 
 
 def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:

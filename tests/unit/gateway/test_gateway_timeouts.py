@@ -15,8 +15,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import cli_stage
+import command_stage
 import pytest
-import test_harnesses
 from cli_stage import settings
 from gateway_double import served
 from starlette.responses import PlainTextResponse
@@ -68,7 +68,7 @@ print(json.dumps({"turn": turn, "text": "", "stop": True}), flush=True)
 time.sleep(1000)
 """
     try:
-        ending, _, turns = test_harnesses.play(tmp_path, code)
+        ending, _, turns = command_stage.play(tmp_path, code)
         assert (ending.reason, turns) == ("agent_stopped", [(1, "")])
     finally:
         # Closing the pipes to it kills it: by now it may be gone.
@@ -79,7 +79,7 @@ time.sleep(1000)
 def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "_PIPE_PATIENCE_S", SOON_S)
     monkeypatch.setattr(agent_process, "_LAST_WORDS_S", SOON_S)
-    test_harnesses.test_a_child_that_holds_the_pipes_does_not_hold_up_the_end(tmp_path)
+    assert command_stage.play_with_a_child_that_holds_the_pipes(tmp_path).reason == "agent_stopped"
 
 
 # Coding agents' CLIs.

@@ -4,43 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
+from command_stage import play, play_with_a_child_that_holds_the_pipes
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
 from evopolicy_gateway.harnesses.agent_process import environment_of
-from evopolicy_gateway.harnesses.base import AgentError, Ending, Stage
+from evopolicy_gateway.harnesses.base import AgentError, Stage
 from evopolicy_gateway.harnesses.command import CommandHarness
-
-PATIENCE_S = 30.0
-
-
-def play(tmp_path: Path, code: str) -> tuple[Ending, list[dict[str, Any]], list[tuple[int, str]]]:
-    """How a Python program with that code ended, its log, and what it said."""
-    turns: list[tuple[int, str]] = []
-    log = AgentLog(tmp_path / "logs" / "agent.jsonl")
-    stage = Stage(
-        workspace=tmp_path,
-        urls={"EVOPOLICYGYM_INFO_URL": "http://127.0.0.1:9/nobody"},
-        environment=environment_of({"EVOPOLICYGYM_INFO_URL": "u"}),
-        log=log,
-        on_turn=lambda turn, text: turns.append((turn, text)),
-    )
-
-    async def main() -> Ending:
-        async with asyncio.timeout(PATIENCE_S):
-            return await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
-
-    ending = asyncio.run(main())
-    log.close()
-    lines = (tmp_path / "logs" / "agent.jsonl").read_text().splitlines()
-    return ending, [json.loads(line) for line in lines], turns
 
 
 def test_a_program_that_never_reads_plays_until_it_exits(tmp_path: Path) -> None:
@@ -90,16 +65,7 @@ sys.stdout.write("no newline at the end")
 
 
 def test_a_child_that_holds_the_pipes_does_not_hold_up_the_end(tmp_path: Path) -> None:
-    code = """
-import subprocess, sys
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-open("child", "w").write(str(child.pid))
-"""
-    try:
-        ending, _, _ = play(tmp_path, code)
-        assert ending.reason == "agent_stopped"
-    finally:
-        os.kill(int((tmp_path / "child").read_text()), 9)
+    assert play_with_a_child_that_holds_the_pipes(tmp_path).reason == "agent_stopped"
 
 
 def test_a_flood_of_output_does_not_block_the_program(tmp_path: Path) -> None:

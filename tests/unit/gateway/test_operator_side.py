@@ -8,14 +8,14 @@ from typing import Any
 
 import msgspec
 import pytest
+from finished_run import SETTINGS, finished
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_common.messages.operator import RunFinished, RunProgress, RunSettings, SubmitRecord
-from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway import control
 from evopolicy_gateway.control import Progress
@@ -29,8 +29,6 @@ from evopolicy_gateway.runs import RunResult, exit_code, report
 from evopolicy_gateway.times import Times
 from evopolicy_gateway.watch import watching
 
-SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
-
 
 def plan(tmp_path: Path, **fields: Any) -> Plan:
     usual: dict[str, Any] = {
@@ -41,50 +39,6 @@ def plan(tmp_path: Path, **fields: Any) -> Plan:
         "wall_limit_s": 60.0,
     }
     return Plan(**usual | fields)
-
-
-def finished(**fields: Any) -> RunFinished:
-    usual: dict[str, Any] = {
-        "run": "r-1",
-        "settings": SETTINGS,
-        "status": "completed",
-        "error": None,
-        "close_reason": "budget_spent",
-        "agent": {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None},
-        "final_score": 2.0,
-        "best_submit_index": 1,
-        "val_scores": {0: 1.0, 1: 1.5},
-        "heldout_returns": (1.0, 3.0),
-        "validation_ineligible": {2: "brought its slot down"},
-        "policy_failures": {"validation": 0, "heldout": 1},
-        "random_heldout_returns": (0.0, 1.0),
-        "episode_budget": 8,
-        "budget_used": 8,
-        "split_hashes": {"train": "a", "validation": "b", "heldout": "c"},
-        "split_secret": True,
-        "env_version": "line-1",
-        "deterministic": True,
-        "fingerprint": Fingerprint(code_version="1", python="3.11", packages={"numpy": "2.4"}, cpu="x"),
-        "created_at": 100.0,
-        "closed_at": 110.0,
-        "finished_at": 112.5,
-        "submits": (
-            SubmitRecord(
-                submit_index=0,
-                status="ok",
-                bundle=None,
-                env_instances=(0,),
-                remaining_budget=0,
-                mean_return=1.0,
-                val_mean=1.0,
-                started_at=101.0,
-                completed_at=102.0,
-            ),
-        ),
-        "wall_s": {"queue": 0.5, "rollout": 3.0, "finalise": 2.5},
-        "fingerprint_overrides": ("a → b: the old workers are gone",),
-    }
-    return RunFinished(**usual | fields)
 
 
 STAGED = Staged(

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from test_operator_side import finished
+from finished_run import finished
 
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import RefusedError, TransportError
