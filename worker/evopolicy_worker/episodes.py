@@ -37,7 +37,7 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.scratch import remove_tree
 from evopolicy_common.trajectory import Recorder, decode
-from evopolicy_worker import environments
+from evopolicy_worker import environments, float_environment
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
 from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
@@ -323,6 +323,7 @@ class _Episode:
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
         total, t = 0.0, 0
+        float_environment.reset()
         obs = environment.reset(self._spec.case)
         while True:
             invalid = False

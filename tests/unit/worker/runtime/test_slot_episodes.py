@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import platform
 
 import numpy as np
 import pytest
 from slots import HONEST, Slots, make_job, rows
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker import environments
+from evopolicy_worker import environments, float_environment
 from evopolicy_worker.episodes import random_actions
 from evopolicy_worker.sandbox.jail import ENVIRONMENT
 
@@ -346,3 +348,48 @@ def test_what_stands_above_a_policy_tells_nothing_of_those_before(slots: Slots) 
         slots.run(slot.close())
     assert b"env_meta" in seen[0]
     assert len(set(seen)) == 1
+
+
+def test_float_settings_are_the_defaults_whatever_was_set_before(slots: Slots) -> None:
+    libm = ctypes.CDLL(None)
+    upward = 0x800 if platform.machine() == "x86_64" else 0x400000
+    third = 1.0 / float("3")
+    try:
+        assert libm.fesetround(upward) == 0
+        assert 1.0 / float("3") > third
+        float_environment.reset()
+        assert libm.fegetround() == 0
+        assert 1.0 / float("3") == third
+    finally:
+        libm.fesetround(0)
+
+
+def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slots: Slots) -> None:
+    policy = """
+        import ctypes, locale, os, time
+        class Policy:
+            def __init__(self, *spaces):
+                names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONHASHSEED"
+                print([os.environ[name] for name in names], hash("a word"), locale.setlocale(locale.LC_ALL), time.tzname)
+                print(ctypes.CDLL(None).fegetround(), 5e-324 * float("1") > 0)
+            def reset(self, episode_index): pass
+            def act(self, obs): return [0.0]
+    """
+    said = {slots.play(policy, slot=slots.slot()).stdout.decode() for _ in range(2)}
+    other = slots.new()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {
+            "OMP_NUM_THREADS": "7",
+            "PYTHONHASHSEED": "9",
+            "LC_ALL": "tr_TR",
+            "TZ": "Asia/Tokyo",
+        }.items():
+            patch.setenv(name, value)
+        slots.run(other.start())
+    said.add(slots.play(policy, slot=other).stdout.decode())
+    slots.run(other.close())
+    (told,) = said
+    assert told.startswith("['1', '1', '1', '0'] ")
+    # Where a system's C library has no C.UTF-8, it is C, and Python reads UTF-8 all the same.
+    assert "C.UTF-8 ('UTC', 'UTC')" in told or " C ('UTC', 'UTC')" in told
+    assert told.endswith("0 True\n")

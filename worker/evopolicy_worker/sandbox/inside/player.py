@@ -45,6 +45,7 @@ def play(init: dict[str, Any]) -> NoReturn:
     """Builds the Policy and answers for it until told to end."""
     global action_bytes, home
     action_bytes, home = init["action_bytes"], init["home"]
+    libc.fesetenv(ctypes.c_void_p(-1))  # FE_DFL_ENV, whatever an allowed package has set when it was imported
     seed_generators(bytes.fromhex(init["seed"]))
     os.environ.pop("PWD", None)
     os.environ["HOME"] = init["home"]
