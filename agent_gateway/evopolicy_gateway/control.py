@@ -74,6 +74,8 @@ class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
     action: str = ""
     tokens: dict[str, Any] | None = None
     """Of the run so far, as in `run.json`."""
+    note: str = ""
+    """What the operator should know."""
     paused_s: float = 0.0
     """It waits that long for `provider`; 0.0: it does not, or no longer."""
     provider: str = ""

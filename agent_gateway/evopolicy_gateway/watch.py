@@ -67,6 +67,8 @@ class Lines:
         self.note(run, f"turn {turn}: {first_line(text)}")
 
     def doing(self, run: str, doing: AgentDoing) -> None:
+        if doing.note:
+            self.note(run, doing.note)
         if doing.paused_s:
             self.note(run, f"{first_line(doing.action)} (for {doing.paused_s:.0f} s)")
 
@@ -111,6 +113,8 @@ class LiveTable:
         self._row(run).said = first_line(text)
 
     def doing(self, run: str, doing: AgentDoing) -> None:
+        if doing.note:
+            self.note(run, doing.note)
         if doing.action:
             self._row(run).said = first_line(doing.action)
 

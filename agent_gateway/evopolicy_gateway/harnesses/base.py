@@ -48,6 +48,8 @@ class Doing(msgspec.Struct, frozen=True, kw_only=True):
     action: str = ""
     tokens: dict[str, Any] | None = None
     """Of the run so far, as in `run.json`."""
+    note: str = ""
+    """What the operator should know."""
     paused_s: float = 0.0
     """It waits that long for its provider."""
     provider: str = ""

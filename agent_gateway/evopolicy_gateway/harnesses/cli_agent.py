@@ -207,9 +207,10 @@ class CliAgent(Harness):
                 f" asked for its options it said: {first_line(self._options) or 'nothing'}"
             )
         if self._version != dialect.tested_version:
-            log.warning(
-                "another version than the tested one", version=self._version, tested=dialect.tested_version
-            )
+            found = self._version or "of an unknown version"
+            note = f"{name} {found} is used; held against was {dialect.tested_version}"
+            log.warning("another version than the tested one", version=found, tested=dialect.tested_version)
+            stage.on_doing(Doing(note=note))
 
     async def _ask(self, stage: Stage, arguments: tuple[str, ...]) -> str:
         words = [*self._program, *arguments]

@@ -120,6 +120,7 @@ def _tell(doing: Doing) -> None:
         AgentDoing(
             action=doing.action[:_TEXT_SHOWN],
             tokens=doing.tokens,
+            note=doing.note[:_TEXT_SHOWN],
             paused_s=doing.paused_s,
             provider=doing.provider,
         )

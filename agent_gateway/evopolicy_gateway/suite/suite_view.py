@@ -118,6 +118,8 @@ class SuiteView:
         row.action = first_line(doing.action) or row.action
         row.tokens = doing.tokens or row.tokens
         self.on_doing(run, doing)
+        if doing.note:
+            self.note(run, doing.note)
         if doing.paused_s:
             self.event(
                 "paused",

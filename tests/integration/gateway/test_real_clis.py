@@ -9,12 +9,14 @@ Nothing leaves the machine: the keys are made up, and the settings folders are t
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
 import msgspec
 import pytest
 from cli_stage import play, settings
+from commands import command, record_in, run_dir
 from model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
 
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, read_agent
@@ -30,6 +32,7 @@ SUBMIT = (
     "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
     " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
 )
+SMALL_HIDDEN = ("--validation", "1", "--heldout", "1", "--slots", "1")
 SCRIPT = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
 
 
@@ -128,3 +131,27 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
     assert tokens["input_noncached"] == 4 * (INPUT - CACHED)
     assert tokens["cache_read"] == 4 * CACHED
     assert tokens["output"] == 4 * OUTPUT
+
+
+@pytest.mark.parametrize("harness", ["codex", "claude-code"])
+def test_the_real_cli_plays_a_whole_run_in_its_jail_and_is_resumed_there(
+    tmp_path: Path, harness: str
+) -> None:
+    program = Path(CLIS) / {"codex": "codex", "claude-code": "claude"}[harness]
+    with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
+        config = config_for(harness, api)
+        variables = {name: value for name, value in config.environment.items() if name != "PATH"}
+        told = ", ".join(f"{name} = {json.dumps(value)}" for name, value in variables.items())
+        (tmp_path / "agent.toml").write_text(
+            f'harness = "{harness}"\nmodel = "{config.model}"\nprogram = ["{program}"]\nbackoff_s = 0.01\n'
+            f"extra_args = {json.dumps(config.extra_args)}\nenvironment = {{ {told} }}\n"
+        )
+        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
+        reaches = api.base_url.removeprefix("http://")
+        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN, "--allow-host", reaches) as running:
+            assert running.wait() == 0, running.text
+    record = record_in(run_dir(tmp_path))
+    assert (record.jail, record.outcome.budget_used, record.agent.retries) == ("bwrap", 4, 1)
+    assert "first" in str(api.requests[-1])
+    policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "system" / "policy.py"
+    assert policy.read_text().count("# better") == 2

@@ -18,7 +18,7 @@ from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway import control
-from evopolicy_gateway.control import Progress
+from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.journal import Rejected
 from evopolicy_gateway.layout import Staged
 from evopolicy_gateway.options import cases_of, limits_of, one_environment
@@ -158,12 +158,16 @@ def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
         for _ in range(3):
             watch.progress("toy/line", progress)
         watch.progress("toy/line", msgspec.structs.replace(progress, waits_for="a worker"))
+        watch.doing("toy/line", AgentDoing(note="codex 99 is used"))
+        watch.doing("toy/line", AgentDoing(action="paused: usage limit", paused_s=60.0, provider="openai"))
         watch.turn("toy/line", 1, "first line\nsecond")
         for done in range(3):
             watch.phase("toy/line", RunProgress(phase="heldout", done=done, total=3))
     assert out.getvalue().splitlines() == [
         "toy/line: submit_000 ok, mean return -1.25; 4 of 8 episodes left",
         "toy/line: waiting for a worker",
+        "toy/line: codex 99 is used",
+        "toy/line: paused: usage limit (for 60 s)",
         "toy/line: turn 1: first line",
         "toy/line: held-out",
     ]

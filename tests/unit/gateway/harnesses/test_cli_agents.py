@@ -217,7 +217,10 @@ def test_what_was_killed_goes_on_in_its_session(tmp_path: Path, harness: str) ->
 def test_versions_are_told_and_lacking_options_named(tmp_path: Path, harness: str) -> None:
     played = play(tmp_path / "newer", settings(harness), "work", 2, FAKE_VERSION="99.1.0")
     assert ended(played).facts["cli_version"] == "99.1.0"
-    assert ended(played).facts["settings"]["tested_version"] != "99.1.0"
+    tested = ended(played).facts["settings"]["tested_version"]
+    assert tested != "99.1.0"
+    (note,) = [doing.note for doing in played.doings if doing.note]
+    assert note.endswith(f" 99.1.0 is used; held against was {tested}")
     with pytest.raises(AgentError, match=r"0\.1\.0 has no .*--"):
         play(tmp_path / "older", settings(harness), "work", 2, FAKE_VERSION="0.1.0", FAKE_HELP="nothing")
 
