@@ -18,7 +18,7 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.run_difference import differences
+from evopolicy_common.run_difference import differences, left_out
 from evopolicy_gateway import door, harnesses, options, processes, trials
 from evopolicy_gateway.door import Door
 from evopolicy_gateway.gateway import folder_of
@@ -159,11 +159,23 @@ def play_random(
         _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
 
 
+def _tell_left_out(wanted: bool) -> None:
+    if wanted:
+        typer.echo("\n".join(left_out()))
+        raise typer.Exit
+
+
 @app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
 def diff_runs(
     left: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="A run directory.")],
     right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--left-out", is_eager=True, callback=_tell_left_out, help="Print what is left out, and why."
+        ),
+    ] = False,
 ) -> None:
     """Says where two runs differ, leaving out times, logs and what else may differ between equal runs.
 

@@ -48,6 +48,13 @@ MAX_COMPARED_BYTES = 1 << 30
 """An agent may leave files of any size that take no room."""
 
 
+def left_out() -> list[str]:
+    """The published list, a line for each: what is not compared, and why."""
+    files = [f"{pattern}: {why}" for pattern, why in EXCLUDED_FILES.items()]
+    fields = EXCLUDED_FIELDS.items()
+    return files + [f"{file}, {name}: {why}" for file, names in fields for name, why in names.items()]
+
+
 def differences(left: Path, right: Path) -> list[str]:
     """One line for each file or field in which two run directories differ; empty when they are the same run."""
     ours, theirs = _files(left), _files(right)

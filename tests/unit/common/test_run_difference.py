@@ -6,7 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from typer.testing import CliRunner
+
 from evopolicy_common.run_difference import differences
+from evopolicy_gateway.cli import app
 
 
 def make_run(root: Path, name: str, **changes: Any) -> Path:
@@ -57,3 +60,16 @@ def test_a_return_a_file_and_a_byte_each_make_one(tmp_path: Path) -> None:
 def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
     found = differences(make_run(tmp_path, "a", extra=1), make_run(tmp_path, "b"))
     assert found == ["workspace/feedback/submit_000/summary.json: extra: 1 and nothing"]
+
+
+def test_the_list_of_what_is_left_out_is_told_with_reasons_and_covers_what_differs(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["diff", "--left-out"])
+    assert done.exit_code == 0, done.output
+    told = done.output.splitlines()
+    assert "run.json, timing: times" in told
+    assert "summary.json, submit_started_at: a time" in told
+    assert all(": " in line for line in told)
+    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 0
+    (right / "extra").touch()
+    assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 1
