@@ -65,6 +65,30 @@ def _():
     return True
 
 
+@attempt("move the workspace away")
+def _():
+    here = os.getcwd()
+    os.rename(here, f"{here}-away")
+    os.rename(f"{here}-away", here)
+    return True
+
+
+@attempt("read the gateway's memory")
+def _():
+    for path in glob.glob("/proc/[0-9]*/cmdline"):
+        folder = os.path.dirname(path)
+        try:
+            if "evopolicy_gateway.serve_cli" not in text(path):
+                continue
+            start = int(text(f"{folder}/maps").partition("-")[0], 16)
+            with open(f"{folder}/mem", "rb") as memory:
+                memory.seek(start)
+                return bool(memory.read(16))
+        except OSError:
+            continue
+    raise OSError("no gateway to be read")
+
+
 @attempt("mount over feedback")
 def _():
     libc = ctypes.CDLL(None, use_errno=True)

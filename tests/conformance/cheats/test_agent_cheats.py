@@ -15,7 +15,7 @@ from evopolicy_common.run_record import decode_run_record
 
 STOPPED = (
     *("forge feedback", "add feedback", "move feedback away", "rewrite the rules", "replace the rules"),
-    *("mount over feedback",),
+    *("mount over feedback", "move the workspace away", "read the gateway's memory"),
     *("list the coordinator's state", "read the operator's credentials", "read the gateway's credentials"),
     *("read another run", "read the operator's variables", "stop the coordinator"),
     *("find the cluster's processes", "knock at the coordinator's socket", "open a Zenoh session"),
@@ -29,6 +29,7 @@ NEEDS_MORE_THAN_NO_JAIL = {
     *("mount over feedback", "send to the world", "change the kernel's settings"),
     *(
         "read another process's variables",
+        "read the gateway's memory",
         "open a socket to the machine below",
         "open a ring that makes sockets",
     ),
