@@ -47,7 +47,7 @@ def main() -> None:
             page.look(width=1280, height=1000, dark=dark)
             shoot(page, out / f"{name}.png")
         page.look(width=1280, height=1000)
-        for section in ("evolution", "timelines"):
+        for section in ("evolution", "demand", "edits", "timelines", "cost"):
             page.run(PICK)
             page.run(TO_SECTION % f"section[id^={section}], section[aria-labelledby^={section}]")
             shoot(page, out / f"report-{section}.png")
