@@ -45,6 +45,11 @@ def test_tokens_are_counted_as_the_paper_counts_them(tmp_path: Path, harness: st
     prices = Prices(input=1.0, output=10.0, cache_read=0.1, cache_creation=2.0)
     played = play(tmp_path, settings(harness, prices=prices), "work", budget=4)
     tokens = ended(played).facts["tokens"]
+    # Told while it plays, too, for a sweep's caps: never less than before, and the whole at the end.
+    told = [doing.tokens for doing in played.doings if doing.tokens is not None]
+    outputs = [one["output"] for one in told]
+    assert outputs == sorted(outputs)
+    assert told[-1] == tokens
     assert tokens["input_noncached"] == 600
     assert tokens["cache_read"] == 1400
     assert tokens["output"] == 40
