@@ -41,6 +41,30 @@ class Policy:
 """
 """A policy for `toy/line` that does what it should."""
 
+_MISBEHAVING = """
+import ctypes, json, os, signal, struct, sys, threading, time
+import numpy as np
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+        {init}
+
+    def reset(self, episode_index):
+        {reset}
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == 4:
+            {act}
+        return [0.0]
+"""
+
+
+def misbehaving(init: str = "pass", reset: str = "pass", act: str = "pass") -> str:
+    """A policy with this code in its three places; in `act` at step 3 only."""
+    return _MISBEHAVING.format(init=init, reset=reset, act=act)
+
 
 class Slots:
     """One slot per tier and sealing, each started at its first use."""

@@ -10,28 +10,9 @@ import platform
 from typing import Any
 
 import msgspec
-from slots import QUICK
+from slots import QUICK, misbehaving
 
 from evopolicy_common.messages.episode import ResourceLimits
-
-BREAKER = """
-import ctypes, json, os, signal, struct, sys, threading, time
-import numpy as np
-
-class Policy:
-    def __init__(self, *spaces):
-        self.n = 0
-        {init}
-
-    def reset(self, episode_index):
-        {reset}
-
-    def act(self, obs):
-        self.n += 1
-        if self.n == 4:
-            {act}
-        return [0.0]
-"""
 
 
 class Breaker(msgspec.Struct, frozen=True, kw_only=True):
@@ -58,7 +39,7 @@ class Breaker(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def source(self) -> str:
-        return BREAKER.format(init=self.init, reset=self.reset, act=self.act)
+        return misbehaving(init=self.init, reset=self.reset, act=self.act)
 
 
 def limits(**changes: Any) -> ResourceLimits:

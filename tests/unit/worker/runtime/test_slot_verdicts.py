@@ -6,34 +6,11 @@ import signal
 
 import msgspec
 import pytest
-from slots import HONEST, QUICK, Slots, rows
+from slots import HONEST, QUICK, Slots, misbehaving, rows
 
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
 from evopolicy_worker import environments, frames
 from evopolicy_worker.episodes import random_actions
-
-SHELL = """
-import os, sys, time, threading
-import numpy as np
-
-class Policy:
-    def __init__(self, *spaces):
-        self.n = 0
-        {init}
-
-    def reset(self, episode_index):
-        {reset}
-
-    def act(self, obs):
-        self.n += 1
-        if self.n == 4:
-            {act}
-        return [0.0]
-"""
-
-
-def policy(init: str = "pass", reset: str = "pass", act: str = "pass") -> str:
-    return SHELL.format(init=init, reset=reset, act=act)
 
 
 def limits(**changes: float) -> ResourceLimits:
@@ -54,51 +31,56 @@ def played_on_with_random_actions(outcome: EpisodeOutcome, step: int) -> bool:
 @pytest.mark.parametrize(
     ("source", "category", "step", "words"),
     [
-        (policy(reset="raise KeyError('left')"), "reset_error", None, "KeyError: 'left'"),
-        (policy(act="raise ValueError('of no use')"), "act_error", 3, "ValueError: of no use"),
-        (policy(act="sys.exit(0)"), "act_error", 3, "SystemExit"),
-        (policy(act="raise KeyboardInterrupt"), "act_error", 3, "KeyboardInterrupt"),
+        (misbehaving(reset="raise KeyError('left')"), "reset_error", None, "KeyError: 'left'"),
+        (misbehaving(act="raise ValueError('of no use')"), "act_error", 3, "ValueError: of no use"),
+        (misbehaving(act="sys.exit(0)"), "act_error", 3, "SystemExit"),
+        (misbehaving(act="raise KeyboardInterrupt"), "act_error", 3, "KeyboardInterrupt"),
         (
-            policy(act="self.act(obs) if False else (lambda f: f(f))(lambda f: f(f))"),
+            misbehaving(act="self.act(obs) if False else (lambda f: f(f))(lambda f: f(f))"),
             "act_error",
             3,
             "recursion",
         ),
-        (policy(act="os._exit(7)"), "killed", 3, "exited with status 7"),
-        (policy(act="import ctypes; ctypes.string_at(0)"), "killed", 3, "SIGSEGV"),
-        (policy(act="os.abort()"), "killed", 3, "SIG"),
-        (policy(act="bytearray(1 << 30)"), "oom", 3, "268,435,456 bytes"),
-        (policy(act="np.ones(1 << 28)"), "oom", 3, "268,435,456 bytes"),
-        (policy(act="open('/tmp/big', 'wb').write(bytes(8 << 20))"), "file_limit", 3, "4,194,304 bytes"),
+        (misbehaving(act="os._exit(7)"), "killed", 3, "exited with status 7"),
+        (misbehaving(act="import ctypes; ctypes.string_at(0)"), "killed", 3, "SIGSEGV"),
+        (misbehaving(act="os.abort()"), "killed", 3, "SIG"),
+        (misbehaving(act="bytearray(1 << 30)"), "oom", 3, "268,435,456 bytes"),
+        (misbehaving(act="np.ones(1 << 28)"), "oom", 3, "268,435,456 bytes"),
+        (misbehaving(act="open('/tmp/big', 'wb').write(bytes(8 << 20))"), "file_limit", 3, "4,194,304 bytes"),
         (
-            policy(act="[open(f'/tmp/{k}', 'wb').write(bytes(1 << 20)) for k in range(8)]"),
+            misbehaving(act="[open(f'/tmp/{k}', 'wb').write(bytes(1 << 20)) for k in range(8)]"),
             "file_limit",
             3,
             "No space left",
         ),
         (
-            policy(act="self.f = [open('/dev/null') for _ in range(999)]"),
+            misbehaving(act="self.f = [open('/dev/null') for _ in range(999)]"),
             "file_limit",
             3,
             "256 open descriptors",
         ),
         (
-            policy(act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(99)]"),
+            misbehaving(act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(99)]"),
             "process_limit",
             3,
             "8 threads",
         ),
-        (policy(act="os.fork()"), "process_limit", 3, "may be started"),
-        (policy(act="return [None] * 2000"), "act_error", 3, "2,001 values; 1,025 are the limit"),
-        (policy(act="return np.zeros(5000)"), "act_error", 3, "40,000 bytes; 16,400 are the limit"),
-        (policy(act="raise ValueError('\\ud800')"), "act_error", 3, "ValueError: \\ud800"),
+        (misbehaving(act="os.fork()"), "process_limit", 3, "may be started"),
+        (misbehaving(act="return [None] * 2000"), "act_error", 3, "2,001 values; 1,025 are the limit"),
+        (misbehaving(act="return np.zeros(5000)"), "act_error", 3, "40,000 bytes; 16,400 are the limit"),
+        (misbehaving(act="raise ValueError('\\ud800')"), "act_error", 3, "ValueError: \\ud800"),
         (
-            policy(act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})"),
+            misbehaving(act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})"),
             "act_error",
             3,
             "cannot be shown",
         ),
-        (policy(act="import subprocess; subprocess.run(['/bin/true'])"), "process_limit", 3, "no process"),
+        (
+            misbehaving(act="import subprocess; subprocess.run(['/bin/true'])"),
+            "process_limit",
+            3,
+            "no process",
+        ),
     ],
 )
 def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
@@ -116,12 +98,12 @@ def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
 @pytest.mark.parametrize(
     ("source", "changes", "category", "limit"),
     [
-        (policy(act="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
-        (policy(reset="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
-        (policy(act="time.sleep(60)"), {"episode_wall_s": 0.4}, "episode_timeout", 0.4),
-        (policy(act="[0 for _ in iter(int, 1)]"), {"cpu_s": 0.5, "act_wall_s": 20.0}, "cpu_limit", 0.5),
+        (misbehaving(act="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
+        (misbehaving(reset="time.sleep(60)"), {"act_wall_s": 0.3}, "act_timeout", 0.3),
+        (misbehaving(act="time.sleep(60)"), {"episode_wall_s": 0.4}, "episode_timeout", 0.4),
+        (misbehaving(act="[0 for _ in iter(int, 1)]"), {"cpu_s": 0.5, "act_wall_s": 20.0}, "cpu_limit", 0.5),
         (
-            policy(act="import signal; signal.pthread_sigmask(0, range(1, 64)); time.sleep(60)"),
+            misbehaving(act="import signal; signal.pthread_sigmask(0, range(1, 64)); time.sleep(60)"),
             {"act_wall_s": 0.3},
             "act_timeout",
             0.3,
@@ -148,11 +130,11 @@ def test_a_limit_of_time_is_told_with_its_value_and_what_was_used(
         ({"policy.py": "policy = 3"}, "import_error", "no top-level class named Policy"),
         ({"policy.py": "import gymnasium"}, "denied_import", "policies may not import gymnasium"),
         ({"policy.py": "from evopolicy_common import codec"}, "denied_import", "evopolicy_common"),
-        ({"policy.py": policy(init="raise OSError('no')")}, "init_error", "OSError: no"),
+        ({"policy.py": misbehaving(init="raise OSError('no')")}, "init_error", "OSError: no"),
         ({"policy.py": "class Policy: pass"}, "init_error", "takes no arguments"),
-        ({"policy.py": policy(init="time.sleep(60)")}, "init_error", "longer than 0.5 s"),
-        ({"policy.py": policy(init="os._exit(4)")}, "init_error", "exited with status 4"),
-        ({"policy.py": policy(init="bytearray(1 << 30)")}, "init_error", "268,435,456"),
+        ({"policy.py": misbehaving(init="time.sleep(60)")}, "init_error", "longer than 0.5 s"),
+        ({"policy.py": misbehaving(init="os._exit(4)")}, "init_error", "exited with status 4"),
+        ({"policy.py": misbehaving(init="bytearray(1 << 30)")}, "init_error", "268,435,456"),
     ],
 )
 def test_a_bundle_without_a_policy_is_told_at_index_0_and_not_played(
@@ -183,12 +165,15 @@ def test_a_submit_that_yields_no_policy_has_an_outcome_for_every_episode(slots: 
 def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
     few = limits(open_files=40, files=20, action_bytes=512)
     sources = {
-        policy(act="self.f = [open('/dev/null') for _ in range(60)]"): ("file_limit", "40 open descriptors"),
-        policy(act="[open(f'f{k}', 'w') for k in range(60)]"): (
+        misbehaving(act="self.f = [open('/dev/null') for _ in range(60)]"): (
+            "file_limit",
+            "40 open descriptors",
+        ),
+        misbehaving(act="[open(f'f{k}', 'w') for k in range(60)]"): (
             "file_limit",
             "20 files and folders are the limit",
         ),
-        policy(act="return [0.0] * 99"): ("act_error", "more than 528 bytes"),
+        misbehaving(act="return [0.0] * 99"): ("act_error", "more than 528 bytes"),
     }
     for source, (category, words) in sources.items():
         assert slots.play(source, limits=limits(files=1000)).failure is None
@@ -199,7 +184,7 @@ def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
 
 
 def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slots) -> None:
-    failure = slots.play(policy(act="os.dup2(3, 4)")).failure
+    failure = slots.play(misbehaving(act="os.dup2(3, 4)")).failure
     assert failure is not None
     assert "answers for the policy was broken" in failure.message
 
@@ -207,12 +192,12 @@ def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slo
 def test_a_full_file_system_is_told_whatever_way_it_was_filled(slots: Slots) -> None:
     mapped = "import mmap; k = os.open('s', 66); os.truncate(k, 4 << 20); m = mmap.mmap(k, 4 << 20); "
     filled = "open('t', 'wb').write(bytes(3 << 20)); m[:] = bytes(4 << 20)"
-    failure = slots.play(policy(act=mapped + filled)).failure
+    failure = slots.play(misbehaving(act=mapped + filled)).failure
     assert failure is not None
     assert (failure.category, "SIGBUS" in failure.message) == ("killed", True)
     assert "4,194,304 bytes, the limit" in failure.message
     lost = "os.environ.clear(); os.chdir('/'); [open(f'/tmp/{k}', 'w').close() for k in range(60)]"
-    failure = slots.play(policy(act=lost), limits=limits(files=20)).failure
+    failure = slots.play(misbehaving(act=lost), limits=limits(files=20)).failure
     assert failure is not None
     assert (failure.category, failure.limit) == ("file_limit", 20)
 
@@ -224,7 +209,7 @@ def test_a_limit_beyond_the_machines_own_is_the_machines(slots: Slots) -> None:
 
 def test_a_forged_action_beyond_the_limit_ends_the_policy(slots: Slots) -> None:
     forged = "os.write(4, (20000).to_bytes(4, 'little') + bytes([5, 0, 0, 0]) + bytes(20000)); time.sleep(60)"
-    failure = slots.play(policy(act=forged)).failure
+    failure = slots.play(misbehaving(act=forged)).failure
     assert failure is not None
     assert (failure.category, "20,000 bytes; 16,400 are the limit" in failure.message) == ("killed", True)
 
@@ -242,7 +227,7 @@ def test_what_a_policy_may_return_grows_with_the_action_space() -> None:
 
 
 def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: Slots) -> None:
-    failure = slots.play(policy(act="import json; json.loads('{')")).failure
+    failure = slots.play(misbehaving(act="import json; json.loads('{')")).failure
     assert failure is not None
     assert 'File "system/policy.py", line 16, in act' in failure.traceback
     assert "json/__init__.py" in failure.traceback
@@ -252,7 +237,7 @@ def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: 
 
 
 def test_output_is_kept_up_to_its_limit_and_always_drained(slots: Slots) -> None:
-    source = policy(
+    source = misbehaving(
         init="print('built')",
         act="""[os.write(2, b'e' * 1000) for _ in range(1000)]
             import ctypes
@@ -267,26 +252,26 @@ def test_output_is_kept_up_to_its_limit_and_always_drained(slots: Slots) -> None
 
 def test_what_was_printed_before_an_end_is_kept(slots: Slots) -> None:
     for end in ("raise ValueError", "os._exit(1)", "time.sleep(60)"):
-        outcome = slots.play(policy(act=f"print('last words'); {end}"), limits=limits(act_wall_s=0.3))
+        outcome = slots.play(misbehaving(act=f"print('last words'); {end}"), limits=limits(act_wall_s=0.3))
         assert outcome.stdout == b"last words\n"
 
 
 def test_output_of_c_code_is_kept(slots: Slots) -> None:
-    outcome = slots.play(policy(act="import ctypes; ctypes.CDLL(None).printf(b'from C')"))
+    outcome = slots.play(misbehaving(act="import ctypes; ctypes.CDLL(None).printf(b'from C')"))
     assert outcome.stdout == b"from C"
 
 
 @pytest.mark.parametrize("tier", ["landlock", "none"])
 def test_verdicts_are_the_same_in_the_other_tiers(slots: Slots, tier: str) -> None:
-    source = policy(
+    source = misbehaving(
         act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(20)]; time.sleep(60)"
     )
     expected = {
-        policy(act="time.sleep(60)"): "act_timeout",
-        policy(act="os._exit(1)"): "killed",
-        policy(act="bytearray(1 << 30)"): "oom",
-        policy(act="open('big', 'wb').write(bytes(8 << 20))"): "file_limit",
-        policy(act=f"os.kill(os.getpid(), {signal.SIGKILL.value})"): "killed",
+        misbehaving(act="time.sleep(60)"): "act_timeout",
+        misbehaving(act="os._exit(1)"): "killed",
+        misbehaving(act="bytearray(1 << 30)"): "oom",
+        misbehaving(act="open('big', 'wb').write(bytes(8 << 20))"): "file_limit",
+        misbehaving(act=f"os.kill(os.getpid(), {signal.SIGKILL.value})"): "killed",
         source: "process_limit",
     }
     for text, category in expected.items():
