@@ -136,7 +136,8 @@ WEAKER: dict[str, set[str | None]] = {
     "disk filling": {"act_error"},
     # What it writes is limited file by file.
     "disk filling by many files": {None},
-    "thousands of files": {None},
+    # Their number is limited by the time of an act alone, which a slow disk may use up.
+    "thousands of files": {None, "act_timeout"},
     # Threads are counted ten times a second, and only while it owes an answer.
     "thread bomb": {None, "process_limit"},
     # It is no process 1, which signals without a handler do not reach.
