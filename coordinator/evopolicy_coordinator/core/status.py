@@ -74,6 +74,8 @@ def waits_for(core: Core, group: JobGroup) -> str:
     if any(job.lease is None and not job.queued for job in group.jobs.values()):
         waits_to_adopt = any(job in core.adopting for job in group.jobs.values())
         return "workers to report after a restart" if waits_to_adopt else "another try after a fault of ours"
+    if all(("bench", name) in core.timers for profile in flow.lane.profiles for name in profile.workers):
+        return "workers whose jobs kept failing to be tried again"
     return "a free slot"
 
 

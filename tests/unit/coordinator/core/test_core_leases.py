@@ -257,6 +257,8 @@ def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
             break
         (lease,) = got
     assert rig.core.fleet.workers["w1"].benched_until > rig.now
+    (run,) = rig.core.status(rig.now).runs
+    assert run.waits_for == "workers whose jobs kept failing to be tried again"
     for _ in range(4):
         rig.pass_time(2.0)
         rig.beat(first)
