@@ -9,8 +9,6 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import hmac
-import math
 import secrets
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -18,24 +16,30 @@ from typing import Any, Protocol
 import msgspec
 
 from evopolicy_common import catalogue, codec, keys
-from evopolicy_common.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.blobs import BlobStore, is_digest
 from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import BlobRef, ResourceLimits
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
 from evopolicy_coordinator.machines import Machines
+from evopolicy_coordinator.request_checks import (
+    MAX_COUNT,
+    check_idempotency_key,
+    check_inline,
+    check_key,
+    check_limits,
+    check_registration,
+    check_token,
+    finite_cursor,
+    finite_wait,
+)
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import Identity
 from evopolicy_coordinator.store import stored_blobs
 from evopolicy_coordinator.uploads import Uploads
-
-_MAX_WAIT_S = 60.0
-_MAX_NAME = 200
-_MAX_COUNT = 2**31 - 1
 
 _VERBS: dict[type[Message], str] = {
     worker.Register: "register",
@@ -108,10 +112,10 @@ class Intake:
 
     def _parse_worker(self, tail: str, payload: bytes) -> Parsed:
         message = codec.decode(codec.worker_requests, payload)
-        _check_key(tail, _VERBS[type(message)])
+        check_key(tail, _VERBS[type(message)])
         if isinstance(message, worker.Register):
             self._check_token("worker", self._identity.worker_token, message.token)
-            _check_registration(message)
+            check_registration(message)
         else:
             self._check_session(message.token if isinstance(message, BlobPut | BlobGet) else message.session)
         # Everyone else names a session, which the core knows or refuses.
@@ -121,15 +125,15 @@ class Intake:
     def _parse_gateway(self, tail: str, payload: bytes, rights: Rights) -> Parsed:
         message = codec.decode(codec.gateway_requests, payload)
         run = message.sender if isinstance(message, BlobPut | BlobGet) else message.run
-        _check_key(tail, f"{run}/{_VERBS[type(message)]}")
+        check_key(tail, f"{run}/{_VERBS[type(message)]}")
         capability = rights.capability(run)
-        _check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
+        check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
         return Parsed("gw", run, message)
 
     def _check_token(self, role: Role, local: str, given: str) -> None:
         """Whether it is this machine's token for the role, or an admitted other machine's."""
         if self._machines is None or self._machines.holder(role, given) is None:
-            _check_token(local, given)
+            check_token(local, given)
 
     def _check_session(self, session: str) -> None:
         if self._machines is not None and self._machines.is_shut_out(session):
@@ -187,7 +191,7 @@ class Intake:
             worker=m.worker,
             session=m.session,
             n=m.n,
-            wait_s=_wait(m.wait_s),
+            wait_s=finite_wait(m.wait_s),
             warm_bundles=m.warm_bundles,
             warm_environments=m.warm_environments,
         )
@@ -199,14 +203,14 @@ class Intake:
             worker=m.worker,
             session=m.session,
             held=m.held,
-            wait_s=_wait(m.wait_s),
+            wait_s=finite_wait(m.wait_s),
         )
 
     def results_handed_in(self, m: worker.HandIn, request: int, stimulus: str) -> AnyEvent:
         for result in m.results:
             for outcome in result.episodes:
                 for ref in (outcome.trajectory, outcome.video):
-                    _check_inline(ref)
+                    check_inline(ref)
                 for ref in stored_blobs(outcome):
                     if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
                         raise RefusedError("missing_blob", f"blob {ref.digest[:64]!r} is not stored here")
@@ -223,7 +227,7 @@ class Intake:
         return events.StateRequested(stimulus_id=stimulus, request=request, run=m.run)
 
     def submit_requested(self, m: gateway.Submit, request: int, stimulus: str) -> AnyEvent:
-        _check_idempotency_key(m.key)
+        check_idempotency_key(m.key)
         self._check_bundle(m.bundle, m.run)
         if (m.bundle is None) == (m.bundle_error is None):
             raise RefusedError("bad_message", "a submit has either a bundle or a bundle_error")
@@ -238,15 +242,15 @@ class Intake:
         )
 
     def results_requested(self, m: gateway.ResultsRequest, request: int, stimulus: str) -> AnyEvent:
-        if not 0 <= m.submit_index <= _MAX_COUNT:
+        if not 0 <= m.submit_index <= MAX_COUNT:
             raise RefusedError("unknown_submit", f"this run has no submit {m.submit_index}")
         return events.ResultsRequested(
             stimulus_id=stimulus,
             request=request,
             run=m.run,
             submit_index=m.submit_index,
-            cursor=_cursor(m.cursor),
-            wait_s=_wait(m.wait_s),
+            cursor=finite_cursor(m.cursor),
+            wait_s=finite_wait(m.wait_s),
         )
 
     def run_closed(self, m: gateway.CloseRun, request: int, stimulus: str) -> AnyEvent:
@@ -257,9 +261,9 @@ class Intake:
     # Operators.
 
     def run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
-        _check_idempotency_key(m.key)
+        check_idempotency_key(m.key)
         wanted = m.settings
-        _check_limits(wanted.limits)
+        check_limits(wanted.limits)
         try:
             suite = catalogue.suite_of(wanted.env)
             cases = self._source.splits(
@@ -296,9 +300,9 @@ class Intake:
         )
 
     def evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
-        _check_idempotency_key(m.key)
+        check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
-        _check_limits(m.limits)
+        check_limits(m.limits)
         try:
             suite = catalogue.suite_of(m.env)
             cases = self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
@@ -343,15 +347,17 @@ class Intake:
             raise RefusedError("invalid_settings", str(error)) from error
 
     def run_waited(self, m: operator.WaitRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunWaited(stimulus_id=stimulus, request=request, run=m.run, wait_s=_wait(m.wait_s))
+        return events.RunWaited(
+            stimulus_id=stimulus, request=request, run=m.run, wait_s=finite_wait(m.wait_s)
+        )
 
     def evaluation_polled(self, m: operator.EvaluationPoll, request: int, stimulus: str) -> AnyEvent:
         return events.EvaluationPolled(
             stimulus_id=stimulus,
             request=request,
             evaluation=m.evaluation,
-            cursor=_cursor(m.cursor),
-            wait_s=_wait(m.wait_s),
+            cursor=finite_cursor(m.cursor),
+            wait_s=finite_wait(m.wait_s),
         )
 
     def run_cancelled(self, m: operator.CancelRun, request: int, stimulus: str) -> AnyEvent:
@@ -403,7 +409,7 @@ class Intake:
             return
         whole = len(place.env_instances)
         fits = len(place.indexes) == n and all(0 <= index < whole for index in place.indexes)
-        if not fits or not 1 <= place.modulo <= _MAX_COUNT or not -1 <= place.submit_index <= _MAX_COUNT:
+        if not fits or not 1 <= place.modulo <= MAX_COUNT or not -1 <= place.submit_index <= MAX_COUNT:
             raise RefusedError(
                 "bad_message", f"{n} cases do not fit the list of {whole} they are said to be of"
             )
@@ -441,60 +447,3 @@ _EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
 
 def _or(value: int | None, otherwise: int) -> int:
     return otherwise if value is None else value
-
-
-def _wait(seconds: float) -> float:
-    """A long poll's wait, made finite: NaN decodes."""
-    return min(seconds, _MAX_WAIT_S) if seconds > 0 else 0.0
-
-
-def _cursor(cursor: int) -> int:
-    return min(max(0, cursor), _MAX_COUNT)
-
-
-def _check_limits(limits: ResourceLimits) -> None:
-    for name in limits.__struct_fields__:
-        value = getattr(limits, name)
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise RefusedError("invalid_settings", f"limit {name} is {value}; it must be above 0 and finite")
-
-
-def _check_token(expected: str, given: str) -> None:
-    if not hmac.compare_digest(expected.encode(), given.encode()):
-        raise RefusedError(
-            "bad_token", "wrong token, or one of something that is not here; see the credentials file"
-        )
-
-
-def _check_key(tail: str, expected: str) -> None:
-    if tail != expected:
-        raise RefusedError("wrong_key", f"this message belongs on {expected!r}, not on {tail!r}")
-
-
-def _check_idempotency_key(key: str) -> None:
-    if not 1 <= len(key) <= _MAX_NAME:
-        raise RefusedError(
-            "bad_message", f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
-        )
-
-
-def _check_registration(message: worker.Register) -> None:
-    if message.protocol != codec.WIRE_VERSION:
-        raise RefusedError(
-            "wrong_protocol",
-            f"worker speaks wire version {message.protocol}, the coordinator {codec.WIRE_VERSION}: install the same"
-            " version of evopolicy on both",
-        )
-    if not keys.valid_name(message.worker):
-        raise RefusedError(
-            "bad_name", f"worker name {message.worker[:80]!r}: letters, digits, '.', '_', '-', at most 63"
-        )
-    if not 1 <= message.slots <= 4096:
-        raise RefusedError("bad_message", f"{message.slots} slots: a worker has 1 to 4096")
-
-
-def _check_inline(ref: BlobRef | None) -> None:
-    if ref is None or ref.inline is None:
-        return
-    if len(ref.inline) != ref.size or digest_of(ref.inline) != ref.digest:
-        raise RefusedError("bad_blob", f"inline bytes are not blob {ref.digest[:64]!r} of {ref.size} bytes")

@@ -191,7 +191,7 @@ NO_TIMEOUTS: dict[str, str] = {
     "coordinator/core/settings.py:batch_s": SIZE,
     "coordinator/core/settings.py:warm_bonus_s": SIZE,
     "coordinator/core/status.py:RATE_S": SIZE,
-    "coordinator/intake.py:_MAX_WAIT_S": SIZE,
+    "coordinator/request_checks.py:_MAX_WAIT_S": SIZE,
     "coordinator/service.py:_FIRST_PAUSE_S": PACE,
     "coordinator/service.py:_LONGEST_PAUSE_S": PACE,
     "coordinator/upkeep_cli.py:DAY_S": SIZE,
