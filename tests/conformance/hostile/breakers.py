@@ -14,6 +14,9 @@ from slots import QUICK, misbehaving
 
 from evopolicy_common.messages.episode import ResourceLimits
 
+PATIENT = msgspec.structs.replace(QUICK, act_wall_s=50.0, init_wall_s=50.0, episode_wall_s=100.0, cpu_s=100.0)
+"""Where the verdict is none of time, a busy machine shall not make it one."""
+
 
 class Breaker(msgspec.Struct, frozen=True, kw_only=True):
     """Code that misbehaves, and its verdict."""
@@ -24,7 +27,7 @@ class Breaker(msgspec.Struct, frozen=True, kw_only=True):
     init: str = "pass"
     verdict: str | None
     """The failure's category; None when the episode goes on unharmed."""
-    limits: ResourceLimits = QUICK
+    limits: ResourceLimits = PATIENT
     off: ResourceLimits | None = None
     """Limits under which the same code succeeds; None when the defence is not a limit."""
     unsealed: bool = False
@@ -43,7 +46,7 @@ class Breaker(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def limits(**changes: Any) -> ResourceLimits:
-    return msgspec.structs.replace(QUICK, **changes)
+    return msgspec.structs.replace(PATIENT, **changes)
 
 
 BREAKERS = (
@@ -52,7 +55,7 @@ BREAKERS = (
         act="time.sleep(0.8)",
         verdict="act_timeout",
         limits=limits(act_wall_s=0.3),
-        off=QUICK,
+        off=PATIENT,
     ),
     Breaker(
         name="endless computing",
@@ -66,28 +69,28 @@ BREAKERS = (
         reset="time.sleep(0.8)",
         verdict="act_timeout",
         limits=limits(act_wall_s=0.3),
-        off=QUICK,
+        off=PATIENT,
     ),
     Breaker(
         name="slow episode",
         act="time.sleep(0.8)",
         verdict="episode_timeout",
         limits=limits(episode_wall_s=0.4),
-        off=QUICK,
+        off=PATIENT,
     ),
     Breaker(
         name="sleeping __init__",
         init="time.sleep(0.8)",
         verdict="init_error",
         limits=limits(init_wall_s=0.5),
-        off=QUICK,
+        off=PATIENT,
     ),
     Breaker(
         name="blocked signals",
         act="signal.pthread_sigmask(signal.SIG_BLOCK, range(1, 65)); time.sleep(0.8)",
         verdict="act_timeout",
         limits=limits(act_wall_s=0.3),
-        off=QUICK,
+        off=PATIENT,
     ),
     Breaker(
         name="memory bomb",

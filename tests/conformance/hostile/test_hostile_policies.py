@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from breakers import BREAKERS, Breaker
+from breakers import BREAKERS, PATIENT, Breaker
 from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
 from slots import HONEST, Slots, make_job, rows
 from undefended import harmed
@@ -68,6 +68,7 @@ def serve(listener: socket.socket) -> None:
 
 def probe(slots: Slots, name: str, told: dict[str, Any], **options: Any) -> EpisodeOutcome:
     attack = (POLICIES / f"{name}.py").read_text()
+    options = {"limits": PATIENT} | options
     return slots.play({"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(told)}, **options)
 
 
@@ -230,7 +231,7 @@ def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
         for slot, role in zip(pair, ("tell", "listen"), strict=True):
             told = json.dumps({"role": role, "way": way})
             folder = slots.bundle({"policy.py": PROBE, "attack.py": attack, "target.json": told})
-            plays.append(slot.play(make_job(tier=tier), folder, lambda episodes, steps: None))
+            plays.append(slot.play(make_job(tier=tier, limits=PATIENT), folder, lambda episodes, steps: None))
         (_,), (listener,) = slots.run(both(plays[0], plays[1]))
         heard[tier] = doors(listener)["THROUGH"] != []
     assert heard == {"bwrap": False, "none": True}

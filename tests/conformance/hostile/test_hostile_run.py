@@ -13,11 +13,11 @@ from typing import Any
 
 import msgspec
 import pytest
-from breakers import BREAKERS
-from slots import HONEST, QUICK
+from breakers import BREAKERS, PATIENT
+from slots import HONEST
 
-SOURCES = {attack.name: attack.source for attack in BREAKERS if attack.limits == QUICK}
-VERDICTS = {attack.name: attack.verdict for attack in BREAKERS if attack.limits == QUICK}
+SOURCES = {attack.name: attack.source for attack in BREAKERS if attack.limits == PATIENT}
+VERDICTS = {attack.name: attack.verdict for attack in BREAKERS if attack.limits == PATIENT}
 AGENT = """
 import json, os, sys, urllib.request
 
@@ -41,11 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--env", "toy/line", "--slots", "2"]
     command += ["--budget", str(2 * len(sources)), "--validation", "1", "--heldout", "1", "--jail", "none"]
     command += ["--agent", f"command:{sys.executable} {agent} {attacks}", "--runs", str(root / "runs")]
-    # No verdict here is one of time: on a busy machine none shall become one.
-    patient = msgspec.structs.replace(
-        QUICK, act_wall_s=50.0, init_wall_s=50.0, episode_wall_s=100.0, cpu_s=100.0
-    )
-    for name, value in msgspec.structs.asdict(patient).items():
+    for name, value in msgspec.structs.asdict(PATIENT).items():
         if value is not None:
             command += ["--limit", f"{name}={value}"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, check=False)
