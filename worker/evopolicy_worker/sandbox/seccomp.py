@@ -105,7 +105,8 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
     if machine == "x86_64":
         program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
     blocks = {
-        # Its caller looks at the word again, as after any other wake; the C library's join of a thread asks so.
+        # Its caller looks at the word again, as after any other wake, and again: the C library's join of a thread asks
+        # so, and computes while it waits.
         "futex": [
             (_LOAD, 0, 0, _argument(1)),
             (_AND, 0, 0, _FUTEX_PRIVATE),

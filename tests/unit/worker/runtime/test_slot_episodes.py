@@ -314,6 +314,25 @@ def test_threads_and_numpy_work_in_the_sandbox(slots: Slots) -> None:
     assert (outcome.failure, outcome.stdout) == (None, b"50 True ('UTC', 'UTC')\n")
 
 
+def test_the_c_librarys_threads_can_be_joined(slots: Slots) -> None:
+    # Their join waits on a word that is not private to the process, which the filter answers with "look again".
+    policy = """
+        import ctypes
+
+        class Policy:
+            def __init__(self, *spaces):
+                libc, thread = ctypes.CDLL(None), ctypes.c_ulong()
+                work = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(lambda _: libc.usleep(20000))
+                libc.pthread_create(ctypes.byref(thread), None, work, None)
+                print(libc.pthread_join(thread, None))
+
+            def reset(self, episode_index): pass
+            def act(self, obs): return [0.0]
+    """
+    outcome = slots.play(policy)
+    assert (outcome.failure, outcome.stdout) == (None, b"0\n")
+
+
 LOOKING_UP = """
     import sys
 
