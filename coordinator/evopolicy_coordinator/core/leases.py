@@ -102,7 +102,6 @@ class LeaseBook:
         name = lease_id(job.job_id, attempt)
         lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
         job.lease = lease
-        job.reserved = None
         worker.leases[name] = lease
         worker.n_live += 1
         worker.held[job.priority] += 1
@@ -173,6 +172,7 @@ class LeaseBook:
             or job.group.bars(worker)
         ):
             return None
+        core.scheduler.unreserve(job)
         core.queue.withdraw(job)
         core.timers.disarm(("job", job.job_id))
         core.adopting.pop(job, None)

@@ -287,10 +287,7 @@ class Core:
         if job.lease is not None:
             self.book.stop(job.lease, turn, why)
         self.queue.withdraw(job)
-        if job.reserved is not None:
-            self.fleet.workers[job.reserved].reserved = None
-            self.scheduler.emptied(self.fleet.workers[job.reserved])
-            job.reserved = None
+        self.scheduler.unreserve(job)
         self.adopting.pop(job, None)
         self.timers.disarm(("job", job.job_id))
         del job.group.jobs[job.first]

@@ -201,12 +201,16 @@ class Scheduler:
                 if lease.live and lease.job.priority != TRAIN and self._may_stop(lease.job):
                     self._stop_hidden(lease, worker, f"preempted for {job.job_id}", turn)
 
+    def unreserve(self, job: JobState) -> None:
+        """No worker is emptied for a suspect any more; the one that was may get other work."""
+        if job.reserved is not None:
+            worker = self._core.fleet.workers[job.reserved]
+            worker.reserved = job.reserved = None
+            self.emptied(worker)
+
     def _alone(self, job: JobState, worker: Worker, turn: Turn) -> wire.Lease:
         core = self._core
-        if job.reserved is not None and job.reserved in core.fleet.workers:
-            core.fleet.workers[job.reserved].reserved = None
-            self._emptied[job.reserved] = None
-        worker.reserved = job.reserved = None
+        self.unreserve(job)
         core.queue.withdraw(job)
         return core.book.grant(job, worker, turn)
 

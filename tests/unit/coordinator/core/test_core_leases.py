@@ -221,6 +221,28 @@ def test_a_busy_worker_is_emptied_for_a_suspect() -> None:
     assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
 
 
+def test_a_worker_that_is_emptied_for_a_suspect_gets_work_again_when_the_suspect_is_claimed_elsewhere() -> (
+    None
+):
+    rig, _, lease = one_job("w1")
+    rig.load()
+    second, third = rig.register("w2"), rig.register("w3")
+    rig.create("r2")
+    rig.submit(0, 1, 2, 3, run="r2", key="x")
+    others = rig.poll(third, 2)
+    rig.pass_time(5.0)
+    rig.beat(third, *others)
+    (again,) = [each for each in rig.poll(second, 4) if each.job.job_id == lease.job.job_id]
+    rig.beat(second, again)
+    keep(rig, 18.0, (third, tuple(others)))
+    assert rig.poll(third, 2) == []
+    assert rig.core.fleet.workers["w3"].reserved is not None
+    rig.beat(rig.register("w1"), lease)  # it had only been frozen
+    assert rig.core.fleet.workers["w3"].reserved is None
+    rig.play(third, others[0])
+    assert len(rig.poll(third, 1)) == 1
+
+
 def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emptied_for_it() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.create("r2", n_valid=2)
