@@ -60,8 +60,7 @@ class Lines:
                 f"{progress.last_submit_id} {progress.last_status}{mean};"
                 f" {progress.remaining_budget} of {progress.episode_budget} episodes left",
             )
-        if progress.waits_for and self._changed(f"{run} waits", progress.waits_for):
-            self.note(run, f"waiting for {progress.waits_for}")
+        self._waits_for(run, progress.waits_for)
 
     def turn(self, run: str, turn: int, text: str) -> None:
         self.note(run, f"turn {turn}: {first_line(text)}")
@@ -75,6 +74,11 @@ class Lines:
     def phase(self, run: str, progress: RunProgress) -> None:
         if self._changed(f"{run} phase", progress.phase) and progress.phase != "finished":
             self.note(run, PHASES[progress.phase])
+        self._waits_for(run, progress.waits_for)
+
+    def _waits_for(self, run: str, what: str) -> None:
+        if what and self._changed(f"{run} waits", what):
+            self.note(run, f"waiting for {what}")
 
     def _changed(self, key: str, *value: object) -> bool:
         if self._seen.get(key) == value:

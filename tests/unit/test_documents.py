@@ -57,7 +57,7 @@ def tree() -> frozenset[str]:
 
 
 @cache
-def tests() -> frozenset[str]:
+def names_of_tests() -> frozenset[str]:
     """Names of all tests."""
     found = set()
     for path in (ROOT / "tests").rglob("test_*.py"):
@@ -97,7 +97,7 @@ def test_links_of_a_document_lead_somewhere(document: str) -> None:
 def test_tests_that_a_document_names_are_there(document: str) -> None:
     named = {name for word in code_in(document) for name in re.findall(r"\btest_\w+\b(?!\.py)", word)}
     modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
-    assert named - tests() - modules == set()
+    assert named - names_of_tests() - modules == set()
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

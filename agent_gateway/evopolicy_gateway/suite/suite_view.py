@@ -16,6 +16,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
@@ -37,6 +38,7 @@ class Row:
         self.progress: Progress | None = None
         self.phase: RunProgress | None = None
         self.action = ""
+        self.waits_for = ""
         self.tokens: dict[str, Any] | None = None
         self.entry: Entry | None = None
 
@@ -97,6 +99,7 @@ class SuiteView:
     def progress(self, run: str, progress: Progress) -> None:
         row = self.rows[run]
         row.progress = progress
+        self._waits_for(run, progress.waits_for)
         if progress.last_submit_id is not None and self._said.get(f"{run} submit") != progress.last_submit_id:
             self._said[f"{run} submit"] = progress.last_submit_id
             self.event(
@@ -134,6 +137,13 @@ class SuiteView:
         if self._said.get(f"{run} phase") != progress.phase:
             self._said[f"{run} phase"] = progress.phase
             self.event("phase", run, phase=progress.phase)
+        self._waits_for(run, progress.waits_for)
+
+    def _waits_for(self, run: str, what: str) -> None:
+        self.rows[run].waits_for = what
+        if what not in ("", FREE_SLOT) and self._said.get(f"{run} waits") != what:
+            self._said[f"{run} waits"] = what
+            self.event("waits", run, what=what)
 
     def event(self, kind: str, run: str, **more: Any) -> None:
         """Says that something happened."""
@@ -204,7 +214,7 @@ class TableView(LinesView):
             yield self
 
     def event(self, kind: str, run: str, **more: Any) -> None:
-        if kind in ("finished", "note", "paused", "elsewhere"):
+        if kind in ("finished", "note", "paused", "waits", "elsewhere"):
             self._print(f"{run}: {words(kind, more)}" if run else words(kind, more))
 
     def render(self) -> Group:
@@ -246,6 +256,8 @@ def words(kind: str, told: dict[str, Any]) -> str:
         return f"turn {told['turn']}: {told['text']}"
     if kind == "paused":
         return f"{told['provider']} is away, waits {told['seconds']} s ({told['why']})"
+    if kind == "waits":
+        return f"waiting for {told['what']}"
     if kind == "elsewhere":
         return f"is played on {told['host']}"
     return str(told.get("text", ""))
@@ -312,7 +324,7 @@ def _cells(row: Row) -> tuple[str, ...]:
         "" if progress is None else _number(progress.best_mean),
         _short(tokens) if tokens else "",
         state,
-        row.action,
+        f"waiting for {row.waits_for}" if row.state == "running" and row.waits_for else row.action,
     )
 
 

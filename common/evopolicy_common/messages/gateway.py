@@ -38,6 +38,10 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     """The run's capability; sent with every request and checked on each."""
 
 
+FREE_SLOT = "a free slot"
+"""What most submits wait for at times, and no cause for concern: one of `waits_for`."""
+
+
 class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
     """The submit that runs now."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
+from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 from evopolicy_common.messages.worker import Fingerprint
 
@@ -76,7 +77,7 @@ def waits_for(core: Core, group: JobGroup) -> str:
         return "workers to report after a restart" if waits_to_adopt else "another try after a fault of ours"
     if all(("bench", name) in core.timers for profile in flow.lane.profiles for name in profile.workers):
         return "workers whose jobs kept failing to be tried again"
-    return "a free slot"
+    return FREE_SLOT
 
 
 def _a_worker(flow: Flow) -> str:

@@ -1,14 +1,17 @@
-"""What an operator's terminal is told of an agent holds nothing that steers it."""
+"""What an operator's terminal is told of runs: what they wait for, and nothing of an agent's that steers it."""
 
 from __future__ import annotations
 
 import io
 
+import msgspec
 import pytest
 from rich.console import Console
 
-from evopolicy_gateway.control import AgentDoing
-from evopolicy_gateway.suite.suite_view import LinesView
+from evopolicy_common.messages.gateway import FREE_SLOT
+from evopolicy_common.messages.operator import RunProgress
+from evopolicy_gateway.control import AgentDoing, Progress
+from evopolicy_gateway.suite.suite_view import LinesView, TableView
 from evopolicy_gateway.watch import Lines, LiveTable, first_line, harmless
 
 STEERING = (
@@ -43,3 +46,24 @@ def test_what_can_be_shown_is_shown_as_it_is() -> None:
     text = "Größe ×2, 日本 ✓\nline two"
     assert harmless(text) == text
     assert first_line(text) == "Größe ×2, 日本 ✓"
+
+
+def test_what_a_run_waits_for_is_said_once_and_a_free_slot_is_no_news() -> None:
+    out = io.StringIO()
+    console = Console(file=out, width=200)
+    missing = "a worker that offers toy/line with sandbox tier bwrap"
+    for view in (Lines(console), LinesView(["run"], 1, console)):
+        for what in (missing, missing, ""):
+            view.phase("run", RunProgress(phase="heldout", done=0, total=4, waits_for=what))
+    assert out.getvalue().count(f"waiting for {missing}") == 2
+    sweep = LinesView(["run"], 1, console)
+    sweep.rows["run"].state = "running"
+    progress = Progress(
+        episode_budget=8, remaining_budget=4, n_submits=1, submit_id="submit_000", n_episodes=4
+    )
+    sweep.progress("run", msgspec.structs.replace(progress, waits_for=FREE_SLOT))
+    assert FREE_SLOT not in out.getvalue()
+    table = TableView(["run"], 1, console)
+    table.rows = sweep.rows
+    console.print(table.render())
+    assert f"waiting for {FREE_SLOT}" in out.getvalue()
