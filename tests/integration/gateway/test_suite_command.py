@@ -321,7 +321,11 @@ def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> N
     process = subprocess.Popen(
         [sys.executable, "-m", "evopolicy_gateway.cli", *arguments],
         cwd=tmp_path,
-        env={**os.environ, "TERM": "xterm-256color", "XDG_STATE_HOME": str(tmp_path / "xdg")},
+        env={
+            **os.environ,
+            **{"TERM": "xterm-256color", "COLUMNS": "160", "LINES": "40"},
+            "XDG_STATE_HOME": str(tmp_path / "xdg"),
+        },
         stdin=side,
         stdout=side,
         stderr=side,
