@@ -323,7 +323,9 @@ def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> N
         cwd=tmp_path,
         env={
             **os.environ,
-            **{"TERM": "xterm-256color", "COLUMNS": "160", "LINES": "40"},
+            "TERM": "xterm-256color",
+            "COLUMNS": "160",
+            "LINES": "40",
             "XDG_STATE_HOME": str(tmp_path / "xdg"),
         },
         stdin=side,
