@@ -31,10 +31,10 @@ $(STAMP): pyproject.toml constraints.txt
 demo: install
 	@$(BIN)/evopolicy local --env gym/continuouscar --agent evolve --budget 32 --exp-id demo --overwrite --runs runs
 
-# One file after another in as many processes as there are cores. One by one: make test ARGS="-n 0"
+# One process more than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
 test: install
 	@bash deploy/setup-host.sh --tests
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --basetemp="$$short/t" $(ARGS); status=$$?; \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 5 )) --dist loadfile --basetemp="$$short/t" $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
 check: install
