@@ -19,6 +19,8 @@ import msgspec
 from evopolicy_common.errors import ConfigError
 
 Demand = Literal["synthesis", "tuning"]
+ObservationKind = Literal["state", "image", "symbolic", "dict"]
+ActionKind = Literal["discrete", "continuous"]
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,6 +36,9 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Short name for tables, such as `Acrobot`."""
     max_episode_steps: int
     """Upper bound on an episode's length, in steps."""
+    observation: ObservationKind
+    """What an observation is: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
+    action: ActionKind
     demand: Demand | None = None
     """Task-demand group of the paper's mechanism section; None when the paper does not place it."""
 

@@ -1,4 +1,4 @@
-"""A table as data, and its three written forms: CSV (full precision), Markdown and LaTeX (rounded, best and second marked)."""
+"""A table as data, and its plain forms: CSV (full precision) and Markdown (rounded, best and second marked)."""
 
 from __future__ import annotations
 
@@ -87,81 +87,6 @@ def to_markdown(table: Table) -> str:
 
 def _pipe(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    DASH: "--",
-    "±": r"$\pm$",
-    "≤": r"$\le$",
-    "→": r"$\rightarrow$",
-    "×": r"$\times$",
-}
-
-
-def latex_text(text: str) -> str:
-    """`text` with LaTeX's special characters escaped."""
-    return "".join(_LATEX.get(character, character) for character in text)
-
-
-def to_latex(table: Table) -> str:
-    """A `table` environment with booktabs rules; best in bold, second-best underlined, as in the paper.
-
-    A table too wide for a page is in panels one below the other, each with the first columns of text.
-    """
-    lines = [
-        "% needs \\usepackage{booktabs}",
-        "\\begin{table}",
-        "\\centering",
-        f"\\caption{{{latex_text(table.caption or table.title)}}}",
-        f"\\label{{tab:{table.name}}}",
-    ]
-    if len(table.columns) > _ROOMY:
-        lines += ["\\scriptsize", "\\setlength{\\tabcolsep}{3pt}"]
-    for number, columns in enumerate(_panels(table.columns)):
-        lines += ["\\par\\vspace{0.75em}"] * bool(number) + _tabular(table, columns)
-    return "\n".join([*lines, "\\end{table}", ""])
-
-
-_ROOMY = 7
-"""Columns that fit a page in its own type size."""
-_WIDEST = 13
-"""Columns that fit a page in small type."""
-
-
-def _panels(columns: tuple[Column, ...]) -> list[tuple[Column, ...]]:
-    if len(columns) <= _WIDEST:
-        return [columns]
-    first = next((i for i, column in enumerate(columns) if column.kind != "text"), len(columns))
-    head, rest = columns[:first], columns[first:]
-    n = -(-len(rest) // max(1, _WIDEST - 3 - len(head)))
-    size = -(-len(rest) // n)
-    return [(*head, *rest[i : i + size]) for i in range(0, len(rest), size)]
-
-
-def _tabular(table: Table, columns: tuple[Column, ...]) -> list[str]:
-    spec = "".join("l" if column.kind == "text" else "r" for column in columns)
-    wrap = {0: "{}", 1: "\\textbf{{{}}}", 2: "\\underline{{{}}}"}
-    lines = [
-        f"\\begin{{tabular}}{{{spec}}}",
-        "\\toprule",
-        " & ".join(latex_text(column.title) for column in columns) + " \\\\",
-        "\\midrule",
-    ]
-    for number, row in enumerate(table.rows):
-        cells = [
-            wrap[table.marks.get((number, column.key), 0)].format(
-                latex_text(shown(row.get(column.key), column))
-            )
-            for column in columns
-        ]
-        lines.append(" & ".join(cells) + " \\\\")
-    return [*lines, "\\bottomrule", "\\end{tabular}"]
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:

@@ -30,13 +30,14 @@ from evopolicy_coordinator.analysis.html.pages import (
     replays_page,
     trace_page,
 )
+from evopolicy_coordinator.analysis.latex import to_latex
 from evopolicy_coordinator.analysis.palette import Look, looks
 from evopolicy_coordinator.analysis.records import Run
 from evopolicy_coordinator.analysis.report_tables import tables_of
 from evopolicy_coordinator.analysis.run_tables import feedback_use, submits_of
 from evopolicy_coordinator.analysis.scores import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
-from evopolicy_coordinator.analysis.tables import Table, to_csv, to_latex, to_markdown
+from evopolicy_coordinator.analysis.tables import Table, to_csv, to_markdown
 from evopolicy_coordinator.analysis.trace import Trace, trace
 
 REPORT_SCHEMA_VERSION = 1

@@ -41,6 +41,11 @@ def test_a_description_says_what_the_catalogue_says(env_id: str, warm: Warm) -> 
     assert description.env == env_id
     assert (found.gymnasium_id or env_id) in description.env_version
     assert description.max_episode_steps == found.max_episode_steps
+    obs, action = description.obs_space, description.action_space
+    symbols = obs["type"] == "Dict" and "mission" in obs["spaces"]
+    kinds = {"Box": "state", "Image": "image", "Dict": "symbolic" if symbols else "dict"}
+    assert found.observation == kinds[obs["type"]]
+    assert found.action == {"Box": "continuous", "Discrete": "discrete"}[action["type"]]
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -25,7 +25,6 @@ from evopolicy_coordinator.analysis.tables import (
     best_marks,
     shown,
     to_csv,
-    to_latex,
     to_markdown,
 )
 from evopolicy_coordinator.analysis.trace import diff, trace
@@ -61,25 +60,6 @@ def test_markdown_marks_best_and_second_and_escapes_pipes() -> None:
     assert "| A & B_1 | **1.23** | 50 % | **3** |" in lines
     assert "| C\\|D | – | 13 % | 0 |" in lines
     assert "| E | *0.00* | – | **3** |" in lines
-
-
-def test_latex_escapes_and_marks() -> None:
-    text = to_latex(TABLE)
-    assert "A \\& B\\_1 & \\textbf{1.23} & 50 \\% & \\textbf{3} \\\\" in text
-    assert "E & \\underline{0.00} & -- & \\textbf{3} \\\\" in text
-    assert "\\begin{tabular}{lrrr}" in text
-    assert "\\caption{50 \\% of it.}" in text
-
-
-def test_wide_latex_table_is_in_panels_that_each_name_their_rows() -> None:
-    numbers = tuple(Column(key=f"e{i}", title=f"E{i}", kind="number", digits=0) for i in range(16))
-    row = {"who": "A", "how": "h", **{f"e{i}": i for i in range(16)}}
-    head = (Column(key="who", title="Agent"), Column(key="how", title="Harness"))
-    text = to_latex(Table(name="w", title="W", caption="", columns=(*head, *numbers), rows=(row,)))
-    assert text.count("\\begin{tabular}{llrrrrrrrr}") == text.count("\\end{tabular}") == 2
-    assert "A & h & 0 & 1 & 2 & 3 & 4 & 5 & 6 & 7 \\\\" in text
-    assert "A & h & 8 & 9 & 10 & 11 & 12 & 13 & 14 & 15 \\\\" in text
-    assert text.count("\\begin{table}") == text.count("\\label") == 1
 
 
 def test_number_too_small_to_show_is_told_from_nought() -> None:

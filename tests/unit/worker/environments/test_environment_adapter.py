@@ -64,7 +64,13 @@ class CounterFamily(GymnasiumFamily):
 
 
 ENTRY = Entry(
-    id="test/counter", gymnasium_id="Counter-v0", family="toy", title="Counter", max_episode_steps=5
+    id="test/counter",
+    gymnasium_id="Counter-v0",
+    family="toy",
+    title="Counter",
+    max_episode_steps=5,
+    observation="state",
+    action="discrete",
 )
 
 
