@@ -341,7 +341,7 @@ class RunPlay:
         if self._plan.jail.mode == "none":
             return None
         sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
-        states = [str(Path(path).parent) for kind, _, path in sockets if kind == "unixsock-stream"]
+        states = [str(Path(path).parent.resolve()) for kind, _, path in sockets if kind == "unixsock-stream"]
         if self._credentials.tls is not None:
             states.append(str(Path(self._credentials.tls.private_key).parent))
         hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]

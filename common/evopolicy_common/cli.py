@@ -51,6 +51,15 @@ class _Stderr:
             sys.stderr.flush()
 
 
+def bytes_text(n: float) -> str:
+    """A number of bytes as people read it, such as `3.4 GiB`."""
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if n < 1024:
+            return f"{n:.0f} {unit}" if unit == "B" else f"{n:.1f} {unit}"
+        n /= 1024
+    return f"{n:.1f} TiB"
+
+
 def setup_logging(level: str = "info") -> None:
     """Structured logs on stderr: for people on a terminal, JSON lines otherwise."""
     terminal = sys.stderr.isatty()

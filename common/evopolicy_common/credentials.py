@@ -57,12 +57,12 @@ class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 def default_state_dir() -> Path:
     """The coordinator's state folder when none is named: `$EVOPOLICY_STATE` or one in the user's state home."""
     named = os.environ.get("EVOPOLICY_STATE")
-    return Path(named) if named else _state_home() / "coordinator"
+    return Path(named) if named else state_home() / "coordinator"
 
 
 def registry_dir() -> Path:
     """Where this user's clusters on this machine are found by endpoint."""
-    return _state_home() / "clusters"
+    return state_home() / "clusters"
 
 
 def write(credentials: Credentials, path: Path) -> None:
@@ -185,7 +185,8 @@ def _read_private(path: Path) -> bytes:
     return data
 
 
-def _state_home() -> Path:
+def state_home() -> Path:
+    """Where this user's lasting files are that no command was told a place for."""
     home = os.environ.get("XDG_STATE_HOME")
     return (Path(home) if home else Path.home() / ".local" / "state") / "evopolicy"
 

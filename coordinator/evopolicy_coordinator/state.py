@@ -15,7 +15,9 @@ All that grants anything is made once, has mode 0600, and survives restarts, so 
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import hashlib
 import os
 import secrets
 import socket
@@ -30,6 +32,7 @@ from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
+_SOCKET = "coordinator.sock"
 _SOCKET_PATH_LIMIT = 100
 """Linux allows 107 bytes for a unix socket's path; Zenoh puts a `.lock` beside it."""
 
@@ -51,6 +54,7 @@ class StateFolder:
         self.root = root
         self.identity = identity
         self._lock_fd = lock_fd
+        self._link: Path | None = None
 
     @classmethod
     def open(cls, root: Path, cluster: str | None = None) -> StateFolder:
@@ -87,13 +91,14 @@ class StateFolder:
 
     @property
     def socket_endpoint(self) -> str:
-        """The Zenoh endpoint inside the folder; ConfigError when its path is too long for a unix socket."""
-        path = self.root / "coordinator.sock"
-        if len(os.fsencode(path)) > _SOCKET_PATH_LIMIT:
-            raise ConfigError(
-                f"state folder {self.root} has too long a path for a unix socket; choose a shorter one with --state"
-            )
-        return f"unixsock-stream/{path}"
+        """The Zenoh endpoint inside the folder, by a link to it where its own path is too long for a unix socket.
+
+        The same after every restart. ConfigError when there is no place for a link.
+        """
+        folder = self.root
+        if not _fits(folder):
+            folder = self._link = _linked(folder)
+        return f"unixsock-stream/{folder / _SOCKET}"
 
     def write_credentials(
         self, endpoints: tuple[str, ...], *, insecure_tcp: bool = False
@@ -127,6 +132,9 @@ class StateFolder:
 
     def close(self) -> None:
         """Lets another coordinator have the folder."""
+        if self._link is not None:
+            with contextlib.suppress(OSError):
+                self._link.unlink()
         os.close(self._lock_fd)
 
 
@@ -186,6 +194,29 @@ def _identity(root: Path, cluster: str | None) -> Identity:
     if cluster is not None and identity.cluster != cluster:
         raise ConfigError(f"state folder {root} is of cluster {identity.cluster!r}, not {cluster!r}")
     return identity
+
+
+def _fits(folder: Path) -> bool:
+    return len(os.fsencode(folder / _SOCKET)) <= _SOCKET_PATH_LIMIT
+
+
+def _linked(root: Path) -> Path:
+    """A short link to `root`, always the same one, in a folder that nobody but this user can change."""
+    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    for folder in (credentials.state_home() / "sockets", Path("/tmp") / f"evopolicy-{os.getuid()}"):
+        link = folder / name
+        with contextlib.suppress(OSError):
+            if _fits(link):
+                folder.mkdir(parents=True, mode=0o700, exist_ok=True)
+                found = folder.lstat()
+                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+                    new = folder / f"{name}.{os.getpid()}"
+                    new.symlink_to(root)
+                    new.replace(link)
+                    return link
+    raise ConfigError(
+        f"state folder {root} has too long a path for a unix socket; choose a shorter one with --state"
+    )
 
 
 def resolve_listen(endpoints: list[str]) -> tuple[str, ...]:

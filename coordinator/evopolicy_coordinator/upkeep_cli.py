@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli import bytes_text, fail_on_our_errors
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_coordinator import upkeep
 
@@ -55,7 +55,7 @@ def collect(
     verb = "would remove" if dry_run else "removed"
     typer.echo(
         f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,} blobs:"
-        f" {_size(done.bytes)}; {_size(done.free_bytes)} free"
+        f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
         typer.echo(
@@ -75,7 +75,7 @@ def disk(
     runs: Annotated[int, typer.Option(min=1, help="Planned: runs on each environment.")] = 1,
     as_json: Json = False,
 ) -> None:
-    """What the stored runs take by environment, and whether a planned sweep fits. Run directories come on top."""
+    """What the stored runs take by environment, and whether a planned sweep fits; its run directories come on top."""
     with fail_on_our_errors():
         root = state or default_state_dir()
         used = upkeep.use(root)
@@ -84,24 +84,22 @@ def disk(
             for env_id in catalogue.resolve(env or [])
         }
         needed = upkeep.estimate(root, planned) if planned else None
+        directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
     if as_json:
-        typer.echo(msgspec.json.encode({"environments": used, "planned": needed}))
+        typer.echo(
+            msgspec.json.encode({"environments": used, "planned": needed, "run_directories": directories})
+        )
     else:
         for each in used:
             typer.echo(
-                f"{each.env:<32}{each.runs:>5} runs{each.train_episodes:>9,} episodes{_size(each.bytes):>12}"
-                f"{_size(each.bytes_per_episode):>12} an episode"
+                f"{each.env:<32}{each.runs:>5} runs{each.train_episodes:>9,} episodes{bytes_text(each.bytes):>12}"
+                f"{bytes_text(each.bytes_per_episode):>12} an episode"
             )
         if needed is not None:
             guessed = f"; guessed for want of runs: {', '.join(needed.guessed)}" if needed.guessed else ""
-            typer.echo(f"planned: about {_size(needed.bytes)}, {_size(needed.free_bytes)} are free{guessed}")
+            typer.echo(
+                f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{guessed}"
+            )
+            typer.echo(f"their run directories, wherever they are: at most {bytes_text(directories)}")
     if needed is not None and not needed.fits:
         raise typer.Exit(1)
-
-
-def _size(n: float) -> str:
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if n < 1024:
-            return f"{n:.0f} {unit}" if unit == "B" else f"{n:.1f} {unit}"
-        n /= 1024
-    return f"{n:.1f} TiB"

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.suite.suite_file import SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
@@ -120,6 +121,17 @@ def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:
             f"the suite's file has changed since {shown} {'was' if len(names) == 1 else 'were'} played:"
             " say --changed keep to leave them as they are, or --changed rerun to play them again"
         )
+
+
+def feedback_bytes(decisions: Sequence[Decision]) -> int:
+    """What the feedback of the runs that will be played takes at most, without videos."""
+    played = [one.run.settings for one in decisions if one.kind in ("new", "resume", "restart")]
+    return sum(
+        catalogue.entry(settings.env).feedback_bytes(
+            settings.budget or catalogue.suite_of(settings.env).budget
+        )
+        for settings in played
+    )
 
 
 def told(decisions: Sequence[Decision], left_alone: Sequence[str]) -> list[str]:

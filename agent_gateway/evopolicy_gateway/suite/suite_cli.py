@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +19,7 @@ import msgspec
 import typer
 from rich.console import Console
 
-from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
@@ -158,6 +159,16 @@ def _tell(order: Order, index: Index, decided: list[Decision], console: Console)
     left_alone = [name for name in index.runs if name not in known and name not in in_file]
     for line in decisions.told(decided, left_alone):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+    needed, free = decisions.feedback_bytes(decided), shutil.disk_usage(order.root).free
+    if needed:
+        fits = "" if needed <= free else "; it may not fit: make room, or choose another --runs"
+        console.print(
+            f"feedback takes at most {bytes_text(needed)} of the {bytes_text(free)} that are free in"
+            f" {order.root}{fits}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
     if order.as_json:
         view = JsonView([], 1)
         for one in decided:

@@ -36,11 +36,17 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Short name for tables, such as `Acrobot`."""
     max_episode_steps: int
     """Upper bound on an episode's length, in steps."""
+    step_bytes: int
+    """About what a step takes of a run directory in a train episode's feedback, without video; as measured."""
     observation: ObservationKind
     """What an observation is: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
     action: ActionKind
     demand: Demand | None = None
     """Task-demand group of the paper's mechanism section; None when the paper does not place it."""
+
+    def feedback_bytes(self, episodes: int) -> int:
+        """What the feedback of so many train episodes takes of a run directory when all are as long as can be."""
+        return episodes * self.max_episode_steps * self.step_bytes
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

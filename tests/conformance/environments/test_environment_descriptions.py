@@ -12,6 +12,8 @@ import pytest
 
 from evopolicy_common.catalogue import entries, entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
+from evopolicy_common.trajectory import Recorder
+from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_worker.environments import Environment, offered
 from evopolicy_worker.environments.spaces import bounds
 
@@ -46,6 +48,24 @@ def test_a_description_says_what_the_catalogue_says(env_id: str, warm: Warm) -> 
     kinds = {"Box": "state", "Image": "image", "Dict": "symbolic" if symbols else "dict"}
     assert found.observation == kinds[obs["type"]]
     assert found.action == {"Box": "continuous", "Discrete": "discrete"}[action["type"]]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_steps_feedback_takes_about_what_the_catalogue_says(env_id: str, warm: Warm) -> None:
+    environment = warm(env_id)
+    rng = np.random.default_rng(0)
+    recorder = Recorder()
+    n, most = 0, 100
+    for seed in range(most):
+        obs, ended = environment.reset(Case(seed=seed)), False
+        while not ended and n < most:
+            action = environment.action_codec.sample(rng)
+            step = environment.step(action)
+            ended = step.terminated or step.truncated
+            recorder.append(obs, action, step.reward, step.terminated, step.truncated, step.info)
+            obs, n = step.obs, n + 1
+    files = trajectory_files(recorder.finish(), environment.description.obs_storage)
+    assert sum(map(len, files.values())) / n == pytest.approx(entry(env_id).step_bytes, rel=0.25)
 
 
 @pytest.mark.parametrize("env_id", IDS)

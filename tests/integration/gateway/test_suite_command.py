@@ -115,6 +115,7 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
     with sweep(tmp_path, "--local", "--dry-run") as after:
         assert after.wait() == 0
         assert "3 runs: 3 kept" in after.text
+        assert "feedback takes" not in after.text
 
 
 def _starts(folder: Path) -> int:
@@ -304,6 +305,7 @@ def test_a_changed_file_is_refused_with_what_has_changed_and_a_run_without_ok_su
     arguments = ("--credentials", str(operator_file))
     with sweep(tmp_path, *arguments) as first:
         assert first.wait() == 3, first.text
+        assert "feedback takes at most 25.8 KiB" in first.text
     file.write_text(text.replace("budget = 2", "budget = 3"))
     with sweep(tmp_path, *arguments) as second:
         assert second.wait() == 2, second.text

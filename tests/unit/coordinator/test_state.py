@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from evopolicy_common import credentials
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.scratch import scratch_folder
 from evopolicy_coordinator.state import StateFolder, reachable, resolve_listen
+
+
+@pytest.fixture
+def short_home(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where this user's state goes by default, with a short name."""
+    with scratch_folder("home") as folder:
+        monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+        yield folder
 
 
 def test_identity_survives_a_restart_and_nobody_else_reads_it(tmp_path: Path) -> None:
@@ -63,10 +73,28 @@ def test_folder_of_another_cluster_or_a_damaged_one_is_refused_and_unlocked(tmp_
         StateFolder.open(tmp_path, "a/b")
 
 
-def test_too_long_a_socket_path_is_told(tmp_path: Path) -> None:
+def test_too_long_a_path_has_a_short_link_that_is_the_same_again(tmp_path: Path, short_home: Path) -> None:
+    deep = tmp_path / ("x" * 100)
+    found = []
+    for _ in range(2):
+        state = StateFolder.open(deep)
+        protocol, _, path = state.socket_endpoint.partition("/")
+        found.append(path)
+        assert (protocol, Path(path).name) == ("unixsock-stream", "coordinator.sock")
+        assert len(path) <= 100
+        assert Path(path).parent.resolve() == deep
+        state.close()
+        assert not Path(path).parent.is_symlink()
+    assert found[0] == found[1]
+    assert found[0].startswith(str(short_home))
+
+
+def test_a_folder_that_others_may_change_holds_no_link(tmp_path: Path, short_home: Path) -> None:
+    (short_home / "evopolicy").mkdir()
+    (short_home / "evopolicy" / "sockets").mkdir()
+    (short_home / "evopolicy" / "sockets").chmod(0o777)
     state = StateFolder.open(tmp_path / ("x" * 100))
-    with pytest.raises(ConfigError, match="shorter one with --state"):
-        _ = state.socket_endpoint
+    assert state.socket_endpoint.startswith(f"unixsock-stream//tmp/evopolicy-{os.getuid()}/")
     state.close()
 
 

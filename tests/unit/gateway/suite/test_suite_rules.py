@@ -13,7 +13,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
-from evopolicy_gateway.suite.decisions import Found, check_changes, decide, told
+from evopolicy_gateway.suite.decisions import Decision, Found, check_changes, decide, feedback_bytes, told
 from evopolicy_gateway.suite.suite_file import SuiteRun, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index, used
 from evopolicy_gateway.suite.suite_view import TableView
@@ -165,6 +165,17 @@ def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     assert lines[0] == "1 runs: 1 begun again as a new attempt"
     assert "the file has other settings" in lines[1]
     assert "no longer in the file" in lines[2]
+
+
+def test_only_what_is_played_takes_room_for_feedback(tmp_path: Path) -> None:
+    kept, new = suite_in(tmp_path)[:2]  # of 8 and of 16 train episodes
+    line = catalogue.entry("toy/line")
+    episode = line.max_episode_steps * line.step_bytes
+    assert feedback_bytes([Decision(run=kept, kind="keep", attempt=1)]) == 0
+    both = [Decision(run=kept, kind="restart", attempt=2), Decision(run=new, kind="new", attempt=1)]
+    assert feedback_bytes(both) == 24 * episode
+    usual = msgspec.structs.replace(new, settings=msgspec.structs.replace(new.settings, budget=None))
+    assert feedback_bytes([Decision(run=usual, kind="resume", attempt=1)]) == 128 * episode
 
 
 def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ ENTRY = Entry(
     family="toy",
     title="Counter",
     max_episode_steps=5,
+    step_bytes=100,
     observation="state",
     action="discrete",
 )
