@@ -51,6 +51,11 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
     turn.reply(event.request, reply)
     name = worker.profile.fingerprint_class
     turn.log("info", "worker_registered", worker=worker.name, slots=worker.slots, fingerprint_class=name)
+    _pin_waiting(core, worker, turn)
+
+
+def _pin_waiting(core: Core, worker: Worker, turn: Turn) -> None:
+    """A worker may have work again: runs that nobody could serve when they were opened are pinned now."""
     for flow in list(core.unpinned.values()):
         if flow.env in worker.profile.key[0] and flow.tier in worker.profile.key[1]:
             core.pin(flow, turn)
@@ -72,12 +77,15 @@ def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
     known = core.fleet.workers.get(event.worker)
     if _refused_as_forger(core, event.worker, known.machine if known else "", event.request, turn):
         return None
+    was_lost = known is not None and known.state == "lost"
     worker = core.fleet.of_session(event.worker, event.session, turn.now)
     if worker is None:
         text = f"session of worker {event.worker!r} is not known here; register again"
         turn.refuse(event.request, "unknown_worker", text)
     else:
         core.timers.arm_once(("worker", worker.name), turn.now + core.settings.lease_ttl_s)
+        if was_lost:
+            _pin_waiting(core, worker, turn)
     return worker
 
 
@@ -136,6 +144,7 @@ def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
         if worker.beat is not None:
             core.fleet.answer_beat(worker, (), turn)
         core.scheduler.emptied(worker)
+        _pin_waiting(core, worker, turn)
         for lane in worker.profile.lanes.values():
             turn.dirty[lane] = None
     turn.reply(event.request, operator.Done())

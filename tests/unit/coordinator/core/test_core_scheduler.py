@@ -290,6 +290,25 @@ def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
     assert len(rig.poll(session)) == 1
 
 
+@pytest.mark.parametrize("how", ["paused", "lost"])
+def test_a_run_opened_while_its_only_worker_was_away_is_played_when_it_is_back(
+    how: Literal["paused", "lost"],
+) -> None:
+    rig = Rig()
+    session = rig.register()
+    if how == "paused":
+        rig.tell(events.WorkerStateSet(request="out", worker="w1", state="paused"))
+    else:
+        rig.pass_time(60.0)
+    assert [each.state for each in rig.core.status(rig.now).workers] == [how]
+    rig.create()
+    rig.submit(0)
+    if how == "paused":
+        assert rig.poll(session) == []
+        rig.tell(events.WorkerStateSet(request="back", worker="w1", state="active"))
+    assert len(rig.poll(session)) == 1
+
+
 def test_a_second_poll_answers_the_first_with_no_leases() -> None:
     rig = Rig()
     session = rig.register()
