@@ -115,6 +115,16 @@ BUGS = (
         "event.waited_s > event.wait_s + core.settings.late_s",
         "False",
     ),
+    Bug(
+        "leave runs unpinned when a lost worker is back", membership, "worker_of", "if was_lost:", "if False:"
+    ),
+    Bug(
+        "leave runs unpinned when a worker is taken back",
+        membership,
+        "worker_state",
+        "_pin_waiting(core, worker, turn)",
+        "pass",
+    ),
     Bug("let a lease expire under heartbeats", LeaseBook, "hear", "lease.renewed = now", "pass"),
     Bug(
         "take a liveliness hint for the truth",

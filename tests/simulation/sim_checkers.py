@@ -377,6 +377,10 @@ class Checkers:
             want(
                 False, "it goes on", f"nothing was committed for {quiet_s:.0f} s", status.runs, status.stalls
             )
+        for flow in core.unpinned.values():
+            want(
+                core.fleet.offer(flow) is None, "a run is unpinned only while nobody could serve it", flow.id
+            )
         if self._steps % VALIDATE_EVERY == 0:
             core.validate()
             self._preempted(core)

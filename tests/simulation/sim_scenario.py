@@ -67,6 +67,8 @@ class Simulation:
         # In one seed of four, so that the others show what holds without audits.
         self.audit_share = (0.3, 1.0)[seed // 4 % 2] if seed % 4 == 0 else 0.0
         self._out_of_service = ("draining", "paused")[seed % 2]
+        self.absent = {7: "frozen", 15: "paused"}.get(seed % 16)
+        """How all workers are away when the runs are opened."""
         self.slanderer = "w1" if seed % 8 == 4 else None
         """The worker that lies about what it plays again; players are honest, so all runs come to what they must."""
         settings = CoreSettings(audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S)
@@ -76,7 +78,8 @@ class Simulation:
             version = "1" if index == 0 or chance.random() < 0.8 else "2"
             name = f"w{index}"
             self.workers[name] = SimWorker(self, name, chance.randint(1, 3), envs, version)
-        self.operators = [SimOperator(self, plan, chance.random() * 3.0) for plan in self.plans]
+        opened_s = 30.0 if self.absent else 0.0
+        self.operators = [SimOperator(self, plan, opened_s + chance.random() * 3.0) for plan in self.plans]
         self._plan_faults()
 
     # ---- how long, and how ----
@@ -118,6 +121,11 @@ class Simulation:
             world.after(at, self._flap)
         if not self.harmless and chance.random() < 0.3:
             world.after(chance.random() * faults.until_s, self._drain)
+        for worker in self.workers.values():
+            if self.absent == "frozen":
+                world.after(2.0, lambda worker=worker: worker.freeze(45.0))  # type: ignore[misc]
+            elif self.absent == "paused":
+                world.after(2.0, lambda name=worker.name: self._take_out(name, "paused", 45.0))  # type: ignore[misc]
 
     def _some_worker(self) -> SimWorker:
         return self.world.chance.choice(list(self.workers.values()))
@@ -135,19 +143,21 @@ class Simulation:
         self.coordinator.receive(name, events.LivenessLost, {"worker": name}, lambda message: None)
 
     def _drain(self) -> None:
+        self._take_out(self._some_worker().name, self._out_of_service, 20.0)
+
+    def _take_out(self, name: str, state: str, for_s: float) -> None:
         """An operator takes a worker out of service and back later."""
-        name = self._some_worker().name
         operator = self.operators[0]
 
         def drained(message: object) -> None:
             self.checkers.drained_at[name] = self.world.now
-            operator.later(20.0, back)
+            operator.later(for_s, back)
 
         def back() -> None:
             self.checkers.drained_at.pop(name, None)
             operator.ask(events.WorkerStateSet, {"worker": name, "state": "active"}, lambda message: None)
 
-        operator.ask(events.WorkerStateSet, {"worker": name, "state": self._out_of_service}, drained)
+        operator.ask(events.WorkerStateSet, {"worker": name, "state": state}, drained)
 
     # ---- running ----
 

@@ -110,8 +110,6 @@ def _queue(core: Core) -> None:
         want(core, flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
         unpinned = core.unpinned.get(flow.id) is flow
         want(core, flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
-        waits = flow.pin is not None or core.fleet.offer(flow) is None
-        want(core, flow.id, waits, "a flow waits for a pin only while nobody could serve it")
         for priority in range(N_PRIORITIES):
             valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
             want(core, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
