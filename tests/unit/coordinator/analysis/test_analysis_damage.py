@@ -38,7 +38,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_damaged_run_is_read_or_left_out_and_never_a_crash(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, rng: random.Random
