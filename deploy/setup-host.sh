@@ -6,10 +6,11 @@ set -euo pipefail
 missing=()
 command -v bwrap >/dev/null 2>&1 || missing+=(bubblewrap)
 if [ "${1:-}" = "--tests" ]; then
-  # What only the tests use: network namespaces, a compiler for a clock that jumps, a browser for reports, drawing without
-  # a display.
+  # What only the tests use: network namespaces, a compiler for a clock that jumps, a browser for reports, systemd's
+  # check of units, drawing without a display.
   command -v ip >/dev/null 2>&1 || missing+=(iproute2)
   command -v cc >/dev/null 2>&1 || missing+=(gcc libc6-dev)
+  command -v systemd-analyze >/dev/null 2>&1 || missing+=(systemd)
   command -v chromium >/dev/null 2>&1 || missing+=(chromium)
   ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' || missing+=(libegl1 libegl-mesa0 libgl1-mesa-dri)
 fi

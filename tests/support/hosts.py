@@ -4,13 +4,14 @@ A host is its holder, a process that only sleeps: what runs on the host is start
 namespaces, and when the holder is gone and nothing runs there any more, the kernel takes namespaces, devices and routes
 away. Holders, and what was started on hosts, are ended with the thread that made them: a test that is killed leaves nothing.
 
-Root makes the namespaces as it is; other users make them inside a user namespace, where the kernel lets them. `refusal`
+Root makes the namespaces as it is; other users make them inside a user namespace, where the kernel lets them. `require`
 says why not. Call from the main thread.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
@@ -20,10 +21,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 _PATIENCE_S = 60.0
 _WIRE = Path(__file__).with_name("bad_wire.py")
 
 
+def require() -> None:
+    """Skips the test that asks where there can be no hosts, and says why and what helps."""
+    why = refusal()
+    if why is not None:
+        pytest.skip(why)
+
+
+@functools.cache
 def refusal() -> str | None:
     """Why there can be no hosts here; None when there can."""
     missing = [tool for tool in ("ip", "unshare", "nsenter", "setpriv") if shutil.which(tool) is None]
@@ -35,7 +46,7 @@ def refusal() -> str | None:
             hosts.cable(near, "10.92.0.1/30", far, "10.92.0.2/30")
             hosts.wire(near, "10.92.0.5/30", far, "10.92.0.6/30")
     except (AssertionError, OSError, subprocess.CalledProcessError) as error:
-        return f"network namespaces are not permitted here: {error}"
+        return f"this kernel or container permits no network namespaces (as root it usually does): {error}"
     return None
 
 

@@ -172,7 +172,7 @@ def _least(fits: Sequence[_Fit]) -> float:
 
 def _set(panel: list[_Fit]) -> list[_Fit]:
     """The panel's columns with their texts as wide as there is room for, the longest broken first."""
-    cap = max(fit.natural for fit in panel)
+    cap = min(max(fit.natural for fit in panel), int(_WIDTH / _SMALL.character))
     while cap > 0 and _room([_capped(fit, cap) for fit in panel], _SMALL) > _WIDTH:
         cap -= 1
     return [msgspec.structs.replace(fit, width=_capped(fit, cap)) for fit in panel]

@@ -14,7 +14,6 @@ import hosts
 import pytest
 from hosts import Host, Network
 
-REFUSAL = hosts.refusal()
 PEER = """
 import socket, sys
 with socket.create_server((sys.argv[1], 7000)) as server:
@@ -58,8 +57,7 @@ with hosts.network() as network:
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    if REFUSAL is not None:
-        pytest.skip(REFUSAL)
+    hosts.require()
     with hosts.network() as made:
         yield made
 
@@ -106,8 +104,8 @@ def test_a_hosts_disk_is_hidden_from_another(network: Network, tmp_path: Path) -
     assert (tmp_path / "secret").exists()
 
 
-@pytest.mark.skipif(REFUSAL is not None, reason=str(REFUSAL))
 def test_a_maker_that_is_killed_leaves_nothing(tmp_path: Path) -> None:
+    hosts.require()
     maker = subprocess.Popen(
         [sys.executable, "-c", MAKER, str(tmp_path / "log")],
         stdout=subprocess.PIPE,

@@ -24,7 +24,6 @@ from evopolicy_common.run_difference import differences
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-REFUSAL = hosts.refusal()
 DELAY_S = 0.1
 LOSS = 0.01
 Command = subprocess.Popen[bytes]
@@ -35,8 +34,7 @@ AWAY_S = 4.0
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Sites]:
     """The hosts with their workers; the runs of one machine are played before these join."""
-    if REFUSAL is not None:
-        pytest.skip(REFUSAL)
+    hosts.require()
     with contextlib.ExitStack() as stack:
         root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="evm-", dir="/tmp")))
         made = stack.enter_context(sites(root, stack.enter_context(hosts.network())))

@@ -21,7 +21,6 @@ from evopolicy_common.run_record import decode_run_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-REFUSAL = hosts.refusal()
 README = Path(__file__).parents[3] / "README.md"
 FIRST = "10.92.1.1"
 PATIENCE_S = 300.0
@@ -58,8 +57,7 @@ class Machine:
 
 @pytest.fixture
 def machines() -> Iterator[tuple[Machine, Machine]]:
-    if REFUSAL is not None:
-        pytest.skip(REFUSAL)
+    hosts.require()
     with tempfile.TemporaryDirectory(prefix="evs-", dir="/tmp") as root, hosts.network() as network:
         first, second = (Machine(network.host(name), Path(root, name)) for name in ("first", "second"))
         network.cable(first.host, f"{FIRST}/24", second.host, "10.92.1.2/24")

@@ -14,28 +14,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from small_table import TABLE
 
 from evopolicy_coordinator.analysis.latex import latex_text, to_latex
-from evopolicy_coordinator.analysis.tables import Column, Table, best_marks
+from evopolicy_coordinator.analysis.tables import Column, Table
 
-ROWS = (
-    {"who": "A & B_1", "x": 1.23456, "share": 0.5, "n": 3},
-    {"who": "C|D", "x": None, "share": 0.126, "n": 0},
-    {"who": "E", "x": -1.5, "share": None, "n": 3},
-)
-SMALL = Table(
-    name="t",
-    title="A table",
-    caption="50 % of it.",
-    columns=(
-        Column(key="who", title="Agent"),
-        Column(key="x", title="Score", kind="number", digits=2),
-        Column(key="share", title="Share", kind="percent"),
-        Column(key="n", title="Runs", kind="integer"),
-    ),
-    rows=ROWS,
-    marks=best_marks(ROWS, ["x", "n"]),
-)
 WORDS = "what the agent said of its submit, in some more words than go into a line of a page"
 
 
@@ -49,12 +32,17 @@ def table(n_text: int, n_numbers: int, n_rows: int, text: str = WORDS) -> Table:
 
 
 def test_what_means_something_to_latex_is_escaped_and_the_best_are_marked() -> None:
-    text = to_latex(SMALL)
+    text = to_latex(TABLE)
     assert "A \\& B\\_1 & \\textbf{1.23} & 50 \\% & \\textbf{3} \\\\" in text
     assert "C\\textbar{}D & -- & 13 \\% & 0 \\\\" in text
-    assert "E & \\underline{$-$1.50} & -- & \\textbf{3} \\\\" in text
+    assert "E & \\underline{0.00} & -- & \\textbf{3} \\\\" in text
     assert "\\begin{tabular}{lrrr}" in text
     assert "\\caption{50 \\% of it.}" in text
+
+
+def test_a_negative_number_has_a_true_minus() -> None:
+    below = Table(name="n", title="N", caption="", columns=TABLE.columns, rows=({"who": "-1", "x": -1.5},))
+    assert "\n-1 & $-$1.50 & -- & -- \\\\\n" in to_latex(below)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +104,7 @@ def test_a_table_too_long_goes_on_over_pages_under_its_heading() -> None:
 def test_what_is_written_compiles_and_fits_the_page(tmp_path: Path) -> None:
     names = []
     strange = f"{WORDS} \\input{{x}} _^~#$%& … − × 中 --x gymnasium/MiniGrid-ObstructedMaze-1Q-v1"
-    for i, one in enumerate([SMALL, table(0, 24, 2), table(2, 3, 2), table(3, 30, 60, strange)]):
+    for i, one in enumerate([TABLE, table(0, 24, 2), table(2, 3, 2), table(3, 30, 60, strange)]):
         (tmp_path / f"{i}.tex").write_text(to_latex(one))
         names.append(f"\\input{{{i}.tex}}")
     page = "\\documentclass{article}\\textwidth=397pt\\usepackage{array,booktabs,longtable}"

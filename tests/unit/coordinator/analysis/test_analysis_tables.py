@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from invented_policies import Version, png, policy
 from run_dirs import write_run
+from small_table import TABLE
 
 from evopolicy_coordinator.analysis import figures_of, study
 from evopolicy_coordinator.analysis.agent_log import read_agent_log
@@ -21,32 +22,12 @@ from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.reader import read_run
 from evopolicy_coordinator.analysis.tables import (
     Column,
-    Table,
     best_marks,
     shown,
     to_csv,
     to_markdown,
 )
 from evopolicy_coordinator.analysis.trace import diff, trace
-
-ROWS = (
-    {"who": "A & B_1", "x": 1.23456, "share": 0.5, "n": 3},
-    {"who": "C|D", "x": None, "share": 0.126, "n": 0},
-    {"who": "E", "x": -0.0001, "share": None, "n": 3},
-)
-TABLE = Table(
-    name="t",
-    title="A table",
-    caption="50 % of it.",
-    columns=(
-        Column(key="who", title="Agent"),
-        Column(key="x", title="Score", kind="number", digits=2),
-        Column(key="share", title="Share", kind="percent"),
-        Column(key="n", title="Runs", kind="integer"),
-    ),
-    rows=ROWS,
-    marks=best_marks(ROWS, ["x", "n"]),
-)
 
 
 def test_csv_keeps_full_precision_and_empty_fields() -> None:

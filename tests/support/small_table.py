@@ -1,0 +1,24 @@
+"""A small table with what written forms must take care of: special characters, gaps, ties, a value that rounds to -0."""
+
+from __future__ import annotations
+
+from evopolicy_coordinator.analysis.tables import Column, Table, best_marks
+
+ROWS = (
+    {"who": "A & B_1", "x": 1.23456, "share": 0.5, "n": 3},
+    {"who": "C|D", "x": None, "share": 0.126, "n": 0},
+    {"who": "E", "x": -0.0001, "share": None, "n": 3},
+)
+TABLE = Table(
+    name="t",
+    title="A table",
+    caption="50 % of it.",
+    columns=(
+        Column(key="who", title="Agent"),
+        Column(key="x", title="Score", kind="number", digits=2),
+        Column(key="share", title="Share", kind="percent"),
+        Column(key="n", title="Runs", kind="integer"),
+    ),
+    rows=ROWS,
+    marks=best_marks(ROWS, ["x", "n"]),
+)
