@@ -36,6 +36,34 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     run: str
     token: str
     """The run's capability; sent with every request and checked on each."""
+    asks_permit: bool = False
+    """The gateway sends `RequestPermit` before its agent starts. Without it the agent may be on any machine already."""
+
+
+class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):
+    """Ask that the run's agent may be alive on a kernel: a long poll, safe to send again.
+
+    The permit lasts until the run is closed or cancelled, or its machine has another boot id.
+    """
+
+    run: str
+    token: str
+    boot_id: str
+    """Of the kernel that the agent runs on (`host.boot_id`); empty: unknown, which counts as every kernel."""
+    machine_id: str = ""
+    """Of that machine (`host.machine_id`), the same over reboots; empty: unknown."""
+    host: str = ""
+    """Its name, for people."""
+    wait_s: float = 0.0
+
+
+class Permit(Message, frozen=True, kw_only=True, tag="permit"):
+    """The answer to `RequestPermit`."""
+
+    granted: bool
+    """False: not within `wait_s`; the agent must not start, and the gateway asks again."""
+    waits_for: str = ""
+    """What it waits for, in words that tell nothing of other runs' results."""
 
 
 FREE_SLOT = "a free slot"
@@ -50,6 +78,8 @@ class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
     n_done: int
     waits_for: str = ""
     """What it waits for when nothing of it runs, in words for the agent; empty while episodes run."""
+    held_s: float = 0.0
+    """Seconds for which none of its episodes ran because hidden work had the machines; they count against no limit."""
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,6 +91,8 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     is_finalized: bool
     """True when no more submits are taken."""
     in_flight: SubmitInFlight | None = None
+    held_s: float = 0.0
+    """The same seconds of all the run's submits so far."""
 
 
 class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
@@ -170,6 +202,8 @@ class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):
     done: SubmitDone | None
     """Set on the page after which nothing more comes."""
     waits_for: str = ""
+    held_s: float = 0.0
+    """As in `RunState`."""
 
 
 class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
@@ -187,7 +221,9 @@ class RunClosed(Message, frozen=True, kw_only=True, tag="run_closed"):
     """Taken; the outcome goes to the operator only."""
 
 
-GatewayRequest = OpenRun | StateRequest | Submit | ResultsRequest | CloseRun | BlobPut | BlobGet
+GatewayRequest = (
+    OpenRun | RequestPermit | StateRequest | Submit | ResultsRequest | CloseRun | BlobPut | BlobGet
+)
 GatewayReply = (
-    RunOpened | StateReply | SubmitAccepted | ResultsPage | RunClosed | BlobAck | BlobChunk | Refused
+    RunOpened | Permit | StateReply | SubmitAccepted | ResultsPage | RunClosed | BlobAck | BlobChunk | Refused
 )

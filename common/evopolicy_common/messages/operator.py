@@ -20,6 +20,16 @@ from evopolicy_common.messages.worker import (
     Refused,
 )
 
+HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
+"""Whether hidden episodes and agents shared a kernel: never; they could, as the rule was off for all or some of the run; the
+operator vouched for where the agent was; or the run was played before this was recorded."""
+
+HiddenCases = Literal["shared", "per_run"]
+"""Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
+
+ELSEWHERE = "elsewhere"
+"""For `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
+
 
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is opened with. None means the suite's own number."""
@@ -45,6 +55,9 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     limits: ResourceLimits = ResourceLimits()
     notes: dict[str, str] = {}
     """The operator's own labels; kept in `run.json`."""
+    hidden_cases: HiddenCases = "shared"
+    agent_host: str = ""
+    """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
 
     @property
     def recorded_heldout(self) -> VideoOption:
@@ -109,6 +122,7 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """Repeated attempts of one job whose results differed."""
     audit: AuditRecord | None = None
     """None where nothing was to be audited and no forger is known."""
+    hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
 
@@ -251,6 +265,13 @@ class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
     run: str
 
 
+class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
+    """The operator's word that a run's agent is no longer alive: ends its permit. For machines that are lost for good."""
+
+    token: str
+    run: str
+
+
 class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
     """Let a run go on with the workers of another fingerprint class; the reason is recorded in the run."""
 
@@ -332,6 +353,9 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Seconds since its last heartbeat."""
     refused: dict[str, str] = {}
     """Run id to why this worker gets no work of it."""
+    boot_id: str = ""
+    hidden_bar: str = ""
+    """Why it plays no hidden episodes now; empty when it may."""
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -349,6 +373,8 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     done: int
     """Episode jobs finished, train and hidden together."""
     waits_for: str = ""
+    agent_host: str = ""
+    """Where its agent may be alive: a host's name, a boot id, or `everywhere`; empty: nowhere."""
 
 
 class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
@@ -394,6 +420,7 @@ OperatorRequest = (
     | DescribeEnvironment
     | RecordedRequest
     | CancelRun
+    | AgentGone
     | RepinRun
     | SetWorker
     | Claim

@@ -48,6 +48,10 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     environments: tuple[EnvironmentDescription, ...]
     fingerprint: Fingerprint
     host: str = ""
+    boot_id: str = ""
+    """Of the worker's kernel (`host.boot_id`); a worker without one plays no hidden episodes."""
+    machine_id: str = ""
+    """Of its machine (`host.machine_id`)."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):

@@ -64,8 +64,16 @@ ALLOWED: dict[str, dict[str, str]] = {
         "n_submits": "int",
         "is_finalized": "bool",
         "in_flight": "SubmitInFlight | none",
+        "held_s": "float",
     },
-    "SubmitInFlight": {"submit_index": "int", "n_episodes": "int", "n_done": "int", "waits_for": "str"},
+    "SubmitInFlight": {
+        "submit_index": "int",
+        "n_episodes": "int",
+        "n_done": "int",
+        "waits_for": "str",
+        "held_s": "float",
+    },
+    "Permit": {"granted": "bool", "waits_for": "str"},
     "StateReply": {"state": "RunState"},
     "SubmitAccepted": {"submit_index": "int", "first_global_episode": "int", "remaining_budget": "int"},
     "ResultsPage": {
@@ -73,6 +81,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "episodes": "[EpisodeFeedback]",
         "done": "SubmitDone | none",
         "waits_for": "str",
+        "held_s": "float",
     },
     # Of train episodes only: the golden traffic test sees that no hidden one is ever told.
     "EpisodeFeedback": {

@@ -1,0 +1,40 @@
+"""Names the kernel that this process runs on, so that hidden episodes and agents are kept on different ones.
+
+Namespaces and containers share their kernel's counters, so the unit is the kernel, not the host name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+from pathlib import Path
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_MACHINE_ID = Path("/etc/machine-id")
+
+
+def boot_id() -> str:
+    """The running kernel's id, new at every boot and the same in all its containers; empty where there is none."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        pass
+    if platform.system() != "Darwin":
+        return ""
+    asked = subprocess.run(
+        ["sysctl", "-n", "kern.bootsessionuuid"], capture_output=True, text=True, check=False
+    )
+    return asked.stdout.strip().lower() if asked.returncode == 0 else ""
+
+
+def machine_id() -> str:
+    """16 hex digits that stay the same over reboots; empty where the machine has no id of its own.
+
+    The host name is part of it, since machines cloned from one image may share `/etc/machine-id`.
+    """
+    try:
+        installed = _MACHINE_ID.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+    return hashlib.sha256(f"{installed} {platform.node()}".encode()).hexdigest()[:16] if installed else ""

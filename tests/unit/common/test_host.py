@@ -1,0 +1,43 @@
+"""The kernel that a process runs on has a name that its containers share."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from evopolicy_common import host
+
+
+def test_boot_id_is_the_kernels_own() -> None:
+    assert host.boot_id() == Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def test_boot_id_is_the_same_in_namespaces_of_their_own() -> None:
+    if shutil.which("bwrap") is None:
+        pytest.skip("bubblewrap is missing: bash deploy/setup-host.sh")
+    inside = ["bwrap", "--unshare-all", "--ro-bind", "/", "/", "--proc", "/proc"]
+    read = subprocess.run(
+        [*inside, "cat", "/proc/sys/kernel/random/boot_id"], capture_output=True, text=True, check=True
+    )
+    assert read.stdout.strip() == host.boot_id()
+
+
+def test_kernel_without_an_id_has_an_empty_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(host, "_BOOT_ID", tmp_path / "none")
+    monkeypatch.setattr(host, "_MACHINE_ID", tmp_path / "none")
+    assert host.boot_id() == ""
+    assert host.machine_id() == ""
+
+
+def test_clones_of_one_image_differ_by_their_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    image = tmp_path / "machine-id"
+    image.write_text("0123456789abcdef0123456789abcdef\n")
+    monkeypatch.setattr(host, "_MACHINE_ID", image)
+    ids = set()
+    for name in ("first", "second"):
+        monkeypatch.setattr(host.platform, "node", lambda name=name: name)
+        ids.add(host.machine_id())
+    assert len(ids) == 2
