@@ -1,8 +1,7 @@
-"""What the documents name is there: files, links, tests, commands and their options, make's targets."""
+"""What the documents name is there: files, links, commands and their options, make's targets."""
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 from functools import cache
@@ -56,17 +55,6 @@ def tree() -> frozenset[str]:
     return frozenset(str(each) for name in files for each in (Path(name), *Path(name).parents))
 
 
-@cache
-def names_of_tests() -> frozenset[str]:
-    """Names of all tests."""
-    found = set()
-    for path in (ROOT / "tests").rglob("test_*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-                found.add(node.name)
-    return frozenset(found)
-
-
 def is_there(name: str) -> bool:
     """A path in the tree, from its root, a room's package, or as the only end of a path that says so."""
     name = name.rstrip("/")
@@ -91,13 +79,6 @@ def test_files_that_a_document_names_are_there(document: str) -> None:
 def test_links_of_a_document_lead_somewhere(document: str) -> None:
     links = [link for link in re.findall(r"\]\(([^)#]+)", text_of(document)) if "://" not in link]
     assert [link for link in links if not (ROOT / document).parent.joinpath(link).exists()] == []
-
-
-@pytest.mark.parametrize("document", DOCUMENTS)
-def test_tests_that_a_document_names_are_there(document: str) -> None:
-    named = {name for word in code_in(document) for name in re.findall(r"\btest_\w+\b(?!\.py)", word)}
-    modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
-    assert named - names_of_tests() - modules == set()
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
