@@ -187,7 +187,10 @@ def _outcome(finished: RunFinished) -> Outcome:
         heldout_returns=heldout if completed else (),
         quarantined_submits=tuple(sorted(finished.validation_ineligible)),
         random_reference=ReferenceScore(
-            mean_return=math.fsum(reference) / len(reference), std_return=_std(reference), returns=reference
+            mean_return=math.fsum(reference) / len(reference),
+            std_return=_std(reference),
+            returns=reference,
+            seeded_by="case" if finished.reference_by_case else "run",
         )
         if reference
         else None,

@@ -114,6 +114,9 @@ class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
     std_return: float
     """Population standard deviation."""
     returns: tuple[float, ...] = ()
+    seeded_by: Literal["case", "run"] = "run"
+    """What the actions follow from: `case` for split and case alone, the same numbers in every run on the split. `run` for
+    a run's own secret, in runs of earlier versions: those differ from run to run."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):

@@ -129,6 +129,12 @@ def _seed(run: PlannedRun, submit_index: int, split: str, case_id: int, occurren
     return hmac.new(run.secret, text.encode(), "sha256").digest()[:16]
 
 
+def _reference_seed(case_seed: int) -> bytes:
+    """Random actions follow from split and case alone, whatever the run."""
+    text = f'["heldout", {case_seed}, null, 0]'
+    return hashlib.sha256(b"evopolicy random reference\0" + text.encode()).digest()[:16]
+
+
 def _played(
     run: PlannedRun,
     split: str,
@@ -138,10 +144,13 @@ def _played(
     modulo: int,
     told: dict[str, Any],
 ) -> tuple[Expected, ...]:
-    seeds = run.cases("heldout" if split == "random" else split)
+    seeds = run.cases("heldout" if bundle is None else split)
     played = []
     for index, case_id in enumerate(ids):
-        seed = _seed(run, submit_index, split, case_id, ids[:index].count(case_id))
+        if bundle is None:
+            seed = _reference_seed(seeds[case_id])
+        else:
+            seed = _seed(run, submit_index, split, case_id, ids[:index].count(case_id))
         value = return_of(seeds[case_id], bundle, seed, index % modulo, told)
         played.append(Expected(value, failure_of(bundle, index)))
     return tuple(played)

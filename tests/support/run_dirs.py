@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, pstdev
+from typing import Any, Literal
 
 from agent_logs import LOGS
 from invented_policies import Version
@@ -53,6 +54,9 @@ def write_run(
     split: str = "split-1",
     fingerprint: Mapping[str, str] | None = None,
     status: str | None = None,
+    seeded_by: Literal["case", "run"] = "run",
+    closed_reason: str | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone."""
     folder = (
@@ -78,7 +82,12 @@ def write_run(
         exp_id=exp_id,
         repeat=repeat,
         agent=Agent(
-            entry=entry, harness=harness, model_string=entry.lower(), turns=len(versions), tokens=tokens
+            entry=entry,
+            harness=harness,
+            model_string=entry.lower(),
+            settings={"program": ["agent"]} if settings is None else dict(settings),
+            turns=len(versions),
+            tokens=tokens,
         ),
         sandbox_tier="bwrap",
         jail=jail,
@@ -112,9 +121,11 @@ def write_run(
             heldout_std_return=pstdev(heldout) if heldout else None,
             heldout_returns=tuple(heldout),
             random_reference=(
-                ReferenceScore(mean_return=random_mean, std_return=1.0) if random_mean is not None else None
+                ReferenceScore(mean_return=random_mean, std_return=1.0, seeded_by=seeded_by)
+                if random_mean is not None
+                else None
             ),
-            closed_reason="budget_spent" if remaining == 0 else "agent_stopped",
+            closed_reason=closed_reason or ("budget_spent" if remaining == 0 else "agent_stopped"),
             budget_used=budget - remaining,
         ),
         rejected_submits=tuple(

@@ -125,6 +125,8 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
+    reference_by_case: bool = False
+    """The random actions follow from split and case; False for runs that an earlier version created."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):

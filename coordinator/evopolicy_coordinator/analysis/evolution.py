@@ -1,13 +1,13 @@
 """Score evolution: the best hidden-validation score so far over the consumed budget (paper, "Post-hoc score trajectories").
 
 A step function of the episodes consumed: it holds from the end of the submit that reached it. Agents never see it.
-Scales are per environment: 0 is the random reference (held-out cases, the only ones it is played on; without it the lowest
-first score of any run), 1 the best validation score of any run.
+Scales are per environment: 0 is the random reference of the report's tables (held-out cases, the only ones it is played on;
+without it the lowest first score of any run), 1 the best validation score of any run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -54,15 +54,18 @@ def curve(run: Run) -> tuple[Step, ...]:
     )
 
 
-def evolutions(runs: Iterable[Run]) -> list[Evolution]:
-    """Every run's curve, environments in catalogue order, then by entry and run."""
+def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evolution]:
+    """Every run's curve, environments in catalogue order, then by entry and run.
+
+    `references`: environment to the random reference's mean return, where there is one.
+    """
     by_env: dict[str, list[tuple[Run, tuple[Step, ...]]]] = {}
     for run in runs:
         by_env.setdefault(run.env, []).append((run, curve(run)))
     out: list[Evolution] = []
     for env in ordered_environments(by_env):
         group = sorted(by_env[env], key=lambda pair: (pair[0].entry.casefold(), pair[0].name))
-        base, top = scale(group)
+        base, top = scale([steps for _, steps in group], references.get(env))
         for run, steps in group:
             out.append(
                 Evolution(
@@ -80,19 +83,13 @@ def evolutions(runs: Iterable[Run]) -> list[Evolution]:
     return out
 
 
-def scale(group: Sequence[tuple[Run, Sequence[Step]]]) -> tuple[float | None, float | None]:
+def scale(curves: Iterable[Sequence[Step]], reference: float | None) -> tuple[float | None, float | None]:
     """The environment's 0 and 1; both None when no run has a score."""
-    tops = [steps[-1].best for _, steps in group if steps]
-    if not tops:
+    scored = [steps for steps in curves if steps]
+    if not scored:
         return None, None
-    references = [
-        run.record.outcome.random_reference.mean_return
-        for run, _ in group
-        if run.record.outcome.random_reference is not None
-    ]
-    firsts = [steps[0].val_mean for _, steps in group if steps]
-    base = sum(references) / len(references) if references else min(firsts)
-    return base, max(tops)
+    base = min(steps[0].val_mean for steps in scored) if reference is None else reference
+    return base, max(steps[-1].best for steps in scored)
 
 
 def area(steps: Sequence[Step], budget: int, base: float | None, top: float | None) -> float | None:

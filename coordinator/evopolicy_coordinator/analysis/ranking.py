@@ -61,7 +61,7 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     rank: int
     """By `score`, ties share the better rank."""
     score_interval: Interval | None = None
-    """None when no cell has two runs."""
+    """None unless each of the entry's cells has two runs or more: what was run once shows no spread."""
     rank_interval: Interval | None = None
     """Range of the entry's rank by suite score over the resamples' central 95 %."""
 
@@ -194,9 +194,11 @@ def _percentiles(ordered: Sequence[float]) -> Interval:
 def _bootstrap_standings(table: ScoreTable, resamples: int) -> dict[str, tuple[Interval, Interval]]:
     """Entry to the intervals of its suite score and suite rank: every cell's runs are resampled together.
 
-    Cells of one run do not vary, so with few repeats the intervals understate; empty when no cell has two runs.
+    Only for entries whose cells all have two runs or more: a cell of one run does not vary under resampling, and an interval
+    from it would pass for certainty. Entries beside them that were run once, such as the random reference, stay fixed.
     """
-    if not any(len(cell.scores) > 1 for cell in table.cells.values()):
+    once = {cell.entry for cell in table.cells.values() if len(cell.scores) < 2}
+    if once.issuperset(table.entries):
         return {}
     generator = random.Random(1)
     scores: dict[str, list[float]] = {entry: [] for entry in table.entries}
@@ -220,7 +222,7 @@ def _bootstrap_standings(table: ScoreTable, resamples: int) -> dict[str, tuple[I
     return {
         entry: (_percentiles(sorted(scores[entry])), _percentiles(sorted(ranks[entry])))
         for entry in table.entries
-        if scores[entry]
+        if scores[entry] and entry not in once
     }
 
 

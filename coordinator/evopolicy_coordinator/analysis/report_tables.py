@@ -95,7 +95,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
     )
     if any(row.score_interval is not None for row in suite.board.standings):
-        caption += " Intervals resample the runs of every cell (percentile bootstrap, 95 %)."
+        caption += " Intervals resample the runs of every cell (percentile bootstrap, 95 %); an entry with a cell of one run has none."
     return Table(
         name=f"leaderboard_{suite.name}",
         title=f"{suite_title(suite.name)} leaderboard",

@@ -124,19 +124,14 @@ def suite_size(suite: str) -> int:
 
 
 def score_table(runs: Iterable[Run]) -> ScoreTable:
-    """Cells of the runs, and the random reference from what the runs themselves recorded on their held-out cases.
-
-    Runs on the same held-out split (by hash) carry the same reference, so each split counts once.
-    """
+    """Cells of the runs, and the random reference from what the runs themselves recorded on their held-out cases."""
+    runs = list(runs)
     scores: dict[tuple[str, str], list[float | None]] = {}
     harness: dict[str, set[str]] = {}
-    references: dict[str, dict[str, float]] = {}
     for run in runs:
         scores.setdefault((run.entry, run.env), []).append(run.score)
         harness.setdefault(run.entry, set()).add(run.harness)
-        reference = run.record.outcome.random_reference
-        if reference is not None and math.isfinite(reference.mean_return):
-            references.setdefault(run.env, {})[run.record.versions.data_heldout_hash] = reference.mean_return
+    reference = references(runs)
     name = RANDOM_ENTRY
     while name in harness:  # an operator may have called an agent that
         name += " (reference)"
@@ -144,12 +139,39 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
         key: Cell(entry=key[0], env=key[1], scores=tuple(sorted(found, key=_none_first)))
         for key, found in scores.items()
     }
-    for env, by_split in references.items():
-        cells[name, env] = Cell(entry=name, env=env, scores=(fmean(by_split.values()),))
+    for env, mean in reference.items():
+        cells[name, env] = Cell(entry=name, env=env, scores=(mean,))
     named = {entry: ", ".join(sorted(found)) for entry, found in harness.items()}
-    if references:
+    if reference:
         named[name] = RANDOM_HARNESS
-    return ScoreTable(cells=cells, harness=named, reference=name if references else None)
+    return ScoreTable(cells=cells, harness=named, reference=name if reference else None)
+
+
+def references(runs: Iterable[Run]) -> dict[str, float]:
+    """Environment to the mean held-out return of uniform random actions: one number for each held-out split.
+
+    Its actions follow from split and case, so all runs on a split tell the same number. Runs of earlier versions each drew
+    their own: they count only for a split that no newer run has played, with the mean of their numbers. An environment
+    whose runs have several splits gets the mean over the splits.
+    """
+    told: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for run in runs:
+        found = run.record.outcome.random_reference
+        if found is not None and math.isfinite(found.mean_return):
+            by_seeding = told.setdefault(run.env, {}).setdefault(run.record.versions.data_heldout_hash, {})
+            by_seeding.setdefault(found.seeded_by, []).append(found.mean_return)
+    return {
+        env: _one_mean(
+            _one_mean(by_seeding.get("case") or by_seeding["run"]) for by_seeding in splits.values()
+        )
+        for env, splits in told.items()
+    }
+
+
+def _one_mean(values: Iterable[float]) -> float:
+    """Their mean; exactly their value where all are equal."""
+    found = list(values)
+    return found[0] if len(set(found)) == 1 else fmean(found)
 
 
 def _none_first(score: float | None) -> float:

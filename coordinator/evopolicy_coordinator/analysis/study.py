@@ -103,7 +103,7 @@ def study_of(
             _suite(name, table.restricted(envs), resamples)
             for name, envs in suites_of(table.environments).items()
         ),
-        evolutions=tuple(evolutions(ordered)),
+        evolutions=tuple(evolutions(ordered, _reference_of(table))),
         edit_rates=tuple(edit_rates(ordered)),
         timelines=tuple(
             Timeline(
@@ -138,6 +138,14 @@ def _suite(name: str, table: ScoreTable, resamples: int) -> Suite:
 def _in_order(runs: Sequence[Run]) -> list[Run]:
     place = {env: i for i, env in enumerate(ordered_environments(run.env for run in runs))}
     return sorted(runs, key=lambda run: (place[run.env], run.entry.casefold(), run.record.repeat, run.name))
+
+
+def _reference_of(table: ScoreTable) -> dict[str, float]:
+    return {
+        env: cell.mean
+        for (entry, env), cell in table.cells.items()
+        if entry == table.reference and cell.mean is not None
+    }
 
 
 def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:

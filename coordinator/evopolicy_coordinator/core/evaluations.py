@@ -105,7 +105,7 @@ def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
         cases=row.cases,
         case_ids=row.case_ids,
         occurrences=tuple(counts[index] for index in place.indexes),
-        secret=row.secret,
+        secret=None if row.bundle is None else row.secret,
         split=row.split,
         submit_index=place.submit_index,
         modulo=place.modulo,

@@ -6,7 +6,8 @@ Rules that this module owns:
   policy seed, in a run that is pinned to one fingerprint class.
 - Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later submit.
 - A checkpoint whose bundle brings its slots down while hidden is ineligible, and only the finished run says so.
-- The selected checkpoint plays all held-out cases; uniform random actions play the same ones.
+- The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
+  split and case (`seeds.reference_seed`), except in a run that was created when they followed from its secret.
 - Each stage is found again from the store: `advance` may be called any number of times.
 """
 
@@ -60,8 +61,12 @@ def _open(
 ) -> None:
     settings = run.row.settings
     cases = run.row.validation if kind == "validation" else run.row.heldout
+    secret: bytes | None = run.row.secret
+    split: str = kind
     if row is None:
         name, index, modulo, bundle = random_group(run.id), RANDOM, len(cases), None
+        if run.row.reference_by_case:
+            secret, split = None, "heldout"
         scope: PolicyScope = "episode"
         meta: dict[str, object] = {"env": settings.env}
     else:
@@ -76,8 +81,8 @@ def _open(
         cases=cases,
         case_ids=tuple(range(len(cases))),
         occurrences=(0,) * len(cases),
-        secret=run.row.secret,
-        split=kind,
+        secret=secret,
+        split=split,
         submit_index=index,
         modulo=modulo,
         per_job=modulo if scope == "submit" else 1,
@@ -261,6 +266,7 @@ def _result(
         },
         policy_failures=failures,
         random_heldout_returns=run.hidden_returns.get(random_group(run.id), ()),
+        reference_by_case=row.reference_by_case,
         episode_budget=row.budget,
         budget_used=run.ledger.settled,
         split_hashes=row.split_hashes,

@@ -28,7 +28,7 @@ from evopolicy_common.messages.episode import (
 from evopolicy_common.messages.gateway import VideoOption
 
 from .records import OutcomeHead
-from .seeds import policy_seed
+from .seeds import policy_seed, reference_seed
 
 if TYPE_CHECKING:
     from .leases import Lease
@@ -71,7 +71,8 @@ class Template:
     """One for each index."""
     case_ids: tuple[int, ...]
     occurrences: tuple[int, ...]
-    secret: bytes
+    secret: bytes | None
+    """What policy seeds are derived from; None for the random reference, whose actions follow from split and case."""
     split: str
     submit_index: int
     modulo: int
@@ -217,6 +218,14 @@ def open_jobs(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: flo
     return list(group.jobs.values())
 
 
+def _seed(template: Template, index: int) -> bytes:
+    occurrence = template.occurrences[index]
+    if template.secret is None:
+        return reference_seed(template.split, template.cases[index], occurrence)
+    case_id = template.case_ids[index]
+    return policy_seed(template.secret, template.submit_index, template.split, case_id, occurrence)
+
+
 def build(job: JobState, description: EnvironmentDescription) -> Job:
     """The job as a worker gets it."""
     template = job.group.template
@@ -226,13 +235,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
             index=index,
             episode_index=(template.indexes[index] if template.indexes else index) % template.modulo,
             case=template.cases[index],
-            policy_seed=policy_seed(
-                template.secret,
-                template.submit_index,
-                template.split,
-                template.case_ids[index],
-                template.occurrences[index],
-            ),
+            policy_seed=_seed(template, index),
             replay=template.replays[index] if template.replays else None,
         )
         for index in range(job.first, job.first + job.n)

@@ -54,6 +54,8 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     denied_imports: tuple[str, ...] = ()
     audit_share: float = 0.0
     """Of the run's episodes, played again on another worker."""
+    reference_by_case: bool = False
+    """The random reference's actions follow from split and case; False in rows of earlier versions: from `secret`."""
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""

@@ -104,6 +104,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
         allowed_imports=event.allowed_imports,
         denied_imports=event.denied_imports,
         audit_share=core.settings.audit_share,
+        reference_by_case=True,
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )

@@ -62,11 +62,12 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
         axes[0][0].set_yticks(range(len(standings)), [row.entry for row in standings])
         figure.supxlabel("Mean rank score (1 = best on every environment)", fontsize=9)
     first = standings[0]
+    has_intervals = any(row.score_interval is not None for row in standings)
     return Plot(
         name=f"rank_scores_{suite.name}",
         title=f"{suite_title(suite.name)} rank scores",
         caption="Mean rank score over the suite and over each family of environments."
-        + (" Thin bars: 95 % bootstrap interval over runs." if first.score_interval is not None else ""),
+        + (" Thin bars: 95 % bootstrap interval over runs." if has_intervals else ""),
         alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {first.entry}"
         + (f" at {first.score:.2f}." if first.score is not None else "."),
         data=rows(standings),

@@ -13,10 +13,11 @@ from run_dirs import write_run
 from evopolicy_common.run_record import Tokens
 from evopolicy_coordinator.analysis.audit import audit_signals, token_use
 from evopolicy_coordinator.analysis.edits import classify, edit_rates
-from evopolicy_coordinator.analysis.evolution import Step, area, best_at, episodes_to, evolutions
+from evopolicy_coordinator.analysis.evolution import Step, area, best_at, episodes_to
 from evopolicy_coordinator.analysis.reader import load_runs, read_run
-from evopolicy_coordinator.analysis.scores import RANDOM_ENTRY, score_table
+from evopolicy_coordinator.analysis.scores import RANDOM_ENTRY, references, score_table
 from evopolicy_coordinator.analysis.structure import edit_size_bins, selected_structures, structure_means
+from evopolicy_coordinator.analysis.study import study_of
 
 BROKEN = Version({"policy.py": "import nothing\n"}, (0.0,) * 2, None, "import_error")
 VERSIONS = [
@@ -87,7 +88,7 @@ def test_unchanged_source_with_an_unknown_digest_counts_as_a_retest(tmp_path: Pa
 def test_evolution_gives_area_and_episodes_on_the_environments_scale(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS[:2], budget=32, random_mean=0.0, entry="Slow")  # 10 at 8, 20 at 16
     write_run(tmp_path, [Version(policy(), (0.0,) * 16, 40.0)], budget=32, random_mean=0.0, entry="Fast")
-    fast, slow = evolutions(load_runs([tmp_path]).runs)
+    fast, slow = study_of(load_runs([tmp_path]).runs).evolutions
     assert (fast.entry, slow.entry) == ("Fast", "Slow")
     # The scale is 0 … 40. Slow: 0 to 8, 0.25 to 16, 0.5 to 32. Fast: 0 to 16, 1 to 32.
     assert slow.area == pytest.approx((8 * 0.25 + 16 * 0.5) / 32)
@@ -99,7 +100,7 @@ def test_evolution_gives_area_and_episodes_on_the_environments_scale(tmp_path: P
 
 def test_evolution_without_a_scale_has_no_area(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS[:1], random_mean=50.0)
-    (only,) = evolutions(load_runs([tmp_path]).runs)
+    (only,) = study_of(load_runs([tmp_path]).runs).evolutions
     assert (only.area, only.to_50) == (None, None)
     assert area((), 10, None, None) is None
     assert episodes_to((), 0.5, 0.0, 1.0) is None
@@ -191,6 +192,33 @@ def test_random_reference_of_one_split_counts_once(tmp_path: Path) -> None:
     assert table.reference == RANDOM_ENTRY
     assert table.cells[RANDOM_ENTRY, "gym/acrobot"].scores == (-4.0,)
     assert table.agents == ["Agent A", "B"]
+
+
+def test_tables_and_curves_use_one_random_reference(tmp_path: Path) -> None:
+    steps = [Version(policy(), (0.0,) * 8, 27.5), Version(policy(gain=2.0), (0.0,) * 8, 40.0)]
+    for repeat, mean in enumerate((0.0, 10.0, 35.0)):
+        write_run(tmp_path, steps, budget=32, random_mean=mean, repeat=repeat)
+    found = study_of(load_runs([tmp_path]).runs)
+    assert found.suites[0].table.cells[RANDOM_ENTRY, "gym/acrobot"].scores == (15.0,)
+    # The scale is 15 … 40: 0.5 from 8 to 16, 1 to 32.
+    assert [one.area for one in found.evolutions] == pytest.approx([(8 * 0.5 + 16) / 32] * 3)
+
+
+@pytest.mark.parametrize("newer_first", [True, False])
+def test_a_reference_seeded_by_case_replaces_those_of_earlier_versions(
+    tmp_path: Path, newer_first: bool
+) -> None:
+    names = ["A", "B", "C"] if newer_first else ["C", "B", "A"]
+    write_run(tmp_path, VERSIONS[:1], random_mean=-4.5, entry=names[0], seeded_by="case")
+    write_run(tmp_path, VERSIONS[:1], random_mean=-40.0, entry=names[1])
+    write_run(tmp_path, VERSIONS[:1], random_mean=-50.0, entry=names[2])
+    assert references(load_runs([tmp_path]).runs) == {"gym/acrobot": -4.5}
+
+
+def test_equal_references_stay_bit_for_bit_what_they_are(tmp_path: Path) -> None:
+    for repeat in range(10):
+        write_run(tmp_path, VERSIONS[:1], random_mean=0.1, repeat=repeat, seeded_by="case")
+    assert references(load_runs([tmp_path]).runs) == {"gym/acrobot": 0.1}
 
 
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=12), st.integers(1, 4))

@@ -121,6 +121,22 @@ def test_repeats_give_mean_and_intervals_that_hold_it() -> None:
     assert (a.score_interval.low, a.score_interval.high) == (0.0, 1.0)
 
 
+def test_an_entry_with_a_cell_of_one_run_has_no_interval() -> None:
+    board = leaderboard(
+        table(
+            {
+                "Once": {"gym/acrobot": (9.0,), "gym/ant5": (9.0, 8.0)},
+                "Twice": {"gym/acrobot": (1.0, 2.0), "gym/ant5": (1.0, 2.0)},
+                "R": {"gym/acrobot": (0.0,), "gym/ant5": (0.0,)},
+            },
+            reference="R",
+        )
+    )
+    intervals = {row.entry: (row.score_interval, row.rank_interval) for row in board.standings}
+    assert intervals["Once"] == intervals["R"] == (None, None)
+    assert all(intervals["Twice"])
+
+
 def test_interval_needs_two_runs_with_scores() -> None:
     assert bootstrap_mean((1.0,)) is None
     assert bootstrap_mean((1.0, None)) is None

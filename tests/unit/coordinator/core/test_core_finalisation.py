@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import core_rig
 import hypothesis.strategies as st
 import msgspec
@@ -14,7 +16,8 @@ from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadEvaluation
-from evopolicy_coordinator.core.records import EvaluationRow, SubmitRow
+from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
+from evopolicy_coordinator.core.seeds import policy_seed
 
 
 def value_of(job: Job) -> float:
@@ -81,6 +84,59 @@ def test_a_run_without_an_ok_submit_says_so_and_still_has_its_random_reference()
     finished = rig.finished()
     assert (finished.status, finished.best_submit_index, finished.final_score) == ("no_ok_submit", None, None)
     assert finished.random_heldout_returns == (-2.0,) * 3
+
+
+def random_seeds(rig: Rig, session: str, run: str) -> list[bytes]:
+    """Seeds of a run's random reference, in order of its cases; everything else is played."""
+    found: dict[int, bytes] = {}
+
+    def value(job: Job) -> float:
+        if split_of(job) == "random":
+            found.update((spec.index, spec.policy_seed) for spec in job.episodes)
+        return 1.0
+
+    rig.create(run, key=run)
+    rig.close(run)
+    rig.work_off(session, value)
+    return [found[index] for index in sorted(found)]
+
+
+def test_runs_on_one_split_play_the_same_random_reference() -> None:
+    rig = Rig()
+    session = rig.register()
+    first = random_seeds(rig, session, "r1")
+    assert first == random_seeds(rig, session, "r2")
+    assert len(set(first)) == 3
+    assert rig.finished("r2").reference_by_case
+
+
+def test_a_run_of_an_earlier_version_keeps_its_random_reference() -> None:
+    rig = Rig()
+    rig.create()
+    row = rig.row(RunRow, "r1")
+    rig.rows[RunRow, "r1"] = msgspec.structs.replace(row, reference_by_case=False)
+    rig.load()
+    session = rig.register()
+    found: list[bytes] = []
+
+    def value(job: Job) -> float:
+        found.extend(spec.policy_seed for spec in job.episodes if split_of(job) == "random")
+        return 1.0
+
+    rig.close()
+    rig.work_off(session, value)
+    assert sorted(found) == sorted(policy_seed(row.secret, -1, "random", case, 0) for case in range(3))
+    assert not rig.finished().reference_by_case
+
+
+def test_random_actions_outside_a_run_are_the_reference_of_their_split() -> None:
+    rig = Rig()
+    session = rig.register(slots=3)
+    reference = random_seeds(rig, session, "r1")
+    heldout = rig.row(RunRow, "r1").heldout
+    ask(rig, bundle=None, split="heldout", case_ids=tuple(range(3)), cases=heldout)
+    leases = rig.poll(session, 3)
+    assert sorted(each.job.episodes[0].policy_seed for each in leases) == sorted(reference)
 
 
 def test_a_checkpoint_quarantined_while_hidden_is_ineligible_and_only_the_end_tells() -> None:
@@ -198,23 +254,22 @@ def test_a_restart_at_any_step_changes_nothing_of_the_result(stops: list[int]) -
     assert play(set(stops)) == play(set())
 
 
-def ask(rig: Rig, key: str = "e") -> object:
-    return rig.tell(
-        events.EvaluationRequested(
-            request=rig.request(),
-            evaluation=f"ev-{key}",
-            key=key,
-            env="toy/line",
-            bundle=BUNDLE,
-            split="train",
-            case_ids=(4, 4),
-            cases=(Case(seed=4), Case(seed=4)),
-            secret=b"x",
-            record="full",
-            tier="bwrap",
-            limits=ResourceLimits(),
-        )
-    )
+def ask(rig: Rig, key: str = "e", **changes: Any) -> object:
+    values: dict[str, Any] = {
+        "request": rig.request(),
+        "evaluation": f"ev-{key}",
+        "key": key,
+        "env": "toy/line",
+        "bundle": BUNDLE,
+        "split": "train",
+        "case_ids": (4, 4),
+        "cases": (Case(seed=4), Case(seed=4)),
+        "secret": b"x",
+        "record": "full",
+        "tier": "bwrap",
+        "limits": ResourceLimits(),
+    }
+    return rig.tell(events.EvaluationRequested(**values | changes))
 
 
 def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:

@@ -8,8 +8,9 @@ import hmac
 import hypothesis.strategies as st
 from hypothesis import given
 
+from evopolicy_common.messages.environment import Case
 from evopolicy_coordinator.core.retry import backoff_s, decide
-from evopolicy_coordinator.core.seeds import occurrences, policy_seed
+from evopolicy_coordinator.core.seeds import occurrences, policy_seed, reference_seed
 from evopolicy_coordinator.core.settings import CoreSettings
 
 SETTINGS = CoreSettings()
@@ -29,6 +30,19 @@ def test_no_two_episodes_of_a_run_share_a_policy_seed() -> None:
         for time in range(3)
     }
     assert len(seeds) == 5 * 4 * 12 * 3
+
+
+def test_a_reference_seed_follows_from_split_and_case_alone() -> None:
+    expected = hashlib.sha256(b'evopolicy random reference\0["heldout", 7, {"a": 1, "b": 2}, 0]').digest()
+    assert reference_seed("heldout", Case(seed=7, options={"b": 2, "a": 1}), 0) == expected[:16]
+    assert reference_seed("train", Case(seed=7, options={}), 0) == reference_seed("train", Case(seed=7), 0)
+    seeds = {
+        reference_seed(split, Case(seed=seed), time)
+        for split in ("train", "validation", "heldout")
+        for seed in range(12)
+        for time in range(3)
+    }
+    assert len(seeds) == 3 * 12 * 3
 
 
 @given(st.lists(st.integers(0, 4)))
