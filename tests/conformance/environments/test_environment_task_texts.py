@@ -55,6 +55,68 @@ def test_a_text_has_an_objective_and_all_sections_and_names_the_step_limit(env_i
     assert "include:" not in text
 
 
+EQUATIONS = {
+    "an assignment": r"←|:=",
+    "a difference, sum or root": r"[ΔΣ√∫]|\w′|\w''",
+    "a power": r"[\w)]\s?(²|³|\^)",
+    "a function of a variable": r"\b(cos|sin|tan|atan|exp|sqrt)\b ?[(\w]",
+    "a weight before a variable": r"\d\.\d+ ?[·*×]|\d\.\d+ (?![msN]\b)[a-zA-Zθωφ][ᵢⱼ\d]?\b",
+}
+"""Signs that a text gives equations of motion or a reward's formula."""
+IN_CODE = {"arithmetic": r"[\w)\]] [+*/×÷−<>] [\w(]|\w[*/+]\w", "a norm": r"\|.+ − .+\|"}
+"""The same within backticks."""
+CONSTANTS = {
+    "mass, inertia, damping or gravity": r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²",
+    "an integrator or its time step": r"Runge|Euler(?! angles)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s",
+    "a distribution of the start": r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
+}
+
+
+def flags(text: str) -> list[str]:
+    """Which signs of equations and constants stand in a text, tables of observations aside: they give units and scales."""
+    head, _, rest = text.partition("## Observation")
+    observation, _, rest = rest.partition("## Action")
+    prose = "\n".join(line for line in observation.splitlines() if not line.startswith("|"))
+    parts = (head, prose, rest)
+    code = [span for part in parts for span in re.findall(r"`([^`\n]+)`", part)]
+    searches = [(EQUATIONS | CONSTANTS, parts), (IN_CODE, code)]
+    return [
+        f"{kind}: {found[0]!r}"
+        for signs, texts in searches
+        for kind, sign in signs.items()
+        for text in texts
+        if (found := re.search(sign, text))
+    ]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_text_describes_dynamics_and_reward_in_words(env_id: str, warm: Warm) -> None:
+    # The rule of the budget: nobody can simulate the environment from its text.
+    assert flags(warm(env_id).description.task_text) == []
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        "One step: `v ← v + 0.0015 a − 0.0025 cos(3x)`, held within ±0.07.",
+        "Each step `Δx / 0.05 − 0.1 Σ aᵢ²`, Δx being the way forward.",
+        "Each step `−|cylinder − goal| − 0.5 |cylinder − wrist|`.",
+        "`1 − 0.9 t / 2560` on the step t that steps on the goal.",
+        "θ2'' = (a + d2/d1 φ1 − 0.5 ω1² sin θ2 − φ2) / (1.25 − d2²/d1)",
+        "Both links: length 1 m, mass 1 kg; g = 9.8 m/s²; no friction.",
+        "One step is 0.2 s, one fourth-order Runge–Kutta step.",
+        "three times 1/15 s of `β = atan(tan(δ)/2)`",
+        "Terminates when `−cos θ1 − cos(θ1 + θ2) > 1`.",
+        "All positions are uniform in ±0.1, all velocities normal with standard deviation 0.1.",
+        "fingertip = (0.1 cos θ1 + 0.11 cos(θ1 + θ2), 0.1 sin θ1 + 0.11 sin(θ1 + θ2)).",
+        "Each joint has damping 1 N m s/rad and armature inertia 1 kg m².",
+    ],
+)
+def test_equation_or_constant_in_a_text_is_found(told: str) -> None:
+    assert flags(f"# Title\n\n## Observation\n\n{told}\n\n## Action\n")
+    assert flags(f"# Title\n\n## Observation\n\n## Action\n\n## Reward\n\n{told}\n")
+
+
 def test_no_text_is_left_without_an_environment() -> None:
     known = {env_id.replace("/", "_") + ".md" for env_id in entries()}
     folder = files("evopolicy_worker.environments.tasks")
