@@ -63,17 +63,17 @@ NO_URLS = Urls(info="INFO_URL", task="TASK_URL", submit="SUBMIT_URL")
 _TEXT = Template("""\
 # Improve a policy
 
-You improve one program, `system/policy.py`, that plays an environment: `$env`. You may run as many experiments on this
-machine as you like, but only a **submit** plays the environment, and the run has a budget of **$budget episodes**.
+You improve one program, `system/policy.py`, that plays an environment: `$env`. Only a **submit** plays the environment, and
+the run has a budget of **$budget episodes**. $evidence
 
 1. Read the task: what is observed, what actions do, how reward is computed.
 2. Edit `system/policy.py` (and other files in `system/`).
 3. Submit it on train cases. Read the feedback. Repeat while budget remains.
 
-When the budget is spent or you stop, every submit with status `ok` is scored on hidden cases; the best of them is your
-result, its mean return on further hidden cases your score. So what counts is how a policy does on cases it has not seen.
+When the budget is spent or you stop, every submit with status `ok` plays hidden validation cases. The best of them is your
+result, and its mean return on further hidden cases is your score: a policy must do well on cases it has not seen.
 
-## Where things are
+$rule## Where things are
 
 | path | what |
 |---|---|
@@ -176,10 +176,40 @@ Episodes are numbered through the run. While a submit runs, its finished episode
 
 ## Not allowed
 
-- Looking for hidden cases, seeds or scores, or for other runs; reaching the environment in any way but a submit.
+- Looking for hidden cases, seeds or scores, or for other runs.
 - Changing `feedback/` or this file; interfering with the service or with the sandbox.
 - Policies that try to tell hidden cases from train cases, or that leave data behind for later.
 """)
+
+
+_EVIDENCE = {
+    "forbidden": "What you know of it comes from submitted episodes\nand from nothing else.",
+    "allowed": "This run lets you experiment with\nsimulations of your own as well; only submits count.",
+}
+_RULE = {
+    "forbidden": """\
+## The rule of the budget
+
+Rollouts happen through a submit and in no other way. Every experiment with the environment costs episodes, so that agents
+can be compared by what they learn from them.
+
+Not allowed, on this machine or elsewhere:
+
+- Running the environment or another simulator of it: Gymnasium, MuJoCo, Box2D, highway-env, MiniGrid or the like.
+- Copying or rewriting its dynamics or its reward function, from memory, from sources or from a fit to the feedback, in order
+  to produce observations, rewards, lengths, returns or scores.
+- Training, searching or tuning a policy in such a simulation. This holds for code in `system/` too.
+
+Allowed:
+
+- Unit tests of your own code, such as a parser, a controller or a planner on inputs that you made up.
+- Analysing `feedback/`: statistics, plots, comparing trajectories of submits.
+- Replaying recorded observations through a policy to see which actions it takes.
+- Control laws, geometry and search over what an observation shows, as long as they do not step the environment's dynamics.
+
+""",
+    "allowed": "",
+}
 
 
 def agents_md(run: RunOpened, urls: Urls) -> str:
@@ -203,6 +233,8 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         example=str(example),
         ranges="0-3,7" if usual else _ranges(n_example, run.n_env_instances),
         scope=scope,
+        evidence=_EVIDENCE[run.simulation],
+        rule=_RULE[run.simulation],
         imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "nothing else",
         first_submit=submit_id(0, run.episode_budget),
         first_episode=episode_name(0, run.episode_budget),

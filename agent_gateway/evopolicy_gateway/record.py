@@ -104,6 +104,7 @@ def run_record(
             max_episodes_per_submit=staged.max_episodes_per_submit if staged else 0,
             policy_scope=settings.policy_scope,
             observations=settings.observations,
+            simulation=settings.simulation,
             n_train=staged.n_train if staged else 0,
             n_validation=settings.n_validation or suite.n_validation,
             n_heldout=len(heldout or finished.random_heldout_returns)

@@ -10,7 +10,7 @@ import typer
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope
-from evopolicy_common.messages.gateway import VideoOption
+from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.door import Door, door_of
@@ -52,6 +52,12 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
         str, typer.Option(help="episode: a fresh Policy each; submit: one through a submit.")
     ] = "episode"
     observations: Annotated[str, typer.Option(help="arrays, or lists as in v2.0-draft.")] = "arrays"
+    simulation: Annotated[
+        str,
+        typer.Option(
+            help="forbidden: only submits play the environment; allowed: the agent may simulate it."
+        ),
+    ] = "forbidden"
     tier: TierName = "bwrap"
     video: Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")] = "off"
     replays: Annotated[
@@ -82,6 +88,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             n_heldout=self.heldout,
             policy_scope=one_of("--policy-scope", self.policy_scope, PolicyScope),  # type: ignore[arg-type]
             observations=one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
+            simulation=one_of("--simulation", self.simulation, SimulationRule),  # type: ignore[arg-type]
             sandbox_tier=tier_of(self.tier),
             video=one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
             replays=None if self.replays is None else one_of("--replays", self.replays, VideoOption),  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
+from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
 
 SCHEMA_VERSION = 1
 """Raised only when an older reader would misunderstand a file; fields may be added without it."""
@@ -74,6 +74,8 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     n_heldout: int
     video: VideoOption = "off"
     limits: ResourceLimits | None = None
+    simulation: SimulationRule = "allowed"
+    """Whether the agent's rules let it simulate the environment. Runs from before this was recorded had no rule against it."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):

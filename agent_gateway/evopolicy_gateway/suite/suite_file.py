@@ -19,7 +19,7 @@ from evopolicy_common import catalogue, keys
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import ResourceLimits, Tier
-from evopolicy_common.messages.gateway import VideoOption
+from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
@@ -44,6 +44,7 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     heldout: Positive | None = None
     policy_scope: PolicyScope | None = None
     observations: ObservationForm | None = None
+    simulation: SimulationRule | None = None
     tier: Tier | None = None
     video: VideoOption | None = None
     replays: VideoOption | None = None
@@ -274,6 +275,7 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         n_heldout=table.heldout,
         policy_scope=table.policy_scope or "episode",
         observations=table.observations or "arrays",
+        simulation=table.simulation or "forbidden",
         sandbox_tier=table.tier or "bwrap",
         video=table.video or "off",
         replays=table.replays,

@@ -28,6 +28,8 @@ SubmitStatus = Literal[
     "quarantined",
 ]
 VideoOption = Literal["off", "first", "all"]
+SimulationRule = Literal["forbidden", "allowed"]
+"""Whether the agent's rules let it simulate the environment outside its submits."""
 
 
 class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
@@ -112,6 +114,7 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     allowed_imports: tuple[str, ...]
     denied_imports: tuple[str, ...]
     state: RunState
+    simulation: SimulationRule = "forbidden"
 
 
 class StateRequest(Message, frozen=True, kw_only=True, tag="state"):

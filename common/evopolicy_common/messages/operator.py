@@ -9,7 +9,7 @@ import msgspec
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
+from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
 from evopolicy_common.messages.worker import (
     BlobAck,
     BlobChunk,
@@ -56,6 +56,7 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     notes: dict[str, str] = {}
     """The operator's own labels; kept in `run.json`."""
     hidden_cases: HiddenCases = "shared"
+    simulation: SimulationRule = "forbidden"
     agent_host: str = ""
     """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
 

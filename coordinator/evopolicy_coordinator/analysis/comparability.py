@@ -48,6 +48,7 @@ _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "episode budget": lambda run: str(run.budget),
     "policy scope": lambda run: run.record.experiment_dimensions.policy_scope,
     "observation form": lambda run: run.record.experiment_dimensions.observations,
+    "simulation rule": lambda run: run.record.experiment_dimensions.simulation,
     "jail": lambda run: run.record.jail,
 }
 _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {

@@ -174,6 +174,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
             limits=settings.limits,
             allowed_imports=row.allowed_imports,
             denied_imports=row.denied_imports,
+            simulation=settings.simulation,
             state=run_state(core, run),
         ),
     )

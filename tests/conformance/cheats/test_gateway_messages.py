@@ -32,6 +32,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "allowed_imports": "[str]",
         "denied_imports": "[str]",
         "state": "RunState",
+        "simulation": "'allowed' | 'forbidden'",
     },
     "EnvironmentDescription": {
         "env": "str",

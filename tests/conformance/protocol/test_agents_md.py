@@ -72,6 +72,20 @@ def test_every_path_in_the_rules_exists_after_a_submit(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
+def test_rules_forbid_every_rollout_outside_a_submit_unless_the_run_allows_it() -> None:
+    text = agents_md(opened(), NO_URLS)
+    rule = text.partition("## The rule of the budget")[2].partition("\n## ")[0]
+    forbidden, _, allowed = rule.partition("Allowed:")
+    for word in ("Gymnasium", "MuJoCo", "dynamics", "reward", "simulator"):
+        assert word in forbidden
+    for word in ("Unit tests", "`feedback/`", "recorded observations"):
+        assert word in allowed
+    assert "as many experiments" not in text
+    free = agents_md(opened(simulation="allowed"), NO_URLS)
+    assert "rule of the budget" not in free
+    assert "simulations of your own" in free
+
+
 @given(data=st.data(), n_ids=st.integers(1, 70), budget=st.integers(1, 300))
 def test_every_example_request_is_accepted_in_a_run_of_any_size(
     data: st.DataObject, n_ids: int, budget: int
