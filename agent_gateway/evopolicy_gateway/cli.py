@@ -19,7 +19,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_difference import differences, left_out
-from evopolicy_gateway import door, harnesses, options, processes, trials
+from evopolicy_gateway import door, options, processes, trials
 from evopolicy_gateway.door import Door
 from evopolicy_gateway.gateway import folder_of
 from evopolicy_gateway.jail.settings import JailSettings
@@ -210,7 +210,6 @@ def _plans(
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
     started_in = Path.cwd()
-    harnesses.make(given.agent, started_in)
     exp_id = given.exp_id or options.default_exp_id()
     plans = [
         Plan(

@@ -27,7 +27,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
-from evopolicy_gateway import children, control, record
+from evopolicy_gateway import children, control, harnesses, record
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
     AgentDoing,
@@ -84,8 +84,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         return run_folder(self.runs, self.settings.entry, self.settings.env, self.settings.exp_id)
 
     def check(self) -> None:
-        """ConfigError when the agent's jail or the run's folder cannot be had: there is one that may not be overwritten."""
+        """ConfigError when the agent cannot start, or its jail or the run's folder cannot be had, such as one that may not
+        be overwritten."""
         check_agent(self.agent, self.door)
+        harnesses.make(self.agent, self.started_in, self.config).check()
         self.jail.check()
         folder = self.folder
         if not folder.root.exists():

@@ -149,6 +149,13 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     auxiliary: dict[str, Any] = {}
     """What an environment reports beside the return, such as means of reward components."""
 
+    @property
+    def agent_never_played(self) -> bool:
+        """The agent failed before it used any budget, such as a CLI that did not start: this is no run of that agent."""
+        return (
+            self.status == "no_ok_submit" and self.closed_reason == "agent_failed" and self.budget_used == 0
+        )
+
 
 class RejectedSubmit(msgspec.Struct, frozen=True, kw_only=True):
     """A request that was refused before the snapshot and cost nothing."""

@@ -129,6 +129,9 @@ class Harness(ABC):
     resumable = False
     """It goes on from `Stage.session_file` after everything of it was killed."""
 
+    def check(self) -> None:  # noqa: B027
+        """ConfigError where the agent cannot be started on this machine; to be asked before a run is opened."""
+
     @abstractmethod
     async def play(self, stage: Stage) -> Ending:
         """Plays until the agent stops by itself. Cancelled when the run is over for another reason."""

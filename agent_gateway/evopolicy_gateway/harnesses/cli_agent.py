@@ -11,14 +11,17 @@ Rules:
 from __future__ import annotations
 
 import asyncio
+import os
 import random
 import shutil
 import subprocess
 import uuid
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import structlog
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import prompts, session
 from evopolicy_gateway.harnesses.base import AgentError, Doing, Ending, Harness, Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
@@ -51,6 +54,11 @@ class CliAgent(Harness):
         self._failures = 0
         """Failed turns since the last one that was done."""
         self._pause_s = self._config.pause_s
+
+    def check(self) -> None:
+        environment = os.environ | self._dialect.environment() | self._config.environment
+        if (missing := self._missing(environment)) is not None:
+            raise ConfigError(missing)
 
     async def play(self, stage: Stage) -> Ending:
         self._config.check(stage.environment)
@@ -188,12 +196,20 @@ class CliAgent(Harness):
                 return f"cap reached: {cost:.2f} of {config.max_cost:.2f} dollars spent"
         return None
 
+    def _missing(self, environment: Mapping[str, str]) -> str | None:
+        """What is missing where the program is not there."""
+        name, install = self._program[0], self._dialect.install
+        if shutil.which(name, path=environment.get("PATH")) is not None:
+            return None
+        return f"there is no program {name!r} on the PATH" + (
+            f"; install it with: {install}" if install else ""
+        )
+
     async def _probe(self, stage: Stage) -> None:
         """Finds the program, its version and its options. AgentError says what is missing."""
         name, dialect = self._program[0], self._dialect
-        if shutil.which(name, path=stage.environment.get("PATH")) is None:
-            how = f"; install it with: {dialect.install}" if dialect.install else ""
-            raise AgentError(f"no program {name!r} on the PATH{how}")
+        if (missing := self._missing(stage.environment)) is not None:
+            raise AgentError(missing)
         said = await self._ask(stage, dialect.version_args())
         self._version = dialect.version_in(said)
         if not dialect.help_args:

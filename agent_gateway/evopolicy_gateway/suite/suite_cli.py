@@ -129,6 +129,8 @@ async def _suite(order: Order) -> int:
             decisions.check_changes(decided, order.changed)
             if order.dry_run:
                 return 0
+            begun = [one.run for one in decided if one.kind in ("new", "resume", "restart")]
+            suite_file.check_agents_start(begun, started_in)
             for one in decided:
                 if one.kind == "keep":
                     _keep(order, index, one)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -222,6 +223,15 @@ def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> li
         if agent.name in taking_part:
             _check_agent(agent, started_in)
     return runs
+
+
+def check_agents_start(runs: Iterable[SuiteRun], started_in: Path) -> None:
+    """ConfigError where an agent of these runs cannot be started on this machine, such as a CLI that is missing."""
+    for run in {run.agent: run for run in runs}.values():
+        try:
+            harnesses.make(run.harness, started_in, run.config).check()
+        except ConfigError as error:
+            raise ConfigError(f"agent {run.agent!r}: {error}") from error
 
 
 def _check_agent(agent: AgentTable, started_in: Path) -> None:

@@ -89,10 +89,8 @@ def save(root: Path, index: Index) -> None:
 
 
 def state_of(record: RunRecord) -> State:
-    """How a sweep takes a finished run: one whose agent failed before it used any budget was no run of that agent."""
-    outcome = record.outcome
-    failed = outcome.closed_reason == "agent_failed" and outcome.budget_used == 0
-    return "error" if failed else outcome.status
+    """How a sweep takes a finished run: one whose agent never played was no run of that agent."""
+    return "error" if record.outcome.agent_never_played else record.outcome.status
 
 
 def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path, **more: Any) -> Entry:

@@ -41,6 +41,15 @@ def plan(tmp_path: Path, **fields: Any) -> Plan:
     return Plan(**usual | fields)
 
 
+def test_a_cli_that_is_missing_is_refused_before_the_run_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ConfigError, match="no program 'claude' on the PATH; install it with: "):
+        plan(tmp_path, agent="claude-code").claim()
+    assert not list(tmp_path.iterdir())
+
+
 STAGED = Staged(
     agents_md_hash="h",
     initial_policy_hash="i",

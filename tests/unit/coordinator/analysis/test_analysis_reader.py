@@ -50,6 +50,16 @@ def test_run_is_read_from_checkpoints_when_feedback_is_gone(tmp_path: Path) -> N
     assert [submit.status for submit in run.submits] == ["ok", "import_error", "ok"]
 
 
+def test_a_run_whose_agent_never_played_is_left_out(tmp_path: Path) -> None:
+    write_run(tmp_path, [], entry="Missing CLI", closed_reason="agent_failed")
+    write_run(tmp_path, [], entry="Gave up")
+    write_run(tmp_path, VERSIONS[1:2], entry="Crashed", closed_reason="agent_failed")
+    found = study([tmp_path])
+    assert found.entries == ["Crashed", "Gave up"]
+    (left,) = found.left_out
+    assert "failed before it used any budget" in left.reason
+
+
 def test_unknown_fields_are_skipped(tmp_path: Path) -> None:
     folder = write_run(tmp_path, VERSIONS)
     record = json.loads((folder / "run.json").read_text())

@@ -14,7 +14,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Decision, Found, check_changes, decide, feedback_bytes, told
-from evopolicy_gateway.suite.suite_file import SuiteRun, expand, read
+from evopolicy_gateway.suite.suite_file import SuiteRun, check_agents_start, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index, used
 from evopolicy_gateway.suite.suite_view import TableView
 
@@ -66,6 +66,18 @@ def test_runs_are_agents_times_environments_times_repeats_with_overrides(tmp_pat
     assert by_name["GPT/toy/maze/0"].settings.n_heldout == 4
     assert by_name["GPT/toy/line/1"].settings.exp_id == "s-1"
     assert len({run.digest for run in runs}) == len(runs)
+
+
+def test_a_cli_that_is_missing_is_refused_before_a_run_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = suite_in(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    check_agents_start([run for run in runs if run.agent == "evolve"], tmp_path)
+    with pytest.raises(
+        ConfigError, match="'GPT': there is no program 'codex' on the PATH; install it with: npm"
+    ):
+        check_agents_start(runs, tmp_path)
 
 
 def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
