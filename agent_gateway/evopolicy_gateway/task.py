@@ -113,6 +113,7 @@ def _limits(run: RunOpened) -> str:
         ("files written", f"{_size(limits.file_bytes)}, {limits.files:,} files"),
         ("open files", str(limits.open_files)),
         ("one action, beyond 16 bytes for each of its numbers", _size(limits.action_bytes)),
+        ("what larger actions come to in one episode", _size(limits.episode_action_bytes)),
         ("kept of stdout and of stderr", f"{_size(limits.output_bytes)} each"),
     ]
     if limits.submit_wall_s is not None:

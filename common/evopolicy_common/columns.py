@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -16,10 +16,18 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-MAX_COLUMN_BYTES = 1 << 30
+MAX_COLUMN_BYTES = 1 << 28
 """A column of pictures that claims to be larger is not decoded."""
+MAX_ROWS = 16384
+"""Rows of one block."""
+MAX_AXES = 32
+"""Axes of one array."""
+MAX_EMPTY = 1 << 16
+"""An array without numbers, such as one of shape (n, 0), is at most so many empty lists when it is written as lists."""
 
 _EXT_ARRAY, _EXT_INT = 1, 2
+_ZSTD_BLOCK_BYTES, _ZSTD_LEAST_BYTES = 128 << 10, 4
+"""A zstd block holds at most 128 KiB and takes at least 4 bytes."""
 
 
 def pack(values: list[Any]) -> list[Any]:
@@ -32,6 +40,7 @@ def pack(values: list[Any]) -> list[Any]:
             type(value) is np.ndarray and value.dtype == first.dtype and value.shape == first.shape
             for value in values
         ):
+            _check_shape(first.shape)
             joined = b"".join([value.tobytes() for value in values])
             return ["array", n, first.dtype.str, list(first.shape), joined]
         return ["values", values]
@@ -59,6 +68,7 @@ class Pictures:
     """A column of large arrays, all of one shape and dtype, compressed one by one."""
 
     def __init__(self, first: NDArray[Any]) -> None:
+        _check_shape(first.shape)
         self._dtype = first.dtype
         self._shape = first.shape
         self._n = 0
@@ -187,19 +197,20 @@ def _require_equal(n: int, parts: list[Column]) -> None:
         raise ValueError(f"columns of {n} rows have {[len(part) for part in parts]}")
 
 
-def unpack(packed: list[Any]) -> Column:
-    """The column of what `pack` or `Pictures.packed` gave; ValueError when it is none."""
+def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
+    """The column of what `pack` or, with `pictures`, `Pictures.packed` gave; ValueError when it is none."""
     kind = packed[0]
     if kind == "array":
         _, n, dtype, shape, data = packed
-        return Arrays(_array(dtype, data).reshape(n, *shape), scalar=False)
-    if kind == "pictures":
+        return Arrays(_shaped(_array(dtype, data), shape, n), scalar=False)
+    if kind == "pictures" and pictures:
         _, n, dtype, shape, data = packed
-        size = n * np.dtype(dtype).itemsize * math.prod(shape)
-        if not 0 < size <= MAX_COLUMN_BYTES:
-            raise ValueError(f"pictures of {size} bytes")
+        _check_shape((n, *shape))
+        size = n * _dtype(dtype).itemsize * math.prod(shape)
+        if not 0 < size <= min(MAX_COLUMN_BYTES, most_of(data)):
+            raise ValueError(f"{len(data)} bytes that claim to be pictures of {size} bytes")
         raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        return Arrays(_array(dtype, raw).reshape(n, *shape), scalar=False)
+        return Arrays(_shaped(_array(dtype, raw), shape, n), scalar=False)
     if kind == "scalar":
         return Arrays(_array(packed[1], packed[2]), scalar=True)
     if kind == "text":
@@ -240,15 +251,74 @@ def join(columns: list[Column]) -> Column:
 # Values that msgpack has no form for.
 
 
+def most_of(compressed: bytes) -> int:
+    """The most bytes that a zstd frame can hold, whatever it claims: what it claims is allocated at once."""
+    return (len(compressed) // _ZSTD_LEAST_BYTES + 1) * _ZSTD_BLOCK_BYTES
+
+
+def count_values(packed: bytes, most: int) -> int:
+    """How many values a msgpack text is made of, as far as `most` and one; each may become an object of 72 bytes.
+
+    A run through the text: values follow each other, however they nest.
+    """
+    n, at, end = 0, 0, len(packed)
+    while at < end and n <= most:
+        head, (fixed, counted) = packed[at], _SIZES[packed[at]]
+        at += 1
+        if counted:
+            fixed += int.from_bytes(packed[at : at + counted], "big") + counted
+        elif 0xA0 <= head < 0xC0:
+            fixed = head & 0x1F
+        at += fixed
+        n += 1
+    return n
+
+
+_SIZES = [(0, 0)] * 256
+"""By a value's first byte: how many bytes follow it, and how long the number is that counts others."""
+for _head, _fixed in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
+    _SIZES[_head] = _fixed, 0
+for _head, _fixed in zip(range(0xD4, 0xD9), (2, 3, 5, 9, 17), strict=True):
+    _SIZES[_head] = _fixed, 0
+for _head, _fixed in zip(
+    range(0xDC, 0xE0), (2, 4, 2, 4), strict=True
+):  # lists and maps: what is in them follows
+    _SIZES[_head] = _fixed, 0
+for _first, _extra in ((0xC4, 0), (0xC7, 1), (0xD9, 0)):
+    for _k, _counted in enumerate((1, 2, 4)):
+        _SIZES[_first + _k] = _extra, _counted
+
+
+def _check_shape(shape: Sequence[int]) -> None:
+    """ValueError for a shape that no array of ours has: too many axes, or nothing but endless empty lists."""
+    if len(shape) > MAX_AXES or any(type(n) is not int or n < 0 for n in shape):
+        raise ValueError(f"an array of shape {str(list(shape))[:200]}")
+    if 0 in shape and math.prod(max(1, n) for n in shape) > MAX_EMPTY:
+        raise ValueError(f"an array of shape {tuple(shape)}: {MAX_EMPTY:,} empty lists are the limit")
+
+
+def _shaped(array: NDArray[Any], shape: Sequence[int], n: int) -> NDArray[Any]:
+    """`array` as `n` rows of that shape."""
+    if type(n) is not int or not 0 <= n <= MAX_ROWS:
+        raise ValueError(f"a column of {n} rows; {MAX_ROWS:,} are the limit")
+    _check_shape(shape)
+    return array.reshape(n, *shape)
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    kind = np.dtype(name) if type(name) is str and len(name) <= 8 else None
+    if kind is None or kind.kind not in "biuf":
+        raise ValueError(f"no columns of dtype {str(name)[:80]!r}")
+    return kind
+
+
 def _array(dtype: str, data: bytes) -> NDArray[Any]:
-    kind = np.dtype(dtype)
-    if kind.kind not in "biuf":
-        raise ValueError(f"no columns of dtype {dtype!r}")
-    return np.frombuffer(data, dtype=kind)
+    return np.frombuffer(data, dtype=_dtype(dtype))
 
 
 def _enc_hook(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        _check_shape(value.shape)
         head = [value.dtype.str, list(value.shape), value.tobytes()]
         return msgspec.msgpack.Ext(_EXT_ARRAY, encoder.encode(head))
     if isinstance(value, np.generic | np.ndarray):
@@ -259,6 +329,7 @@ def _enc_hook(value: Any) -> Any:
 def _ext_hook(code: int, data: memoryview) -> Any:
     if code == _EXT_ARRAY:
         dtype, shape, raw = decoder.decode(data)
+        _check_shape(shape)
         return _array(dtype, raw).reshape(shape)
     if code == _EXT_INT:
         return int(bytes(data))

@@ -30,9 +30,18 @@ PICTURE_BYTES = 4096
 """Arrays of this size or more are compressed as they come."""
 PICTURES_BLOCK_BYTES = 64 << 20
 """A block of pictures, uncompressed."""
-BLOCK_ROWS = 16384
-MAX_BLOCK_BYTES = 1 << 30
-"""A block that claims to be larger is not decoded."""
+BLOCK_ROWS = columns.MAX_ROWS
+MAX_BLOCK_BYTES = 1 << 28
+"""No larger block is made or decoded."""
+MAX_ROWS = 1 << 22
+"""Steps of an episode."""
+MAX_BYTES = 4 << 30
+"""No trajectory is decoded whose blocks and pictures come to more, unpacked. 27,000 frames of Atari are 2.7 GB."""
+MAX_VALUES = 1 << 23
+"""The same for the values in its blocks, arrays counting as one: Python's objects take more than bytes do."""
+_MAX_HEADER_BYTES = 4096
+_UNCOUNTED_BYTES = 4 << 20
+"""The first blocks, up to so many bytes, are decoded without a count of their values."""
 
 _LENGTH = struct.Struct("<I")
 _TERMINATED, _TRUNCATED = 1, 2
@@ -101,6 +110,7 @@ class Recorder:
         header = columns.encoder.encode({"record": record, "observations": observations})
         self._parts: list[bytes] = [MAGIC, _LENGTH.pack(len(header)), header]
         self._block_rows = 0
+        self._n_packed = 0
         self._pictures: columns.Pictures | None = None
         self._clear()
 
@@ -160,6 +170,12 @@ class Recorder:
             "infos": self._infos if any(self._infos) else len(self._infos),
         }
         packed = columns.encode(block)
+        self._n_packed += len(self._rewards)
+        if len(packed) > MAX_BLOCK_BYTES or self._n_packed > MAX_ROWS:
+            raise ProtocolError(
+                f"an episode of {self._n_packed:,} steps with a block of {len(packed):,} bytes cannot be recorded;"
+                f" {MAX_ROWS:,} and {MAX_BLOCK_BYTES:,} are the limits"
+            )
         level = 1 if len(packed) > _QUICK_BYTES else 3
         compressed = zstandard.ZstdCompressor(level=level).compress(packed)
         self._parts += [_LENGTH.pack(len(compressed)), compressed]
@@ -184,6 +200,7 @@ def decode(data: bytes) -> Trajectory:
         IndexError,
         OverflowError,
         RecursionError,
+        MemoryError,
     ) as error:
         raise ProtocolError(f"{len(data)} bytes are not a trajectory: {error}") from error
 
@@ -192,35 +209,18 @@ def _decode(data: bytes) -> Trajectory:
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("they do not begin with the format's mark")
     frames = _frames(data)
-    header = columns.decoder.decode(next(frames, b""))
-    decompressor = zstandard.ZstdDecompressor()
-    blocks: list[dict[str, Any]] = []
-    for frame in frames:
-        size = zstandard.frame_content_size(frame)
-        if not 0 < size <= MAX_BLOCK_BYTES:
-            raise ValueError(f"a block claims {size} bytes")
-        blocks.append(columns.decoder.decode(decompressor.decompress(frame)))
+    header = columns.decoder.decode(next(frames, b"")[:_MAX_HEADER_BYTES])
     full = header["record"] == "full"
+    blocks = _blocks(frames, full)
     lists = header["observations"] == "lists"
-    observed = columns.join([columns.unpack(block["obs"]) for block in blocks]) if full and blocks else None
-    acted = (
-        columns.join([columns.unpack(block["actions"]) for block in blocks]) if blocks else columns.Values([])
+    observed = (
+        columns.join([block.obs for block in blocks if block.obs is not None]) if full and blocks else None
     )
-    flags = np.frombuffer(b"".join(block["flags"] for block in blocks), dtype=np.uint8)
-    rewards = np.frombuffer(b"".join(block["rewards"] for block in blocks), dtype="<f8").astype(np.float64)
-    infos: list[dict[str, Any]] = []
-    for block in blocks:
-        kept = block["infos"]
-        infos += [{} for _ in range(kept)] if isinstance(kept, int) else kept
+    acted = columns.join([block.actions for block in blocks]) if blocks else columns.Values([])
+    flags = np.frombuffer(b"".join(block.flags for block in blocks), dtype=np.uint8)
+    rewards = np.frombuffer(b"".join(block.rewards for block in blocks), dtype="<f8").astype(np.float64)
+    infos = [info for block in blocks for info in block.infos]
     n = len(rewards)
-    lengths = {
-        len(flags),
-        len(acted),
-        len(observed) if observed is not None else n,
-        len(infos) if full else n,
-    }
-    if lengths != {n}:
-        raise ValueError(f"columns of {n} rows have {sorted(lengths)}")
     form = _as_lists if lists else _same
 
     def obs_at(t: int) -> Any:
@@ -238,6 +238,57 @@ def _decode(data: bytes) -> Trajectory:
         infos=infos,
         obs_at=obs_at,
     )
+
+
+class _Block(NamedTuple):
+    """The rows of one block."""
+
+    obs: columns.Column | None
+    actions: columns.Column
+    rewards: bytes
+    flags: bytes
+    infos: list[dict[str, Any]]
+
+
+def _blocks(frames: Iterator[bytes], full: bool) -> list[_Block]:
+    """The blocks in `frames`, of which nothing is taken at its word: sizes and counts are held to the limits first."""
+    decompressor = zstandard.ZstdDecompressor()
+    blocks: list[_Block] = []
+    n_bytes = n_values = n_rows = 0
+    for frame in frames:
+        size = zstandard.frame_content_size(frame)
+        if not 0 < size <= min(MAX_BLOCK_BYTES, columns.most_of(frame)):
+            raise ValueError(f"a block of {len(frame)} bytes claims {size}")
+        n_bytes += size
+        packed = decompressor.decompress(frame)
+        if n_bytes > _UNCOUNTED_BYTES:
+            n_values += columns.count_values(packed, MAX_VALUES - n_values)
+        if n_values > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES:,} values")
+        block = columns.decoder.decode(packed)
+        n = len(block["rewards"]) // 8
+        n_rows += n
+        if not 0 < n <= BLOCK_ROWS or n_rows > MAX_ROWS:
+            raise ValueError(f"a block of {n} rows, {n_rows} in all")
+        obs = columns.unpack(block["obs"], pictures=True) if full else None
+        if block["obs"] and block["obs"][0] == "pictures" and isinstance(obs, columns.Arrays):
+            n_bytes += obs.array.nbytes
+        if n_bytes > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES:,} bytes")
+        actions = columns.unpack(block["actions"])
+        infos = block["infos"]
+        if isinstance(infos, int):
+            infos = [{} for _ in range(n)] if infos == n else []
+        lengths = {
+            len(actions),
+            len(block["flags"]),
+            len(infos) if full else n,
+            n if obs is None else len(obs),
+        }
+        if lengths != {n}:
+            raise ValueError(f"columns of {n} rows have {sorted(lengths)}")
+        blocks.append(_Block(obs, actions, block["rewards"], block["flags"], infos))
+    return blocks
 
 
 def _frames(data: bytes) -> Iterator[bytes]:

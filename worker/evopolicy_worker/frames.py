@@ -8,6 +8,7 @@ parsed as plain values and arrays, and never executed; anything else raises BadR
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +26,8 @@ REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
 MAX_REPLY_BYTES = (1 << 20) + (1 << 16)
 MAX_DEPTH = 24
+MAX_AXES = 16
+"""Axes of an array in an action."""
 VALUE_BYTES = 16
 """An action of so many bytes may hold one value for each such piece of them: Python's objects take more than bytes do."""
 
@@ -174,14 +177,20 @@ def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
 def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
     """What `act` returned. BadReplyError for what is no action at all; whether it is valid is not decided here.
 
-    `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of.
+    `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of; of arrays the
+    numbers count, or the innermost lists where there are none.
     """
     try:
         if tag == ARRAY:
-            return _array(payload)
+            array = _array(payload)
+            if array.size > max_values or (not array.size and _numbers(array) > max_values):
+                raise ValueError(f"it holds {_numbers(array):,} values; {max_values:,} are the limit")
+            return array
         if tag == INT:
             return _INT.unpack(payload)[0]
         if tag == FLOATS:
+            if len(payload) > 8 * max_values:
+                raise ValueError(f"it holds {len(payload) // 8:,} values; {max_values:,} are the limit")
             return list(struct.unpack(f"<{len(payload) // 8}d", payload))
         if tag == FLOAT:
             return _FLOAT.unpack(payload)[0]
@@ -206,10 +215,15 @@ def report(payload: bytes) -> Report:
 def _array(data: bytes | memoryview) -> NDArray[Any]:
     code, ndim = struct.unpack_from("<4sI", data)
     dtype = _DTYPES.get(code)
-    if dtype is None or ndim > 32:
+    if dtype is None or ndim > MAX_AXES:
         raise ValueError(f"an array of type {code!r} with {ndim} axes")
     shape = struct.unpack_from(f"<{ndim}I", data, 8)
     return np.frombuffer(data, dtype, offset=8 + 4 * ndim).reshape(shape)
+
+
+def _numbers(array: NDArray[Any]) -> int:
+    """How many numbers an array is written as, or innermost lists where it holds none: (4000000000, 0) takes no byte."""
+    return array.size or math.prod(max(1, n) for n in array.shape)
 
 
 def _ext_hook(code: int, data: memoryview) -> Any:
@@ -231,8 +245,10 @@ def _values(value: Any, left: int) -> int:
     if isinstance(value, dict):
         n += len(value)
         value = value.values()
+    elif isinstance(value, np.ndarray):
+        return _numbers(value)
     elif not isinstance(value, list):
         return n
     for item in value:
-        n += _values(item, left - 1) if isinstance(item, dict | list) else 1
+        n += _values(item, left - 1) if isinstance(item, dict | list | np.ndarray) else 1
     return n

@@ -38,6 +38,8 @@ _SHIM_BROKEN = 70
 """The status with which `inside/zygote.py` ends a process that it should never come back from."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
 """Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
+_USUAL_ACTION_BYTES = 256
+"""An action of so many bytes, beside 16 for each number of the action space, counts for nothing in its episode."""
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
 _STAGES: dict[str, FailureCategory] = {
@@ -96,6 +98,8 @@ class PolicyProcess:
         self._base_bytes = _address_space(child.host_pid)
         self._write: frames.Writer = list
         self._action_bytes = 0
+        self._usual_bytes = 0
+        self._surplus_bytes = 0
         self._exit: Exit | None = None
         self._finished: Ended | None = None
         self._closing = threading.Lock()
@@ -117,7 +121,9 @@ class PolicyProcess:
         Raises PolicyFailedError with a category of NO_POLICY.
         """
         limits = self._limits
-        self._action_bytes = limits.action_bytes + 16 * frames.elements(env_meta["action_space"])
+        needed = 16 * frames.elements(env_meta["action_space"])
+        self._action_bytes = limits.action_bytes + needed
+        self._usual_bytes = _USUAL_ACTION_BYTES + needed
         n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
         rlimits = {
             "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
@@ -166,6 +172,7 @@ class PolicyProcess:
 
     def reset(self, episode_index: int) -> None:
         """Raises PolicyFailedError."""
+        self._surplus_bytes = 0
         frame = [frames.REQUEST_HEADER.pack(0, frames.RESET, episode_index)]
         self._expect_ok(frame, "reset", self._limits.act_wall_s)
 
@@ -187,11 +194,23 @@ class PolicyProcess:
             if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
                 raise self._broken(how, self._action_bytes, len(payload))
+            if len(payload) > self._usual_bytes:
+                self._count_surplus(len(payload) - self._usual_bytes)
             try:
                 return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
         raise self._told(tag, payload, "act")
+
+    def _count_surplus(self, n_bytes: int) -> None:
+        """Actions are kept as they came: what they take beyond the usual is bounded for the whole episode too."""
+        self._surplus_bytes += n_bytes
+        limit = self._limits.episode_action_bytes
+        if self._surplus_bytes > limit:
+            text = f"actions larger than the action space needs came to {self._surplus_bytes:,} bytes in this episode;"
+            raise self._failed(
+                "act_error", f"{text} {limit:,} are the limit", limit=limit, used=self._surplus_bytes
+            )
 
     @property
     def spent_s(self) -> float:

@@ -64,6 +64,8 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     action_bytes: int = 16 << 10
     """What one action may take beyond 16 bytes for each number or character that the action space has, bytes; it may be
     made of as many values as there are 16 bytes in that."""
+    episode_action_bytes: int = 4 << 20
+    """What the actions of an episode may take together beyond what the action space needs, bytes."""
     submit_wall_s: float | None = None
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 

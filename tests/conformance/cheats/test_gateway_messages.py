@@ -58,6 +58,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "open_files": "int",
         "output_bytes": "int",
         "action_bytes": "int",
+        "episode_action_bytes": "int",
         "submit_wall_s": "float | none",
     },
     "RunState": {

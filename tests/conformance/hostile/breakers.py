@@ -210,6 +210,23 @@ BREAKERS = (
         verdict="killed",
     ),
     Breaker(
+        name="an array of four billion empty lists",
+        act="return np.empty((2**32 - 1, 0))",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="a forged array of four billion empty lists",
+        act="os.write(4, struct.pack('<IBxxx4sIII', 16, 3, b'|u1', 2, 2**32 - 1, 0)); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
+        name="a large action in every step",
+        act="type(self).act = lambda self, obs: np.full(1000, 1e-5, np.float16)",
+        verdict="act_error",
+        limits=limits(episode_action_bytes=30_000),
+        off=PATIENT,
+    ),
+    Breaker(
         name="a dict without end",
         act="D = type('D', (dict,), {'items': lambda s: iter(lambda: ('a', 1), None)}); return D()",
         verdict="act_error",

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from evopolicy_common.errors import SandboxError, WorkerError
+from evopolicy_gateway.formatting import json_bytes
 from evopolicy_worker import frames
 from evopolicy_worker.monitor import Output
 from evopolicy_worker.sandbox import seccomp
@@ -84,12 +86,39 @@ def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, pay
         b"\xc7\x05\x01junk!",
         b"\x92\x01",
         b"\xdc\x08\x00" + b"\x90" * 2048,
+        struct.pack("<4sI2I", b"|u1", 2, 2**32 - 1, 0),
+        struct.pack("<4sI3I", b"|u1", 3, 2**20, 2**20, 0),
+        struct.pack("<4sI17I", b"|u1", 17, *[1] * 17) + b"x",
+        struct.pack("<4sII", b"<f2", 1, 2000) + bytes(4000),
+        b"\x91\xc7\x10\x01" + struct.pack("<4sI2I", b"|u1", 2, 2**32 - 1, 0),
+        b"\x92" + 2 * (b"\xc8\x02\x64\x01" + struct.pack("<4sII", b"|u1", 1, 600) + bytes(600)),
     ],
 )
 def test_impossible_arrays_and_nests_are_refused(payload: bytes) -> None:
     for tag in (frames.ARRAY, frames.GENERIC):
         with pytest.raises(frames.BadReplyError):
             frames.action(tag, payload)
+
+
+@given(
+    st.recursive(
+        st.none()
+        | st.floats()
+        | hnp.arrays(
+            st.sampled_from([np.float16, np.uint8, np.bool_]),
+            hnp.array_shapes(min_dims=0, min_side=0, max_side=40),
+        ),
+        lambda v: st.lists(v, max_size=20) | st.dictionaries(st.text(max_size=2), v, max_size=4),
+        max_leaves=40,
+    )
+)
+def test_both_ends_count_an_action_alike(action: Any) -> None:
+    try:
+        frame = player.encoded(action)
+    except player.TooLargeError:
+        return
+    got = frames.action(frame[4], frame[8:])
+    assert len(json_bytes(got)) <= 8 * len(frame) + 100
 
 
 def test_report_with_a_text_that_is_none_is_refused() -> None:
@@ -114,6 +143,7 @@ def test_both_ends_agree_on_the_numbers() -> None:
         "FAILED",
         "FAULT",
         "VALUE_BYTES",
+        "MAX_AXES",
     ):
         assert getattr(frames, name) == getattr(player, name), name
     assert frames.REQUEST_HEADER.format == player.REQUEST_HEADER.format
@@ -123,7 +153,19 @@ def test_both_ends_agree_on_the_numbers() -> None:
 def test_an_action_that_cannot_be_sent_is_told() -> None:
     endless: list[Any] = []
     endless.append(endless)
-    for action in (endless, 1 << 5000, np.zeros(1 << 20), ["x" * (1 << 20)] * 3, [1.0] * 4000, [[]] * 2000):
+    for action in (
+        *(
+            endless,
+            1 << 5000,
+            np.zeros(1 << 20),
+            ["x" * (1 << 20)] * 3,
+            [1.0] * 4000,
+            [1.0] * 1025,
+            [[]] * 2000,
+        ),
+        *(np.empty((2**32 - 1, 0)), [np.empty((2**32 - 1, 0))], np.empty((2**40, 0)), np.zeros((1,) * 17)),
+        *(np.zeros(1025, np.float16), [np.zeros(600, np.bool_)] * 2, {"a": np.empty((1025, 0))}),
+    ):
         with pytest.raises(ValueError, match="the action"):
             player.encoded(action)
 

@@ -11,6 +11,7 @@ import ctypes
 import errno
 import importlib
 import json
+import math
 import os
 import random
 import struct
@@ -27,8 +28,11 @@ OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
 MAX_ACTION_DEPTH = 16
+MAX_AXES = 16
 VALUE_BYTES = 16
 """As many bytes as an action may have, so many values may it hold at this size each."""
+MOST_VALUES = 1 << 53
+"""So many are told of an action that holds more."""
 MAX_TEXT = 16_000
 
 libc = ctypes.CDLL(None, use_errno=True)
@@ -222,13 +226,15 @@ def encoded(action: Any) -> bytes:
             raise TooLargeError(
                 f"the action has {action.nbytes:,} bytes; {action_bytes:,} are the limit", action.nbytes
             )
+        if action.size > action_bytes // VALUE_BYTES or not action.size:
+            check_values(numbers_of(action))
         data = array_data(action)
         return REPLY_HEADER.pack(len(data), ARRAY) + data
     if isinstance(action, np.integer) and kind is not np.uint64:
         return struct.pack("<IBxxxq", 8, INT, int(action))
     if kind is float:
         return struct.pack("<IBxxxd", 8, FLOAT, action)
-    if kind is list and 0 < 8 * len(action) <= action_bytes:
+    if kind is list and 0 < len(action) <= action_bytes // VALUE_BYTES:
         kinds = set(map(type, action))
         if kinds == {float}:
             return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
@@ -236,16 +242,27 @@ def encoded(action: Any) -> bytes:
     n = pack(action, out, 0)
     if len(out) > action_bytes:
         raise TooLargeError(f"the action has {len(out):,} bytes; {action_bytes:,} are the limit", len(out))
+    check_values(n)
+    return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
+
+
+def check_values(n: int) -> None:
     if n > action_bytes // VALUE_BYTES:
         how = f"the action holds {n:,} values; {action_bytes // VALUE_BYTES:,} are the limit"
-        raise TooLargeError(how, n * VALUE_BYTES)
-    return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
+        raise TooLargeError(how, min(n, MOST_VALUES) * VALUE_BYTES)
+
+
+def numbers_of(array: Any) -> int:
+    """How many numbers an array is written as, or innermost lists where it holds none."""
+    return int(array.size) or math.prod(max(1, n) for n in array.shape)
 
 
 array_heads: dict[Any, bytes] = {}
 
 
 def array_data(array: Any) -> bytes:
+    if array.ndim > MAX_AXES:
+        raise ValueError(f"the action has an array of {array.ndim} axes; {MAX_AXES} are the limit")
     key = array.dtype, array.shape
     head = array_heads.get(key)
     if head is None:
@@ -298,6 +315,8 @@ def pack(value: Any, out: bytearray, depth: int) -> int:
         if array.dtype.kind == "f" and array.itemsize > 8:
             array = array.astype(np.float64)
         if array.dtype.kind in "biuf":
+            n = numbers_of(array)
+            check_values(n)
             extension(1, array_data(array), out)
         else:
             n += pack(array.tolist(), out, depth + 1)
