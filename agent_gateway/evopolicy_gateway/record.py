@@ -98,6 +98,7 @@ def run_record(
         agent=_agent(plan, finished.agent),
         sandbox_tier=settings.sandbox_tier,
         jail=plan.jail.recorded,
+        hidden_isolation=finished.hidden_isolation,
         experiment_dimensions=ExperimentDimensions(
             episode_budget=finished.episode_budget,
             min_episodes_per_submit=staged.min_episodes_per_submit if staged else 0,
@@ -112,6 +113,7 @@ def run_record(
             or suite.n_heldout,
             video=settings.video,
             limits=settings.limits,
+            hidden_cases=settings.hidden_cases,
         ),
         timing=Timing(
             started_at=utc_text(finished.created_at),

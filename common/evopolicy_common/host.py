@@ -13,6 +13,9 @@ from pathlib import Path
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MACHINE_ID = Path("/etc/machine-id")
 
+NO_BOOT_ID = f"the kernel does not tell its boot id: mount /proc so that {_BOOT_ID} can be read"
+"""Why a worker plays no hidden episodes, and why an agent counts as being on every machine."""
+
 
 def boot_id() -> str:
     """The running kernel's id, new at every boot and the same in all its containers; empty where there is none."""

@@ -17,6 +17,7 @@ from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
+from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
 
 SCHEMA_VERSION = 1
 """Raised only when an older reader would misunderstand a file; fields may be added without it."""
@@ -76,6 +77,8 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
     """Whether the agent's rules let it simulate the environment. Runs from before this was recorded had no rule against it."""
+    hidden_cases: HiddenCases = "shared"
+    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run`, which allows no pairing."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -236,6 +239,9 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     sandbox_tier: Tier
     jail: str
     """How the agent was confined: `bwrap` or `none`; `bwrap+open-network` when asked for."""
+    hidden_isolation: HiddenIsolation = "unknown"
+    """Whether hidden episodes and agents shared a kernel: `exclusive` never, `shared` they could, `waived` the operator
+    vouched for where the agent was, `unknown` the run is from before this was recorded."""
     experiment_dimensions: ExperimentDimensions
     timing: Timing
     outcome: Outcome

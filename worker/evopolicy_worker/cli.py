@@ -20,7 +20,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from evopolicy_common import catalogue, credentials, keys, transport
+from evopolicy_common import catalogue, credentials, host, keys, transport
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import EnvironmentDescription
@@ -167,9 +167,13 @@ async def _run(
         environments=descriptions,
         fingerprint=fingerprint(),
         host=socket.gethostname(),
+        boot_id=host.boot_id(),
+        machine_id=host.machine_id(),
         scratch=scratch,
         grace_s=grace_s,
     )
+    if not options.boot_id:
+        log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
     taken = [cores.take() for _ in range(options.slots)]
 
     def make_slot(index: int, tier: Tier) -> Slot:

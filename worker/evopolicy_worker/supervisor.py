@@ -83,6 +83,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     environments: tuple[EnvironmentDescription, ...]
     fingerprint: Fingerprint
     host: str
+    boot_id: str = ""
+    """Of this kernel; empty: unknown, and no hidden episodes are leased to this worker."""
+    machine_id: str = ""
     scratch: Path
     grace_s: float = 10.0
     """How long running episodes may go on after SIGTERM."""
@@ -170,6 +173,8 @@ class Supervisor:
                 environments=options.environments,
                 fingerprint=options.fingerprint,
                 host=options.host,
+                boot_id=options.boot_id,
+                machine_id=options.machine_id,
             )
             reply = await self._ask.until_answered("register", message, Registered)
             self._session = reply.session

@@ -13,6 +13,7 @@ from typing import Literal
 
 import msgspec
 
+from evopolicy_common import host
 from evopolicy_common.messages.episode import Tier
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import jail, seccomp, why_not
@@ -46,6 +47,7 @@ def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]
     """All checks, in the order in which to show them. Starts each sandbox tier once: takes about a second."""
     return (
         _kernel(),
+        _boot_id(),
         _bubblewrap(),
         *(_namespace(name, flag) for name, flag in _NAMESPACES.items()),
         _seccomp(),
@@ -68,6 +70,18 @@ def best_tier(checks: tuple[Check, ...]) -> Tier | None:
 def _kernel() -> Check:
     return Check(
         name="kernel", verdict="note", found=f"{platform.system()} {platform.release()} {platform.machine()}"
+    )
+
+
+def _boot_id() -> Check:
+    found = host.boot_id()
+    if found:
+        return Check(name="boot id", verdict="ok", found=found)
+    return Check(
+        name="boot id",
+        verdict="missing",
+        found="unknown, so this worker gets no hidden episodes",
+        advice=host.NO_BOOT_ID,
     )
 
 

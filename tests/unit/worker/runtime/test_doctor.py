@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from evopolicy_common import host
 from evopolicy_worker.sandbox import doctor, jail, why_not
 
 
@@ -14,6 +15,7 @@ def test_every_part_of_the_sandbox_has_a_row_and_the_tier_follows() -> None:
     names = [check.name for check in checks]
     assert len(set(names)) == len(names)
     for name in (
+        "boot id",
         "bubblewrap",
         "namespace user",
         "Landlock",
@@ -46,3 +48,14 @@ def test_a_namespace_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch
     check = doctor._namespace("user", 0x10000000)
     assert check.verdict == "missing"
     assert "user.max_user_namespaces" in check.advice
+
+
+def test_kernel_that_does_not_tell_its_boot_id_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert doctor._boot_id().verdict == "ok"
+    monkeypatch.setattr(host, "_BOOT_ID", tmp_path / "none")
+    check = doctor._boot_id()
+    assert check.verdict == "missing"
+    assert "no hidden episodes" in check.found
+    assert "mount /proc" in check.advice
