@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator.analysis.comparability import MixedRunsError
+from evopolicy_coordinator.analysis.comparability import UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reader import load_runs
 from evopolicy_coordinator.analysis.scores import ScoreTable, read_score_csv
 from evopolicy_coordinator.analysis.study import Study, study_of
@@ -52,7 +52,15 @@ def report(
         bool,
         typer.Option(
             "--allow-mixed",
-            help="Compare runs although their budgets, policy scopes, splits, fingerprints or jails differ; the report says so.",
+            help="Compare runs although their budgets, policy scopes, splits, fingerprints, jails or hidden isolation "
+            "differ; the report says so.",
+        ),
+    ] = False,
+    allow_unknown: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unknown",
+            help="Compare runs from before hidden isolation was recorded with later ones; the report says so.",
         ),
     ] = False,
     pages: Annotated[
@@ -74,15 +82,24 @@ def report(
 
     try:
         with _progress() as tell:
-            study = _study(runs, allow_mixed, jobs or os.cpu_count() or 1, tell)
+            study = _study(runs, allow_mixed, allow_unknown, jobs or os.cpu_count() or 1, tell)
             if not study.suites:
                 index = None
             else:
                 index = write_report(study, out, title=title, traces=pages, progress=tell)
     except MixedRunsError as error:
-        _fail(f"{error}\nGive runs that agree, or --allow-mixed to compare them all the same.", MIXED)
+        options = sorted(
+            {"--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed" for one in error.mixtures}
+        )
+        _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
     except ConfigError as error:
         _fail(str(error), USAGE)
+    if unknown := sum(run.record.hidden_isolation == "unknown" for run in study.runs):
+        typer.echo(
+            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
+            " they are from before it was recorded",
+            err=True,
+        )
     if as_json:
         left_out = [{"path": str(item.path), "reason": item.reason} for item in study.left_out]
         found = {
@@ -102,7 +119,7 @@ def report(
         _fail("no complete run among what was given; nothing written", NOTHING)
 
 
-def _study(paths: list[Path], allow_mixed: bool, jobs: int, tell: Tell) -> Study:
+def _study(paths: list[Path], allow_mixed: bool, allow_unknown: bool, jobs: int, tell: Tell) -> Study:
     tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
     if len(tables) > 1:
         raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
@@ -112,7 +129,13 @@ def _study(paths: list[Path], allow_mixed: bool, jobs: int, tell: Tell) -> Study
         progress=lambda done, total: tell("runs read", done, total),
     )
     scores = _read_table(tables[0]) if tables else None
-    return study_of(loaded.runs, left_out=loaded.left_out, allow_mixed=allow_mixed, scores=scores)
+    return study_of(
+        loaded.runs,
+        left_out=loaded.left_out,
+        allow_mixed=allow_mixed,
+        allow_unknown=allow_unknown,
+        scores=scores,
+    )
 
 
 def _read_table(path: Path) -> ScoreTable:

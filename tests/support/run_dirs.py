@@ -51,6 +51,8 @@ def write_run(
     replays: Mapping[str, bytes] | None = None,
     scope: str = "episode",
     jail: str = "bwrap",
+    hidden_isolation: str = "exclusive",
+    hidden_cases: str = "shared",
     split: str = "split-1",
     fingerprint: Mapping[str, str] | None = None,
     status: str | None = None,
@@ -91,6 +93,7 @@ def write_run(
         ),
         sandbox_tier="bwrap",
         jail=jail,
+        hidden_isolation=hidden_isolation,  # type: ignore[arg-type]
         experiment_dimensions=ExperimentDimensions(
             episode_budget=budget,
             min_episodes_per_submit=1,
@@ -100,6 +103,7 @@ def write_run(
             n_train=64,
             n_validation=16,
             n_heldout=32,
+            hidden_cases=hidden_cases,  # type: ignore[arg-type]
         ),
         timing=Timing(
             started_at=utc_text(START),

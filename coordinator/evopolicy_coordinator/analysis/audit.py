@@ -52,6 +52,10 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     secret_splits: bool
     """False when the splits came from a small public seed."""
     jail: str
+    hidden_isolation: str
+    """Whether hidden episodes and agents shared a kernel: `exclusive`, `shared`, `waived`, `unknown`."""
+    hidden_cases: str
+    """`shared`, or `per_run`."""
 
 
 class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,6 +115,8 @@ def _signals(run: Run) -> AuditSignals:
         finalise_s=timing.finalise_s,
         secret_splits=run.record.versions.data_secret,
         jail=run.record.jail,
+        hidden_isolation=run.record.hidden_isolation,
+        hidden_cases=run.record.experiment_dimensions.hidden_cases,
     )
 
 

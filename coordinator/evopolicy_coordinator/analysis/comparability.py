@@ -1,9 +1,10 @@
-"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, and
-results that an audit has put in question with any others.
+"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, whether
+hidden episodes and agents shared a kernel, and results that an audit has put in question with any others.
 
-Budget, scope, observation form and jail must agree over all runs of a suite; splits (by hash), library fingerprint,
-environment version, how large a submit may be, a policy's limits, and whether feedback has videos over the runs of one
-environment, since environments differ in them anyway.
+Budget, scope, observation form, jail, hidden isolation and hidden cases must agree over all runs of a suite; splits (by
+hash), library fingerprint, environment version, how large a submit may be, a policy's limits, and whether feedback has
+videos over the runs of one environment, since environments differ in them anyway. Runs that played hidden cases of their
+own differ in these splits by design.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ class MixedRunsError(EvopolicyError):
 
 
 IN_QUESTION = "results in dispute, or of a forger,"
+UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
+"""Runs from before it was recorded beside runs that tell it: compared only where that is allowed by name."""
 
 _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "episode budget": lambda run: str(run.budget),
@@ -50,16 +53,21 @@ _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "observation form": lambda run: run.record.experiment_dimensions.observations,
     "simulation rule": lambda run: run.record.experiment_dimensions.simulation,
     "jail": lambda run: run.record.jail,
+    "hidden cases": lambda run: run.record.experiment_dimensions.hidden_cases,
 }
 _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
     "train split": lambda run: run.record.versions.data_train_hash[:12],
-    "validation split": lambda run: run.record.versions.data_valid_hash[:12],
-    "held-out split": lambda run: run.record.versions.data_heldout_hash[:12],
+    "validation split": lambda run: _hidden_split(run, run.record.versions.data_valid_hash),
+    "held-out split": lambda run: _hidden_split(run, run.record.versions.data_heldout_hash),
     "environment version": lambda run: run.record.versions.env,
     "episodes a submit": lambda run: run.submit_size,
     "policy limits": lambda run: _limits(run),
     "videos in feedback": lambda run: run.record.experiment_dimensions.video,
 }
+
+
+def _hidden_split(run: Run, digest: str) -> str:
+    return "its own" if run.record.experiment_dimensions.hidden_cases == "per_run" else digest[:12]
 
 
 def _limits(run: Run) -> str:
@@ -78,6 +86,7 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     for suite, envs in suites_of(by_env).items():
         together = [run for env in envs for run in by_env[env]]
         out += _differences(_BY_SUITE, suite, together)
+        out += _isolation(suite, together)
     for env in ordered_environments(by_env):
         out += _differences(_BY_ENVIRONMENT, env, by_env[env])
         out += _differences({"fingerprint": _fingerprint_beside(by_env[env])}, env, by_env[env])
@@ -96,6 +105,16 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
         return " ".join([*words, *(f"then {each}" for each in versions.fingerprint_overrides)])
 
     return beside
+
+
+def _isolation(suite: str, runs: list[Run]) -> list[Mixture]:
+    """Differences among the runs that tell it, and runs that do not tell it beside them."""
+    told = {"hidden isolation": lambda run: run.record.hidden_isolation}
+    known = [run for run in runs if run.record.hidden_isolation != "unknown"]
+    found = _differences(told, suite, known)
+    if 0 < len(known) < len(runs):
+        found += _differences({UNKNOWN_ISOLATION: told["hidden isolation"]}, suite, runs)
+    return found
 
 
 def _in_question(env: str, runs: list[Run]) -> list[Mixture]:

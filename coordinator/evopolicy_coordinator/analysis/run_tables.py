@@ -91,9 +91,10 @@ def _agents(study: Study) -> Table:
             agent.model_string or "",
             _settings(run),
             run.record.jail,
+            run.record.hidden_isolation,
         )
         counts[told] = counts.get(told, 0) + 1
-    keys = ("entry", "harness", "cli_version", "model", "settings", "jail")
+    keys = ("entry", "harness", "cli_version", "model", "settings", "jail", "hidden_isolation")
     rows = [
         {**{key: value or None for key, value in zip(keys, told, strict=True)}, "runs": n}
         for told, n in sorted(counts.items(), key=lambda item: (item[0][0].casefold(), item[0]))
@@ -109,6 +110,11 @@ def _agents(study: Study) -> Table:
             Column(key="model", title="Model string"),
             Column(key="settings", title="Settings"),
             Column(key="jail", title="Jail"),
+            Column(
+                key="hidden_isolation",
+                title="Hidden isolation",
+                note="exclusive: hidden episodes and agents never shared a kernel.",
+            ),
             Column(key="runs", title="Runs", kind="integer"),
         ),
         rows=tuple(rows),

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_coordinator.analysis.audit import AuditSignals, TokenUse, audit_signals, token_use
-from evopolicy_coordinator.analysis.comparability import MixedRunsError, Mixture, mixtures
+from evopolicy_coordinator.analysis.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
 from evopolicy_coordinator.analysis.edits import EditRates, Transition, classify, edit_rates
 from evopolicy_coordinator.analysis.evolution import Evolution, evolutions
 from evopolicy_coordinator.analysis.normalised import Normalised, normalised
@@ -79,10 +79,13 @@ def study_of(
     *,
     left_out: Iterable[LeftOut] = (),
     allow_mixed: bool = False,
+    allow_unknown: bool = False,
     scores: ScoreTable | None = None,
     resamples: int = RESAMPLES,
 ) -> Study:
     """Computes every metric. MixedRunsError when runs are no one comparison and `allow_mixed` is false.
+
+    `allow_unknown` allows runs that do not tell their hidden isolation beside runs that do; `allow_mixed` alone does not.
 
     `scores` adds a table of scores without run directories (such as the paper's): it has no submits, so it shows in
     the leaderboard and normalised performance only. It may not name an entry that the runs name too.
@@ -92,8 +95,9 @@ def study_of(
     if scores is not None:
         table, more = _merged(table, scores)
         mixed += more
-    if mixed and not allow_mixed:
-        raise MixedRunsError(mixed)
+    refused = [one for one in mixed if not (allow_unknown if one.what == UNKNOWN_ISOLATION else allow_mixed)]
+    if refused:
+        raise MixedRunsError(refused)
     ordered = _in_order(runs)
     return Study(
         runs=tuple(ordered),
@@ -123,10 +127,14 @@ def study_of(
     )
 
 
-def study(paths: Iterable[Path | str], *, allow_mixed: bool = False, jobs: int = 1) -> Study:
+def study(
+    paths: Iterable[Path | str], *, allow_mixed: bool = False, allow_unknown: bool = False, jobs: int = 1
+) -> Study:
     """Reads the runs at or under `paths` and computes every metric; see `study_of`."""
     loaded = load_runs([Path(path) for path in paths], jobs=jobs)
-    return study_of(loaded.runs, left_out=loaded.left_out, allow_mixed=allow_mixed)
+    return study_of(
+        loaded.runs, left_out=loaded.left_out, allow_mixed=allow_mixed, allow_unknown=allow_unknown
+    )
 
 
 def _suite(name: str, table: ScoreTable, resamples: int) -> Suite:

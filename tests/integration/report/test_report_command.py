@@ -215,6 +215,21 @@ def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> N
     assert "policy scope on core16" in (tmp_path / "report/index.html").read_text()
 
 
+def test_runs_of_unknown_isolation_are_warned_of_and_mixed_by_name(tmp_path: Path) -> None:
+    runs, out = tmp_path / "runs", tmp_path / "report"
+    write_run(runs, [Version(policy(), (1.0,), 1.0)], hidden_isolation="unknown")
+    arguments = [str(runs), "--out", str(out)]
+    alone = CliRunner().invoke(app, arguments)
+    assert alone.exit_code == 0
+    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in alone.output
+    assert "1 of 1 runs do not tell whether" in (out / "index.html").read_text()
+    write_run(runs, [Version(policy(), (1.0,), 2.0)], entry="Other", hidden_isolation="exclusive")
+    refused = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
+    assert refused.exit_code == 3
+    assert "or --allow-unknown to compare them all the same" in refused.output
+    assert CliRunner().invoke(app, [*arguments, "--allow-unknown"]).exit_code == 0
+
+
 def test_nothing_to_report_writes_nothing_and_says_why(tmp_path: Path) -> None:
     (tmp_path / "runs/x/workspace").mkdir(parents=True)
     (tmp_path / "runs/x/logs").mkdir()

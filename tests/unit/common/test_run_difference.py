@@ -57,6 +57,18 @@ def test_a_return_a_file_and_a_byte_each_make_one(tmp_path: Path) -> None:
     assert "returns: [1.0] and [2.0]" in found[2]
 
 
+def test_other_isolation_and_hidden_cases_make_a_difference(tmp_path: Path) -> None:
+    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    for folder, isolation, cases in ((left, "exclusive", "shared"), (right, "waived", "per_run")):
+        record = json.loads((folder / "run.json").read_text())
+        record |= {"hidden_isolation": isolation, "experiment_dimensions": {"hidden_cases": cases}}
+        (folder / "run.json").write_text(json.dumps(record))
+    assert differences(left, right) == [
+        'run.json: hidden_isolation: "exclusive" and "waived"',
+        'run.json: experiment_dimensions.hidden_cases: "shared" and "per_run"',
+    ]
+
+
 def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
     found = differences(make_run(tmp_path, "a", extra=1), make_run(tmp_path, "b"))
     assert found == ["workspace/feedback/submit_000/summary.json: extra: 1 and nothing"]

@@ -176,6 +176,13 @@ def _section(ident: str, nav: str, *, title: str = "", **parts: Any) -> dict[str
     return {**empty, "id": ident, "nav": nav, "title": title or nav, **parts}
 
 
+_ISOLATION_NOTICES = {
+    "unknown": "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded.",
+    "shared": "were played while hidden episodes and agents could share a kernel (--hidden-isolation off).",
+    "waived": "had agents whose place the operator vouched for (--agent-host elsewhere).",
+}
+
+
 def _notices(study: Study) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     if study.mixtures:
@@ -198,6 +205,15 @@ def _notices(study: Study) -> list[dict[str, Any]]:
         out.append(
             {"title": f"{unjailed} of {len(study.audit)} runs had no jail around their agent.", "lines": []}
         )
+    for isolation, text in _ISOLATION_NOTICES.items():
+        if found := sum(signals.hidden_isolation == isolation for signals in study.audit):
+            out.append({"title": f"{found} of {len(study.audit)} runs {text}", "lines": []})
+    if own := sum(signals.hidden_cases == "per_run" for signals in study.audit):
+        title = (
+            f"{own} of {len(study.audit)} runs had hidden cases of their own: no two scores are on the same cases, "
+            "so differences between runs cannot be paired by case."
+        )
+        out.append({"title": title, "lines": []})
     return out
 
 

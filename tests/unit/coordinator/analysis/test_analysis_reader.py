@@ -11,6 +11,7 @@ from run_dirs import write_run
 
 from evopolicy_coordinator.analysis.comparability import (
     IN_QUESTION,
+    UNKNOWN_ISOLATION,
     MixedRunsError,
     mixtures,
 )
@@ -189,6 +190,9 @@ def test_changed_lines_count_both_sides_of_every_file() -> None:
         ({"split": "split-2"}, "held-out split"),
         ({"fingerprint": {"numpy": "1.26.4"}}, "fingerprint"),
         ({"jail": "none"}, "jail"),
+        ({"hidden_isolation": "shared"}, "hidden isolation"),
+        ({"hidden_isolation": "waived"}, "hidden isolation"),
+        ({"hidden_cases": "per_run"}, "hidden cases"),
     ],
 )
 def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: dict, what: str) -> None:
@@ -244,6 +248,40 @@ def test_a_run_that_workers_of_other_versions_went_on_with_is_not_like_the_other
     (mixture,) = mixtures(load_runs([tmp_path]).runs)
     assert mixture.what == "fingerprint"
     assert mixture.values == {"none": 1, "then a → b: the old workers are gone": 1}
+
+
+def test_runs_from_before_isolation_was_recorded_are_mixed_only_by_name(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS)
+    old = write_run(tmp_path, VERSIONS, entry="Agent B")
+    record = json.loads((old / "run.json").read_text())
+    del record["hidden_isolation"], record["experiment_dimensions"]["hidden_cases"]
+    (old / "run.json").write_text(json.dumps(record))
+    for refused in ({}, {"allow_mixed": True}):
+        with pytest.raises(MixedRunsError, match=UNKNOWN_ISOLATION):
+            study([tmp_path], **refused)
+    assert [mixture.values for mixture in study([tmp_path], allow_unknown=True).mixtures] == [
+        {"exclusive": 1, "unknown": 1}
+    ]
+    # One that was shared is no more comparable for it.
+    write_run(tmp_path, VERSIONS, entry="Agent C", hidden_isolation="shared")
+    with pytest.raises(MixedRunsError, match="hidden isolation on core16: exclusive"):
+        study([tmp_path], allow_unknown=True)
+    assert len(study([tmp_path], allow_unknown=True, allow_mixed=True).mixtures) == 2
+
+
+def test_runs_that_all_do_not_tell_their_isolation_are_compared(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS, hidden_isolation="unknown")
+    write_run(tmp_path, VERSIONS, entry="Agent B", hidden_isolation="unknown")
+    assert mixtures(load_runs([tmp_path]).runs) == []
+
+
+def test_runs_with_hidden_cases_of_their_own_differ_in_them_by_design(tmp_path: Path) -> None:
+    for number in range(2):
+        run = write_run(tmp_path, VERSIONS, exp_id=f"e{number}", hidden_cases="per_run")
+        record = json.loads((run / "run.json").read_text())
+        record["versions"] |= {"data_valid_hash": f"v{number}", "data_heldout_hash": f"h{number}"}
+        (run / "run.json").write_text(json.dumps(record))
+    assert mixtures(load_runs([tmp_path]).runs) == []
 
 
 def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path) -> None:
