@@ -89,7 +89,10 @@ def report(
                 index = write_report(study, out, title=title, traces=pages, progress=tell)
     except MixedRunsError as error:
         options = sorted(
-            {"--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed" for one in error.mixtures}
+            {
+                "--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed"
+                for one in error.mixtures
+            }
         )
         _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
     except ConfigError as error:
