@@ -1,6 +1,7 @@
 """`evopolicy`: the front door. Plays runs, and whole local clusters with them; other rooms add subcommands.
 
-Exit codes: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without an ok submit, 130 Ctrl-C.
+Exit codes: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without an ok submit, 4 an agent
+failed, 5 a run was cancelled, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -237,7 +238,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> No
         print(msgspec.json.format(msgspec.json.encode(results)).decode())
     else:
         report_runs(results, console)
-    _exit(exit_code(results))
+    _exit(exit_code((result.status, result.closed_reason) for result in results))
 
 
 def _trial_cluster(

@@ -55,6 +55,8 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     """Of these, from the last result's arrival to the committed feedback."""
     spent: bool = False
     """No further submit can be taken, and none runs."""
+    cancelled: bool = False
+    """The operator has ended the run."""
 
 
 class RunClosed(Event, frozen=True, kw_only=True, tag="closed"):

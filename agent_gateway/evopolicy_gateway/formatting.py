@@ -118,6 +118,7 @@ def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes
         message = {
             "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
             "quarantined": "the policy brought its slot down three times; it is not played again",
+            "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
         }.get(status, f"the submit ended with {status}")
         failure_fields: dict[str, Any] = {"message": message, "traceback": ""}
     else:

@@ -17,7 +17,8 @@ import structlog
 
 from evopolicy_common import credentials, transport
 from evopolicy_common.blobs import BlobStore
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, RefusedError
+from evopolicy_common.refusals import RUN_OVER
 from evopolicy_gateway import workspace
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.http import make_app
@@ -81,7 +82,13 @@ class Gateway:
                 if link is None:
                     return False
                 session = Session(link, run)
-                opened = await self._unless_told(session.open())
+                try:
+                    opened = await self._unless_told(session.open())
+                except RefusedError as error:
+                    if error.status not in RUN_OVER:
+                        raise
+                    log.warning("the run takes no more", status=error.status, why=error.message)
+                    return True
                 if opened is None:
                     return False
                 workspace.stage(self._folder, opened, address.urls())

@@ -30,13 +30,13 @@ from evopolicy_common.messages.operator import (
     RunSettings,
     WaitRun,
 )
+from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.requests import operator_requests
 from evopolicy_common.transport import Link
 
 WAIT_S = 5.0
 _PATIENCE_S = 10.0
 _SENDER = "operator"
-_WRONG_SETTINGS = frozenset({"invalid_settings", "bad_settings", "invalid_env_instance", "bad_request"})
 _UNAVAILABLE_PAUSE_S = 1.0
 
 
@@ -56,7 +56,7 @@ class Operations:
                     "create", message, RunCreated, patience_s=_PATIENCE_S
                 )
             except RefusedError as error:
-                if error.status != "unavailable":
+                if error.status != Refusal.UNAVAILABLE:
                     raise _settings_error(error) from error
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
@@ -94,7 +94,7 @@ class Operations:
             try:
                 return await self._requests.until_answered("claim", message, ClaimState)
             except RefusedError as error:
-                if error.status != "unavailable":
+                if error.status != Refusal.UNAVAILABLE:
                     raise
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
@@ -171,4 +171,4 @@ def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Crede
 
 
 def _settings_error(error: RefusedError) -> Exception:
-    return ConfigError(error.message) if error.status in _WRONG_SETTINGS else error
+    return ConfigError(error.message) if error.status in WRONG_SETTINGS else error

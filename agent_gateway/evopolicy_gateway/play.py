@@ -24,6 +24,7 @@ import msgspec
 from evopolicy_common import credentials
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
@@ -156,6 +157,8 @@ class RunPlay:
         self._ready: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
         self._spent = asyncio.Event()
         self._closed = asyncio.Event()
+        self._cancelled = False
+        """Somebody else has ended the run at the coordinator."""
         self._order: CloseRun | None = None
         self._gateway: Child | None = None
         self._keeper: Child | None = None
@@ -239,12 +242,15 @@ class RunPlay:
         """Until the run is closed."""
         self._stopwatch.opened()
         serving = asyncio.create_task(self._keep_gateway())
+        following = asyncio.create_task(self._follow())
         keeping: asyncio.Task[AgentEnded] | None = None
         try:
             up: list[asyncio.Future[Any]] = [serving, self._ready]
             await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
             if serving.done():
                 serving.result()
+            if not self._ready.done():
+                return  # cancelled before it was served
             keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
             spent = asyncio.create_task(self._spent.wait())
             going: list[asyncio.Future[Any]] = [serving, keeping, spent]
@@ -262,7 +268,7 @@ class RunPlay:
             await self._close(ended)
             await serving
         finally:
-            tasks = [task for task in (serving, keeping) if task is not None]
+            tasks = [task for task in (serving, following, keeping) if task is not None]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -274,12 +280,21 @@ class RunPlay:
 
     async def _close(self, ended: AgentEnded) -> None:
         reason = "budget_spent" if self._spent.is_set() else ended.reason
+        reason = CANCELLED if self._cancelled else reason
         how = f"agent ended: {reason.replace('_', ' ')}"
         self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
         self._order = CloseRun(reason=reason, agent=about)
         if self._gateway is not None:
             await self._gateway.tell(self._order)
+
+    async def _follow(self) -> None:
+        """Has the agent ended when the run is cancelled at the coordinator, which its gateway may not hear of."""
+        async for progress in self._operations.wait(self.run):
+            finished = progress.finished
+            if finished is not None and finished.status == CANCELLED:
+                self._cancelled = True
+                self._spent.set()
 
     async def _keep_gateway(self) -> None:
         """Runs the gateway, again when it dies, until it has closed the run."""
@@ -322,6 +337,7 @@ class RunPlay:
         elif isinstance(event, Progress):
             self._stopwatch.gateway_told(event.in_flight_s, event.feedback_s)
             self._watch.progress(self._name, event)
+            self._cancelled = self._cancelled or event.cancelled
             if event.spent:
                 self._spent.set()
         elif isinstance(event, RunClosed):

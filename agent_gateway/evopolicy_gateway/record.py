@@ -30,7 +30,6 @@ from evopolicy_common.run_record import (
     RejectedSubmit,
     Replay,
     RunRecord,
-    RunStatus,
     Timing,
     Tokens,
     Versions,
@@ -60,7 +59,7 @@ async def write(
 ) -> RunRecord:
     """Writes everything and removes the gateway's folder. StorageError when the disk refuses.
 
-    `error` tells why a run was cancelled, when that was not the operator's wish.
+    `error` tells why this command gave the run up, when it was not the operator who cancelled it.
     """
     selected: Bundle | None = None
     for submit in finished.submits:
@@ -71,7 +70,7 @@ async def write(
     if selected is not None:
         await asyncio.to_thread(_put_in_place, folder.system, selected)
     if error is not None and finished.status == "cancelled":
-        finished = msgspec.structs.replace(finished, error=error)
+        finished = msgspec.structs.replace(finished, status="error", error=error)
     recorded = await replays.fetch(folder.root, finished, operations)
     return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded)
 
@@ -169,8 +168,6 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
 def _outcome(finished: RunFinished) -> Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
-    # What no submit was charged for is not a result: a cancelled run has none.
-    status: RunStatus = "error" if finished.status == "cancelled" else finished.status
     error = finished.error
     if finished.status == "cancelled" and error is None:
         error = "cancelled by the operator"
@@ -180,7 +177,7 @@ def _outcome(finished: RunFinished) -> Outcome:
         "nondeterministic_results": finished.nondeterministic_results,
     }
     return Outcome(
-        status=status,
+        status=finished.status,
         error=error,
         final_score=finished.final_score if completed else None,
         best_submit_index=finished.best_submit_index if completed else None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -21,7 +21,8 @@ from evopolicy_gateway.operations import Operations, find_credentials
 from evopolicy_gateway.play import Plan, RunPlay
 from evopolicy_gateway.watch import Watch, watching
 
-NO_OK_SUBMIT = 3
+EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
+"""Of a command that plays runs, the gravest first; 0 when every run completed."""
 
 
 class Cluster(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,7 +44,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     run_directory: str
     status: str
-    """`completed`, `no_ok_submit`, `error`."""
+    """`completed`, `no_ok_submit`, `error`, `cancelled`."""
     error: str | None = None
     final_score: float | None = None
     """Held-out mean return."""
@@ -102,11 +103,16 @@ async def play_all(plans: Sequence[Plan], where: Cluster, parallel: int, console
     return [results[index] for index in range(len(plans))]
 
 
-def exit_code(results: Sequence[RunResult]) -> int:
-    """0 when every run completed, 1 when one failed, else 3."""
-    if any(result.status == "error" for result in results):
-        return 1
-    return 0 if all(result.status == "completed" for result in results) else NO_OK_SUBMIT
+def exit_code(ends: Iterable[tuple[str, str]]) -> int:
+    """For the gravest of some runs' ends, each told as its status and why its agent stopped: see `EXIT_CODES`."""
+    found = {_end(status, closed_reason) for status, closed_reason in ends}
+    return next((code for end, code in EXIT_CODES.items() if end in found), 0)
+
+
+def _end(status: str, closed_reason: str) -> str:
+    if closed_reason == "agent_failed" and status != "cancelled":
+        return closed_reason
+    return status if status in EXIT_CODES or status == "completed" else "error"
 
 
 def report(results: Sequence[RunResult], console: Console) -> None:

@@ -165,6 +165,7 @@ def progress_of(desk: Desk) -> Progress:
         in_flight_s=round(desk.in_flight_s, 3),
         feedback_s=round(desk.feedback_s, 3),
         spent=desk.spent,
+        cancelled=desk.cancelled,
     )
 
 

@@ -31,6 +31,7 @@ from evopolicy_common.messages.gateway import (
     SubmitAccepted,
 )
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.refusals import NOT_NOW
 from evopolicy_common.requests import Requester
 from evopolicy_common.transport import Link
 from evopolicy_gateway.journal import Requested
@@ -40,12 +41,7 @@ RESULTS_WAIT_S = 10.0
 STATE_PATIENCE_S = 1.0
 
 
-NOT_NOW = frozenset({"unavailable", "no_worker"})
-"""Refusals that pass: its disk is full, no worker has described the environment yet."""
 NOT_NOW_PAUSE_S = 0.5
-
-NO_MORE = frozenset({"run_closed", "run_finished", "unknown_run", "bad_token"})
-"""Refusals after which nothing more of this run is served."""
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 Wanted = TypeVar("Wanted")

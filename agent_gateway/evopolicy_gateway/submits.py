@@ -16,11 +16,13 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import structlog
 
 from evopolicy_common.blobs import BlobStore, digest_of
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.messages.gateway import (
+    CANCELLED,
     EpisodeFeedback,
     ResultsPage,
     RunOpened,
@@ -28,6 +30,7 @@ from evopolicy_common.messages.gateway import (
     SubmitAccepted,
     SubmitDone,
 )
+from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway import formatting, snapshots
 from evopolicy_gateway.episode_files import episode_files
 from evopolicy_gateway.feedback import SubmitTree
@@ -42,7 +45,7 @@ from evopolicy_gateway.journal import (
     Requested,
     Settled,
 )
-from evopolicy_gateway.session import NO_MORE, Session
+from evopolicy_gateway.session import Session
 from evopolicy_gateway.submit_request import Bounds, parse
 from evopolicy_gateway.tickets import ConflictError, Ticket
 
@@ -55,7 +58,7 @@ DISK_PAUSE_S = 2.0
 """Between tries to write feedback while the disk refuses."""
 MAX_REJECTED_KEPT = 1000
 FETCHES_AT_ONCE = 4
-_REQUEST_STATUSES = ("budget_invalid", "invalid_env_instance")
+_REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
 class Desk:
@@ -76,6 +79,8 @@ class Desk:
         self.state: RunState = run.state
         """As far as this gateway knows; `refresh` asks."""
         self.closed = run.state.is_finalized
+        self.cancelled = run.state.cancelled
+        """The operator has ended the run."""
         self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Fails with what this process cannot go on from."""
         self.in_flight: Ticket | None = None
@@ -134,7 +139,7 @@ class Desk:
                     f"{self.in_flight.submit_id} is running; wait for it, or ask GET /submit/{self.in_flight.submit_id}",
                 )
             if self.closed:
-                raise RequestError("budget_invalid", "the run is closed: no more submits are taken")
+                raise self._refusal()
             env_instances = parse(body, self.bounds())
         except RequestError as error:
             await self.note_rejected(error)
@@ -177,12 +182,12 @@ class Desk:
         try:
             state = await self._session.state()
         except RefusedError as error:
-            self._close(error)
+            self._refused(error)
             state = None
         # While a submit is on its way, an answer may be older than what its acceptance told.
         if state is not None and state.n_submits >= self.state.n_submits:
             self.state = state
-            self.closed = self.closed or state.is_finalized
+            self._close(state.is_finalized, state.cancelled)
         return self.state
 
     async def idle(self) -> None:
@@ -235,12 +240,11 @@ class Desk:
             self.tickets.remove(ticket)
             ticket.fail(error)
         except RefusedError as error:
-            if error.status not in NO_MORE:
+            if error.status not in RUN_OVER:
                 self._give_up(ticket, error)
                 return
-            self._close(error)
-            status = "budget_invalid" if ticket.accepted is None else "closed"
-            ticket.fail(RequestError(status, "the run was closed: no more submits are taken"))
+            self._refused(error)
+            ticket.fail(self._refusal("budget_invalid" if ticket.accepted is None else "closed"))
         except Exception as error:
             self._give_up(ticket, error)
             return
@@ -274,9 +278,9 @@ class Desk:
         try:
             reply = await self._upload_and_submit(request)
         except RefusedError as error:
-            if error.status in NO_MORE or error.status in _REQUEST_STATUSES:
+            if error.status in RUN_OVER or error.status in _REQUEST_STATUSES:
                 await self._note(Refused(key=request.key, status=error.status, message=error.message))
-            if error.status in NO_MORE:
+            if error.status in RUN_OVER:
                 self.tickets.remove(ticket)
             if error.status in _REQUEST_STATUSES:
                 raise RequestError(error.status, error.message) from error
@@ -301,7 +305,7 @@ class Desk:
             try:
                 return await self._session.submit(request)
             except RefusedError as error:
-                if error.status != "missing_bundle":
+                if error.status != Refusal.MISSING_BUNDLE:
                     raise
                 log.warning("the coordinator has lost the bundle; sending it again", bundle=request.bundle)
             await asyncio.sleep(DISK_PAUSE_S)
@@ -349,6 +353,9 @@ class Desk:
                 await asyncio.sleep(LINGER_S)
         last_result = time.monotonic()
         committed = await asyncio.to_thread(self._commit, tree, index, done, scores)
+        if done.status == CANCELLED:
+            self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
+            self._close(True, True)
         self.feedback_s += time.monotonic() - last_result
         return committed
 
@@ -394,11 +401,22 @@ class Desk:
         tree.commit(summary, errors)
         return done.status, summary
 
-    def _close(self, error: RefusedError) -> None:
+    def _refused(self, error: RefusedError) -> None:
         if not self.closed:
             log.warning("the coordinator takes no more of this run", status=error.status, why=error.message)
-        self.closed = True
-        self._on_change()
+        self._close(True, error.status == Refusal.RUN_CANCELLED)
+
+    def _close(self, closed: bool, cancelled: bool) -> None:
+        """Takes no more submits from now on, if `closed`; `cancelled`: because the operator has ended the run."""
+        if closed and not (self.closed and (self.cancelled or not cancelled)):
+            self.closed, self.cancelled = True, self.cancelled or cancelled
+            self._on_change()
+
+    def _refusal(self, status: str = "budget_invalid") -> RequestError:
+        """What a submit is answered once the run is closed."""
+        if self.cancelled:
+            return RequestError(CANCELLED, "the operator cancelled the run: no more submits are taken")
+        return RequestError(status, "the run is closed: no more submits are taken")
 
     async def _note(self, entry: AnyEntry) -> None:
         """Appends to the journal off the event loop, in order; waits while the disk refuses."""

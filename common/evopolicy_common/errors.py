@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import msgspec
 
+from evopolicy_common.refusals import Refusal
+
 DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 """What msgspec raises for bytes that are not what was expected: malformed or of another shape, text that is not UTF-8
 inside, or nested without end."""
@@ -45,7 +47,7 @@ class TransportError(EvopolicyError):
 class RefusedError(EvopolicyError):
     """The coordinator answered, and refused: a wrong token, an unknown run, a closed run."""
 
-    def __init__(self, status: str, message: str) -> None:
+    def __init__(self, status: Refusal, message: str) -> None:
         super().__init__(f"{message} ({status})")
         self.status = status
         self.message = message

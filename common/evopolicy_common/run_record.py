@@ -25,7 +25,8 @@ SCHEMA_VERSION = 1
 PROTOCOL_VERSION = "v2.0-draft"
 """The agent-facing protocol that runs follow."""
 
-RunStatus = Literal["completed", "no_ok_submit", "error"]
+RunStatus = Literal["completed", "no_ok_submit", "error", "cancelled"]
+"""`cancelled`: the operator ended the run; `error`: it could not be played to its end."""
 
 
 class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -129,7 +130,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
     status: RunStatus
     error: str | None = None
-    """Why the status is `error`, for the operator."""
+    """Why the status is `error` or `cancelled`, for the operator."""
     final_score: float | None = None
     """The held-out mean return: the run's number in the paper's table."""
     best_submit_index: int | None = None

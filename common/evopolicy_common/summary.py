@@ -28,7 +28,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Suite id, such as `gym/acrobot`."""
     status: SubmitStatus
     n_episodes: int
-    """Episodes charged."""
+    """Episodes charged; 0 when `cancelled`."""
     first_global_episode: int
     """Number of its first episode, counting attempted episodes through the run from 0."""
     env_instances: tuple[int, ...] | None

@@ -25,6 +25,7 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator import auditing
 from evopolicy_coordinator.core import records
@@ -126,14 +127,16 @@ class Answers:
             return self._evaluation(effect)
         finished = self._reader.finished(effect.run)
         if finished is None:
-            return Refused(status="unknown_run", message=f"run {effect.run!r} has no outcome")
+            return Refused(status=Refusal.UNKNOWN_RUN, message=f"run {effect.run!r} has no outcome")
         done = len(finished.heldout_returns)
         return RunProgress(phase="finished", done=done, total=done, finished=finished)
 
     def _results(self, effect: ReadResults) -> Message:
         row = self._reader.submit(effect.run, effect.submit_index)
         if row is None:
-            return Refused(status="unknown_submit", message=f"this run has no submit {effect.submit_index}")
+            return Refused(
+                status=Refusal.UNKNOWN_SUBMIT, message=f"this run has no submit {effect.submit_index}"
+            )
         # The row may have moved on since the core asked: an end is told with all that belongs before it.
         upto = row.released if effect.upto is None or row.status is not None else effect.upto
         group = records.train_group(effect.run, effect.submit_index)
@@ -159,7 +162,7 @@ class Answers:
     def _recorded(self, message: RecordedRequest) -> Message:
         run = message.run
         if self._reader.finished(run) is None:
-            return Refused(status="unknown_run", message=f"there is no finished run {run[:64]!r} here")
+            return Refused(status=Refusal.UNKNOWN_RUN, message=f"there is no finished run {run[:64]!r} here")
         name = {
             "train": records.train_group,
             "validation": records.validation_group,
@@ -177,10 +180,10 @@ class Answers:
 
     def _put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int) -> Message:
         if not is_digest(message.digest):
-            return Refused(status="bad_blob", message=f"{message.digest[:80]!r} is no SHA-256 digest")
+            return Refused(status=Refusal.BAD_BLOB, message=f"{message.digest[:80]!r} is no SHA-256 digest")
         if not 0 <= message.size <= max_bytes:
             return Refused(
-                status="bad_blob", message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
+                status=Refusal.BAD_BLOB, message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
             )
         on_whole = None
         if run is not None and not self._uploads.has_sent(run, message.digest):
@@ -192,13 +195,13 @@ class Answers:
         except StorageError as error:
             if error.__cause__ is not None:  # the disk's fault, not the sender's
                 raise
-            return Refused(status="bad_blob", message=str(error))
+            return Refused(status=Refusal.BAD_BLOB, message=str(error))
         return BlobAck(have=have)
 
     def _get(self, run: str | None, message: BlobGet) -> Message:
         known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
         if not known or not self._blobs.has(message.digest):
-            return Refused(status="unknown_blob", message=f"no blob {message.digest[:80]!r} here")
+            return Refused(status=Refusal.UNKNOWN_BLOB, message=f"no blob {message.digest[:80]!r} here")
         size = self._blobs.size(message.digest)
         return BlobChunk(
             size=size, data=self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)

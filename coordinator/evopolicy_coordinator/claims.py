@@ -17,6 +17,7 @@ import msgspec
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages.operator import Claim, ClaimState
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.store import Store
 from evopolicy_coordinator.writer import Writer
 
@@ -92,8 +93,8 @@ class Claims:
 def _check(message: Claim) -> None:
     for what in ("suite", "name", "holder"):
         if not 1 <= len(getattr(message, what)) <= _MAX_NAME:
-            raise RefusedError("bad_message", f"a claim's {what} has 1 to {_MAX_NAME} characters")
+            raise RefusedError(Refusal.BAD_MESSAGE, f"a claim's {what} has 1 to {_MAX_NAME} characters")
     if not (math.isfinite(message.ttl_s) and 0.0 <= message.ttl_s <= MAX_TTL_S):
-        raise RefusedError("bad_message", f"ttl_s {message.ttl_s}: 0 to {MAX_TTL_S:g} seconds")
+        raise RefusedError(Refusal.BAD_MESSAGE, f"ttl_s {message.ttl_s}: 0 to {MAX_TTL_S:g} seconds")
     if message.result is not None and len(msgspec.msgpack.encode(message.result)) > _MAX_RESULT_BYTES:
-        raise RefusedError("bad_message", "a claim's result is larger than 64 KiB")
+        raise RefusedError(Refusal.BAD_MESSAGE, "a claim's result is larger than 64 KiB")

@@ -22,6 +22,7 @@ from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
 from evopolicy_coordinator.machines import Machines
@@ -108,7 +109,7 @@ class Intake:
             message = codec.decode(codec.operator_requests, payload)
             self._check_token("operator", self._identity.operator_token, message.token)
             return Parsed("ops", "operator", message)
-        raise RefusedError("wrong_key", f"nothing is asked on {key}")
+        raise RefusedError(Refusal.WRONG_KEY, f"nothing is asked on {key}")
 
     def _parse_worker(self, tail: str, payload: bytes) -> Parsed:
         message = codec.decode(codec.worker_requests, payload)
@@ -138,7 +139,7 @@ class Intake:
     def _check_session(self, session: str) -> None:
         if self._machines is not None and self._machines.is_shut_out(session):
             raise RefusedError(
-                "revoked",
+                Refusal.REVOKED,
                 "this machine was revoked, or issued again; ask the cluster's operator for a new folder",
             )
 
@@ -213,7 +214,9 @@ class Intake:
                     check_inline(ref)
                 for ref in stored_blobs(outcome):
                     if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
-                        raise RefusedError("missing_blob", f"blob {ref.digest[:64]!r} is not stored here")
+                        raise RefusedError(
+                            Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here"
+                        )
         return events.ResultsHandedIn(
             stimulus_id=stimulus, request=request, worker=m.worker, session=m.session, results=m.results
         )
@@ -230,7 +233,7 @@ class Intake:
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle, m.run)
         if (m.bundle is None) == (m.bundle_error is None):
-            raise RefusedError("bad_message", "a submit has either a bundle or a bundle_error")
+            raise RefusedError(Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
         return events.SubmitRequested(
             stimulus_id=stimulus,
             request=request,
@@ -243,7 +246,7 @@ class Intake:
 
     def results_requested(self, m: gateway.ResultsRequest, request: int, stimulus: str) -> AnyEvent:
         if not 0 <= m.submit_index <= MAX_COUNT:
-            raise RefusedError("unknown_submit", f"this run has no submit {m.submit_index}")
+            raise RefusedError(Refusal.UNKNOWN_SUBMIT, f"this run has no submit {m.submit_index}")
         return events.ResultsRequested(
             stimulus_id=stimulus,
             request=request,
@@ -270,13 +273,13 @@ class Intake:
                 suite.name, wanted.env, self._counts(suite, wanted.n_validation, wanted.n_heldout)
             )
         except ConfigError as error:
-            raise RefusedError("invalid_settings", str(error)) from error
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
         budget = suite.budget if wanted.budget is None else wanted.budget
         least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
         most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
         if not 1 <= least <= most:
             raise RefusedError(
-                "invalid_settings",
+                Refusal.INVALID_SETTINGS,
                 f"budget {budget} and {least} to {most} episodes a submit do not go together; all are at least 1",
             )
         return events.RunCreated(
@@ -307,13 +310,13 @@ class Intake:
             suite = catalogue.suite_of(m.env)
             cases = self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
         except ConfigError as error:
-            raise RefusedError("invalid_settings", str(error)) from error
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
         self._check_again(m, len(ids))
         wrong = next((case_id for case_id in ids if not 0 <= case_id < len(cases)), None)
         if wrong is not None or not ids:
             raise RefusedError(
-                "invalid_env_instance",
+                Refusal.INVALID_ENV_INSTANCE,
                 f"case {wrong} of {m.env}: there are 0 to {len(cases) - 1}"
                 if ids
                 else "no cases are asked for",
@@ -344,7 +347,7 @@ class Intake:
                 suite.name, m.env, self._counts(suite, m.n_validation, m.n_heldout)
             ).hashes()
         except ConfigError as error:
-            raise RefusedError("invalid_settings", str(error)) from error
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
 
     def run_waited(self, m: operator.WaitRun, request: int, stimulus: str) -> AnyEvent:
         return events.RunWaited(
@@ -365,7 +368,7 @@ class Intake:
 
     def run_repinned(self, m: operator.RepinRun, request: int, stimulus: str) -> AnyEvent:
         if not m.reason.strip():
-            raise RefusedError("bad_message", "an override of a run's fingerprint class needs a reason")
+            raise RefusedError(Refusal.BAD_MESSAGE, "an override of a run's fingerprint class needs a reason")
         return events.RunRepinned(
             stimulus_id=stimulus,
             request=request,
@@ -397,12 +400,12 @@ class Intake:
         """Whether what is to be played again is told without contradiction."""
         if m.replays and (m.bundle is not None or len(m.replays) != n):
             raise RefusedError(
-                "bad_message", f"{len(m.replays)} recordings for {n} cases, or a bundle beside them"
+                Refusal.BAD_MESSAGE, f"{len(m.replays)} recordings for {n} cases, or a bundle beside them"
             )
         for ref in m.replays:
             if not (is_digest(ref.digest) and self._blobs.has(ref.digest)):
                 raise RefusedError(
-                    "missing_blob", f"blob {ref.digest[:64]!r} is not stored here; upload it first"
+                    Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here; upload it first"
                 )
         place = m.as_in
         if place is None:
@@ -411,17 +414,19 @@ class Intake:
         fits = len(place.indexes) == n and all(0 <= index < whole for index in place.indexes)
         if not fits or not 1 <= place.modulo <= MAX_COUNT or not -1 <= place.submit_index <= MAX_COUNT:
             raise RefusedError(
-                "bad_message", f"{n} cases do not fit the list of {whole} they are said to be of"
+                Refusal.BAD_MESSAGE, f"{n} cases do not fit the list of {whole} they are said to be of"
             )
         if place.policy_scope == "submit" and m.bundle is not None and place.indexes != tuple(range(whole)):
-            raise RefusedError("bad_message", "with policy scope submit only whole submits are played again")
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, "with policy scope submit only whole submits are played again"
+            )
 
     def _check_bundle(self, digest: str | None, run: str | None = None) -> None:
         """Whether it is stored; with `run`, also whether that run's gateway has brought it."""
         brought = digest is None or run is None or self._uploads.has_sent(run, digest)
         if digest is not None and not (brought and is_digest(digest) and self._blobs.has(digest)):
             raise RefusedError(
-                "missing_bundle", f"bundle {digest[:64]!r} is not stored here; upload it first"
+                Refusal.MISSING_BUNDLE, f"bundle {digest[:64]!r} is not stored here; upload it first"
             )
 
 

@@ -10,6 +10,7 @@ from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import worker
 from evopolicy_common.messages.episode import BlobRef, ResourceLimits
+from evopolicy_common.refusals import Refusal
 
 MAX_COUNT = 2**31 - 1
 _MAX_WAIT_S = 60.0
@@ -31,28 +32,30 @@ def check_limits(limits: ResourceLimits) -> None:
     for name in limits.__struct_fields__:
         value = getattr(limits, name)
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise RefusedError("invalid_settings", f"limit {name} is {value}; it must be above 0 and finite")
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and finite"
+            )
 
 
 def check_token(expected: str, given: str) -> None:
     """The token is the one expected, compared in constant time."""
     if not hmac.compare_digest(expected.encode(), given.encode()):
         raise RefusedError(
-            "bad_token", "wrong token, or one of something that is not here; see the credentials file"
+            Refusal.BAD_TOKEN, "wrong token, or one of something that is not here; see the credentials file"
         )
 
 
 def check_key(tail: str, expected: str) -> None:
     """The message came on the key that its kind belongs on."""
     if tail != expected:
-        raise RefusedError("wrong_key", f"this message belongs on {expected!r}, not on {tail!r}")
+        raise RefusedError(Refusal.WRONG_KEY, f"this message belongs on {expected!r}, not on {tail!r}")
 
 
 def check_idempotency_key(key: str) -> None:
     """A key has a bounded length."""
     if not 1 <= len(key) <= _MAX_NAME:
         raise RefusedError(
-            "bad_message", f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
+            Refusal.BAD_MESSAGE, f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
         )
 
 
@@ -60,16 +63,17 @@ def check_registration(message: worker.Register) -> None:
     """The worker speaks this protocol, under a name that can stand in a key."""
     if message.protocol != codec.WIRE_VERSION:
         raise RefusedError(
-            "wrong_protocol",
+            Refusal.WRONG_PROTOCOL,
             f"worker speaks wire version {message.protocol}, the coordinator {codec.WIRE_VERSION}: install the same"
             " version of evopolicy on both",
         )
     if not keys.valid_name(message.worker):
         raise RefusedError(
-            "bad_name", f"worker name {message.worker[:80]!r}: letters, digits, '.', '_', '-', at most 63"
+            Refusal.BAD_NAME,
+            f"worker name {message.worker[:80]!r}: letters, digits, '.', '_', '-', at most 63",
         )
     if not 1 <= message.slots <= 4096:
-        raise RefusedError("bad_message", f"{message.slots} slots: a worker has 1 to 4096")
+        raise RefusedError(Refusal.BAD_MESSAGE, f"{message.slots} slots: a worker has 1 to 4096")
 
 
 def check_inline(ref: BlobRef | None) -> None:
@@ -77,4 +81,6 @@ def check_inline(ref: BlobRef | None) -> None:
     if ref is None or ref.inline is None:
         return
     if len(ref.inline) != ref.size or digest_of(ref.inline) != ref.digest:
-        raise RefusedError("bad_blob", f"inline bytes are not blob {ref.digest[:64]!r} of {ref.size} bytes")
+        raise RefusedError(
+            Refusal.BAD_BLOB, f"inline bytes are not blob {ref.digest[:64]!r} of {ref.size} bytes"
+        )

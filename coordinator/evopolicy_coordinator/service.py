@@ -28,6 +28,7 @@ from evopolicy_common import bundles, codec
 from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answers, answer_to, lane_of
 from evopolicy_coordinator.claims import Claims
@@ -158,7 +159,7 @@ class Service:
         except RefusedError as error:
             self._refuse(query, error)
         except ProtocolError as error:
-            self._refuse(query, RefusedError("bad_message", str(error)))
+            self._refuse(query, RefusedError(Refusal.BAD_MESSAGE, str(error)))
         except Exception:
             # A bug of ours must not take the service down with it; the asker hears at once and may ask again.
             log.exception("request failed", key=query.key)
@@ -258,7 +259,7 @@ class Service:
             self._refuse(query, error)
             return
         except StorageError as error:
-            answer = Refused(status="unavailable", message=str(error))
+            answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
         except Exception:
             log.exception("request failed", key=query.key)
             query.drop()
@@ -273,7 +274,7 @@ class Service:
         elif parsed.room == "gw":
             run = core.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
-                raise RefusedError("closed", f"run {parsed.asker} is closed and takes no more bundles")
+                raise RefusedError(*core.over(parsed.asker))
         run_id = parsed.asker if parsed.room == "gw" else None
         answer = answer_to(query, parsed.asker)
         self._answers.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
@@ -283,7 +284,7 @@ class Service:
             worker = _check_session(core, parsed.asker, message.token)
             if not any(lease.job.names_blob(message.digest) for lease in worker.leases.values()):
                 raise RefusedError(
-                    "unknown_blob",
+                    Refusal.UNKNOWN_BLOB,
                     f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
                 )
         run = parsed.asker if parsed.room == "gw" else None
@@ -314,7 +315,7 @@ class Service:
                 query.key
             ):  # the reason names paths, which no agent needs to know
                 why += f": {self._storage_error}"
-            query.reply(codec.encode(Refused(status="unavailable", message=why)))
+            query.reply(codec.encode(Refused(status=Refusal.UNAVAILABLE, message=why)))
         else:
             query.drop()
 
@@ -475,5 +476,7 @@ class Service:
 def _check_session(core: Core, name: str, session: str) -> Worker:
     worker = core.fleet.workers.get(name)
     if worker is None or not hmac.compare_digest(worker.session.encode(), session.encode()):
-        raise RefusedError("unknown_worker", f"worker {name[:64]!r} has no such session; register again")
+        raise RefusedError(
+            Refusal.UNKNOWN_WORKER, f"worker {name[:64]!r} has no such session; register again"
+        )
     return worker

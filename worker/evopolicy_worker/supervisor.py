@@ -41,6 +41,7 @@ from evopolicy_common.messages.worker import (
     ResultKind,
     WorkerReply,
 )
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.requests import Requester
 from evopolicy_common.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
@@ -239,7 +240,7 @@ class Supervisor:
             try:
                 reply = await self._ask.until_answered("lease", request, Leases, wait_s=LEASE_POLL_S)
             except RefusedError as error:
-                if error.status != "unknown_worker":
+                if error.status != Refusal.UNKNOWN_WORKER:
                     raise
                 await self._register_again(session)
                 continue
@@ -403,7 +404,7 @@ class Supervisor:
             try:
                 await self._ask.until_answered("done", message, HandInReply)
             except RefusedError as error:
-                if error.status == "unknown_worker":
+                if error.status == Refusal.UNKNOWN_WORKER:
                     await self._register_again(session)
                 else:
                     log.error("results not taken; trying again", status=error.status, why=error.message)
@@ -435,7 +436,7 @@ class Supervisor:
                 await self._ask.upload(self._options.name, session, blob.digest, blob.inline)
                 return msgspec.structs.replace(blob, inline=None)
             except RefusedError as error:
-                if error.status == "unknown_worker":
+                if error.status == Refusal.UNKNOWN_WORKER:
                     await self._register_again(session)
                     continue
                 log.error("blob not taken; trying again", status=error.status, why=error.message)

@@ -1,6 +1,7 @@
 """What is done with each run of a sweep at a start: rules without I/O, said before anything is done.
 
-- A finished run is kept. One that ended in an error, ours or its provider's, is played again as a new attempt.
+- A finished run is kept. One that ended in an error, ours or its provider's, or that was cancelled, is played again as a
+  new attempt.
 - A run that the cluster has closed is only finished. One still open goes on in its agent's session; without a session it
   is begun again as a new attempt, and what there is of it is kept aside.
 - Where the file now wants other settings than a run was played with, the operator decides.
@@ -74,7 +75,7 @@ def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision
         why = (entry.error if entry is not None else None) or "it ended in an error"
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
     if not found.opened:
-        if entry is not None and entry.state in ("running", "error"):
+        if entry is not None and entry.state in ("running", "error", "cancelled"):
             return Decision(run=run, kind="restart", attempt=attempt + 1, why="its folder is gone")
         return Decision(run=run, kind="new", attempt=attempt)
     if found.phase is None:

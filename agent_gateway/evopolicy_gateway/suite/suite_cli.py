@@ -1,7 +1,7 @@
 """`evopolicy suite`: plays a sweep, says beforehand what it will do, and goes on where it was when started again.
 
 Exit codes: 0 every run completed, 1 something failed or was not begun, 2 a wrong option or file, 3 a run ended without an ok
-submit, 130 interrupted (started again it goes on).
+submit, 4 an agent failed, 5 a run was cancelled, 130 interrupted (started again it goes on).
 """
 
 from __future__ import annotations
@@ -24,15 +24,13 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
 from evopolicy_gateway import options
-from evopolicy_gateway.runs import Cluster, connected
+from evopolicy_gateway.runs import Cluster, connected, exit_code
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Index
 from evopolicy_gateway.suite.suite_view import JsonView, results_table, viewing
 from evopolicy_gateway.suite.sweep import Sweep, look
-
-NO_OK_SUBMIT = 3
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -148,10 +146,8 @@ async def _suite(order: Order) -> int:
         if (told := suite_index.told(index)) is not None:
             console.print(told, markup=False)
         console.print(f"index: {order.root / suite_index.FILE_NAME}", markup=False, soft_wrap=True)
-    states = {entry.state for entry in entries}
-    if len(entries) < len(names) or not states <= FINISHED:
-        return 1
-    return NO_OK_SUBMIT if "no_ok_submit" in states else 0
+    missing = [("error", "")] * (len(names) - len(entries))
+    return exit_code([*missing, *((entry.state, entry.closed_reason) for entry in entries)])
 
 
 def _tell(order: Order, index: Index, decided: list[Decision], console: Console) -> None:

@@ -22,7 +22,7 @@ FILE_NAME = "suite.json"
 
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
 
-State = Literal["pending", "running", "completed", "no_ok_submit", "error"]
+State = Literal["pending", "running", "completed", "no_ok_submit", "error", "cancelled"]
 FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
 
@@ -51,6 +51,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     tokens: dict[str, Any] | None = None
     earlier: dict[str, Any] | None = None
     """Tokens of the attempts before this one."""
+    closed_reason: str = ""
+    """Why its agent stopped, as in `run.json`."""
     error: str | None = None
     wall_s: float = 0.0
     finished_at: str = ""
@@ -109,6 +111,7 @@ def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path
         random=None if reference is None else reference.mean_return,
         n_submits=len(outcome.val_scores),
         budget_used=outcome.budget_used,
+        closed_reason=outcome.closed_reason,
         tokens=None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens),
         error=outcome.error or (_NO_RUN if state_of(record) == "error" else None),
         wall_s=record.timing.wall_s,

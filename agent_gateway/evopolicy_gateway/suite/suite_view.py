@@ -157,6 +157,8 @@ class SuiteView:
         parts = [f"{len(done)} of {len(self.rows)} runs done", f"{len(running)} running"]
         if failed:
             parts.append(f"{len(failed)} failed")
+        if cancelled := sum(row.state == "cancelled" for row in rows):
+            parts.append(f"{cancelled} cancelled")
         if tokens := sum(_tokens(row.tokens) for row in rows):
             parts.append(f"{_short(tokens)} tokens")
         cost = sum(float((row.tokens or {}).get("cost") or 0.0) for row in rows)
@@ -173,7 +175,7 @@ class SuiteView:
             for row in rows
             if row.entry is not None and row.entry.state in FINISHED and row.entry.wall_s
         ]
-        left = sum(row.state not in FINISHED and row.state != "error" for row in rows)
+        left = sum(row.state not in FINISHED and row.state not in ("error", "cancelled") for row in rows)
         if not walls or not left:
             return None
         return sum(walls) / len(walls) * left / min(self._parallel, left)
@@ -245,6 +247,8 @@ def words(kind: str, told: dict[str, Any]) -> str:
     if kind == "finished":
         if told["state"] == "completed":
             return f"completed, score {_number(told['score'])} (random {_number(told['random'])})"
+        if told["state"] == "cancelled":
+            return str(told["error"] or "cancelled")
         why = f": {told['error']}" if told["error"] else ""
         return str(told["state"]).replace("_", " ") + why
     if kind == "submit":
@@ -295,7 +299,7 @@ def results_table(entries: list[Entry]) -> Table:
 
 
 def _order(row: Row) -> int:
-    kinds = {"running": 0, "error": 1, "waiting": 3}
+    kinds = {"running": 0, "error": 1, "cancelled": 1, "waiting": 3}
     return kinds.get(row.state, 2 if row.state.startswith("on ") else 4)
 
 

@@ -44,6 +44,10 @@ _LOOK_S = 1.0
 ATTEMPTS = ".attempts"
 
 
+class _TakenOverError(Exception):
+    """Another host took the run's claim and cancelled the run at the cluster."""
+
+
 class Sweep:
     """Plays the decisions."""
 
@@ -99,8 +103,11 @@ class Sweep:
                     if task.done():
                         del self._active[name]
                         self._ending.discard(name)
-                        if task.cancelled():
+                        taken_over = not task.cancelled() and isinstance(task.exception(), _TakenOverError)
+                        if task.cancelled() or taken_over:
                             # Another host has it, whose result is asked for in time; or a cap is used up.
+                            if taken_over:
+                                by_name[name] = _anew(by_name[name])
                             self._not_before[name] = time.monotonic() + _ASK_AGAIN_S
                             self._view.waits(name)
                             todo.append(by_name[name])
@@ -198,6 +205,9 @@ class Sweep:
             if decision.kind in ("restart", "new"):
                 await self._put_aside(folder, decision.attempt - 1)
             record = await self._played(decision)
+            if record.outcome.status == "cancelled" and await self._is_taken_over(run):
+                self._view.note(run.name, "another host has it now and has cancelled it here")
+                raise _TakenOverError
             done = suite_index.entry_of(
                 run,
                 record,
@@ -242,6 +252,10 @@ class Sweep:
         )
         self._plays[run.name] = play
         return await (play.resume() if decision.kind in ("resume", "finish") else play.play())
+
+    async def _is_taken_over(self, run: SuiteRun) -> bool:
+        claim = await self._ask(run)
+        return claim.result is not None or not claim.granted
 
     async def _renew(self, by_name: dict[str, Decision]) -> None:
         """Keeps the claims of what goes on here, and tells soon which run of the cluster is played for each."""

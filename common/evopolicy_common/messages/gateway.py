@@ -26,7 +26,12 @@ SubmitStatus = Literal[
     "init_error",
     "rollout_timeout",
     "quarantined",
+    "cancelled",
 ]
+"""`cancelled`: the operator ended the run meanwhile, and nothing was charged. All others were charged."""
+
+CANCELLED = "cancelled"
+"""Why an operator's cancelled run takes no more submits: `close_reason`."""
 VideoOption = Literal["off", "first", "all"]
 SimulationRule = Literal["forbidden", "allowed"]
 """Whether the agent's rules let it simulate the environment outside its submits."""
@@ -93,6 +98,8 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     is_finalized: bool
     """True when no more submits are taken."""
     in_flight: SubmitInFlight | None = None
+    cancelled: bool = False
+    """The operator ended the run."""
     held_s: float = 0.0
     """The same seconds of all the run's submits so far."""
 

@@ -8,6 +8,7 @@ import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.refusals import Refusal
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
@@ -17,8 +18,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
 class Refused(Message, frozen=True, kw_only=True, tag="refused"):
     """The request was understood and is not served; nothing was changed by it."""
 
-    status: str
-    """One word for scripts: `bad_token`, `unknown_worker`, `unknown_run`, `busy`, `budget_invalid` …"""
+    status: Refusal
     message: str
 
 

@@ -132,6 +132,8 @@ def read_run(folder: Path) -> Run:
     outcome = record.outcome
     if outcome.status == "error":
         raise UnreadableRunError(f"the run ended in an error: {outcome.error or 'no reason given'}")
+    if outcome.status == "cancelled":
+        raise UnreadableRunError(f"the run was {outcome.error or 'cancelled'}")
     if outcome.agent_never_played:
         raise UnreadableRunError("its agent failed before it used any budget: this is no run of that agent")
     if outcome.status == "completed":

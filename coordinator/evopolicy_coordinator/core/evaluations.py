@@ -13,6 +13,7 @@ import msgspec
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.environment import PolicyScope
+from evopolicy_common.refusals import Refusal
 
 from . import events
 from .effects import ReadEvaluation
@@ -50,7 +51,7 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
         turn.reply(event.request, operator.EvaluationStarted(evaluation=known))
         return
     if not event.cases or len(event.cases) != len(event.case_ids):
-        turn.refuse(event.request, "bad_request", "an evaluation needs at least one case")
+        turn.refuse(event.request, Refusal.BAD_REQUEST, "an evaluation needs at least one case")
         return
     row = EvaluationRow(
         evaluation=event.evaluation,
@@ -187,7 +188,7 @@ def polled(core: Core, event: events.EvaluationPolled, turn: Turn) -> None:
         return
     group = core.groups.get(poll.target)
     if group is None:
-        turn.refuse(event.request, "unknown_evaluation", f"there is no evaluation {event.evaluation!r}")
+        turn.refuse(event.request, Refusal.UNKNOWN_EVALUATION, f"there is no evaluation {event.evaluation!r}")
     elif group.done > event.cursor or not core.polls.wait(poll, event.wait_s, turn.now):
         turn.add(_page(core, poll, group, turn, finished=False))
 

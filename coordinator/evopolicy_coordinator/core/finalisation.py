@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import PolicyScope
-from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_common.refusals import Refusal
 
 from . import audit, events
 from .jobs import EARLY_VALIDATION, HELDOUT, JobGroup, Template
@@ -138,7 +138,7 @@ def close(core: Core, event: events.RunClosed, turn: Turn) -> None:
     """The agent is gone: no more submits, and the hidden cases are played. Closing twice is closing once."""
     run = core.runs.get(event.run)
     if run is None and event.run not in core.capabilities:
-        turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
+        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
     if run is not None and run.state.phase == "open":
         run.change(turn, phase="closed", closed_at=turn.now, close_reason=event.reason, agent=event.agent)
@@ -192,20 +192,17 @@ def cancel(core: Core, event: events.RunCancelled, turn: Turn) -> None:
         if core.cancel_evaluation(event.run, turn) or event.run in core.capabilities:
             turn.reply(event.request, operator.Done())
         else:
-            turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
     if run.open is not None:
         index, run.open = run.open, None
         run.ledger.refund(index)
-        failure = PolicyFailure(category="killed", step_index=None, message="the operator cancelled the run")
-        run.change_submit(
-            index, turn, status="rollout_timeout", failure=failure, completed_at=turn.now, refunded=True
-        )
+        run.change_submit(index, turn, status="cancelled", completed_at=turn.now, refunded=True)
         group = core.groups[train_group(run.id, index)]
         core.close_group(group, turn, "run cancelled")
         answer_polls(core, group, turn)
     if run.state.phase == "open":
-        run.change(turn, phase="closed", closed_at=turn.now, close_reason="cancelled")
+        run.change(turn, phase="closed", closed_at=turn.now, close_reason=gateway.CANCELLED)
     _finish(core, run, None, turn, cancelled=True)
     turn.reply(event.request, operator.Done())
 
@@ -317,7 +314,7 @@ def waited(core: Core, event: events.RunWaited, turn: Turn) -> None:
         if event.run in core.capabilities:
             turn.add(finished_effect(event.request, event.run, turn))
         else:
-            turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
     poll = Poll(event.request, "run", run.id)
     if not core.polls.wait(poll, event.wait_s, turn.now):

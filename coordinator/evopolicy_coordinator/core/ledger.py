@@ -8,16 +8,9 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from evopolicy_common.refusals import Refusal
 
 from .story import InvariantError
-
-
-class Refusal(NamedTuple):
-    """Why a submit's list of train cases is refused."""
-
-    status: str
-    message: str
 
 
 class Ledger:
@@ -75,17 +68,17 @@ class Ledger:
 
 def refusal(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
-) -> Refusal | None:
-    """Why these train cases cannot be played, or None. Checked in the order that the protocol names."""
+) -> tuple[Refusal, str] | None:
+    """Why these train cases cannot be played, in a word and a sentence, or None. Checked in the order that the protocol names."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:
             message = f"env_instances names {case_id}; train cases are 0 to {n_cases - 1}"
-            return Refusal("invalid_env_instance", message)
+            return Refusal.INVALID_ENV_INSTANCE, message
     if n < minimum:
-        return Refusal("budget_invalid", f"{n} episodes asked for; a submit takes at least {minimum}")
+        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; a submit takes at least {minimum}"
     if n > maximum:
-        return Refusal("budget_invalid", f"{n} episodes asked for; a submit takes at most {maximum}")
+        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; a submit takes at most {maximum}"
     if n > available:
-        return Refusal("budget_invalid", f"{n} episodes asked for; {available} of the budget remain")
+        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; {available} of the budget remain"
     return None

@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
+from evopolicy_common.refusals import Refusal
 
 from . import audit, evaluations, events, finalisation, invariants, membership, runs, status
 from .effects import Effect
@@ -132,6 +133,10 @@ class Core:
     def capability(self, run: str) -> str | None:
         """The token of a run's gateway, finished runs too; None for no run."""
         return self.capabilities.get(run)
+
+    def over(self, run: str) -> tuple[Refusal, str]:
+        """Why nothing more is taken of a run that is not open, in a word and a sentence."""
+        return runs.over(self, run)
 
     def worker_of(self, session: str) -> str | None:
         """The worker whose present session is `session` (its right to read and write blobs); None when it is nobody's."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
+from evopolicy_common.refusals import Refusal
 
 from . import events, handin, status
 from .records import WorkerRow
@@ -34,7 +35,7 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Else one machine could play under another's name, and have it blamed.
         text = f"a worker of another machine is called {event.worker!r}; choose another --name"
-        turn.refuse(event.request, "name_taken", text)
+        turn.refuse(event.request, Refusal.NAME_TAKEN, text)
         return
     if old is not None:
         core.scheduler.drop_poll(old, turn)
@@ -68,7 +69,7 @@ def _refused_as_forger(core: Core, name: str, machine: str, request: events.Requ
         return False
     same = "" if forger == name else f" (as {forger!r} of the same machine)"
     text = f"worker {name!r} gets no more work here: {fleet.quarantined[forger]}{same}"
-    turn.refuse(request, "quarantined", text)
+    turn.refuse(request, Refusal.QUARANTINED, text)
     return True
 
 
@@ -81,7 +82,7 @@ def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
     worker = core.fleet.of_session(event.worker, event.session, turn.now)
     if worker is None:
         text = f"session of worker {event.worker!r} is not known here; register again"
-        turn.refuse(event.request, "unknown_worker", text)
+        turn.refuse(event.request, Refusal.UNKNOWN_WORKER, text)
     else:
         core.timers.arm_once(("worker", worker.name), turn.now + core.settings.lease_ttl_s)
         if was_lost:
@@ -133,7 +134,7 @@ def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
     """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
     if event.state != "active" and event.worker in core.fleet.quarantined:
         text = f"{event.worker} is quarantined: {core.fleet.quarantined[event.worker]}"
-        turn.refuse(event.request, "quarantined", text)
+        turn.refuse(event.request, Refusal.QUARANTINED, text)
         return
     turn.persist(WorkerRow(worker=event.worker, state=event.state))
     worker = core.fleet.workers.get(event.worker)
@@ -159,10 +160,10 @@ def repinned(core: Core, event: events.RunRepinned, turn: Turn) -> None:
         if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
     }
     if run is None:
-        turn.refuse(event.request, "unknown_run", f"there is no unfinished run {event.run!r}")
+        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no unfinished run {event.run!r}")
     elif event.fingerprint_class not in offered:
         text = f"no worker of class {event.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
-        turn.refuse(event.request, "unknown_class", text)
+        turn.refuse(event.request, Refusal.UNKNOWN_CLASS, text)
     else:
         text = f"{run.state.fingerprint_class} → {event.fingerprint_class}: {event.reason}"
         profile = offered[event.fingerprint_class]

@@ -296,12 +296,13 @@ def submit_done(row: SubmitRow) -> SubmitDone | None:
     """The end of a submit as its gateway is told; None while it is open."""
     if row.status is None or row.completed_at is None:
         return None
+    n = len(row.env_instances)
     return SubmitDone(
         status=row.status,
-        n_episodes=len(row.env_instances),
+        n_episodes=0 if row.refunded else n,
         env_instances=row.env_instances,
         first_global_episode=row.first_global_episode,
-        remaining_budget=row.remaining_budget,
+        remaining_budget=row.remaining_budget + (n if row.refunded else 0),
         started_at=row.accepted_at,
         completed_at=row.completed_at,
         failure=row.failure,

@@ -17,7 +17,8 @@ import msgspec
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import NO_POLICY, EpisodeOutcome, PolicyFailure
-from evopolicy_common.messages.gateway import SubmitStatus
+from evopolicy_common.messages.gateway import CANCELLED, SubmitStatus
+from evopolicy_common.refusals import Refusal
 
 from . import events
 from .effects import ReadFinished, ReadResults
@@ -85,7 +86,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
     if fault is None and event.run in core.capabilities:
         fault = f"there is a run {event.run!r} already"
     if fault is not None:
-        turn.refuse(event.request, "bad_settings", fault)
+        turn.refuse(event.request, Refusal.BAD_SETTINGS, fault)
         return
     row = RunRow(
         run=event.run,
@@ -157,7 +158,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
         text = (
             f"no worker that offers {settings.env} with sandbox tier {settings.sandbox_tier} is connected yet"
         )
-        turn.refuse(event.request, "no_worker", text)
+        turn.refuse(event.request, Refusal.NO_WORKER, text)
         return
     turn.reply(
         event.request,
@@ -193,7 +194,12 @@ def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> Non
 
 def last_state(row: RunStateRow) -> gateway.RunState:
     """What the gateway of a finished run is told of it."""
-    return gateway.RunState(remaining_budget=row.remaining_budget, n_submits=row.n_submits, is_finalized=True)
+    return gateway.RunState(
+        remaining_budget=row.remaining_budget,
+        n_submits=row.n_submits,
+        is_finalized=True,
+        cancelled=row.close_reason == CANCELLED,
+    )
 
 
 def run_state(core: Core, run: Run) -> gateway.RunState:
@@ -218,10 +224,20 @@ def run_state(core: Core, run: Run) -> gateway.RunState:
 def _live(core: Core, request: events.RequestId, name: str, turn: Turn) -> Run | None:
     run = core.runs.get(name)
     if run is None:
-        finished = name in core.capabilities
-        text = f"run {name!r} is finished" if finished else f"there is no run {name!r}"
-        turn.refuse(request, "run_finished" if finished else "unknown_run", text)
+        turn.refuse(request, *over(core, name))
     return run
+
+
+def over(core: Core, name: str) -> tuple[Refusal, str]:
+    """Why nothing more is taken of a run that is not open, in a word and a sentence."""
+    last = core.finished.get(name)
+    if last is not None and last.cancelled:
+        return Refusal.RUN_CANCELLED, f"run {name!r} was cancelled by the operator"
+    if last is not None:
+        return Refusal.RUN_FINISHED, f"run {name!r} is finished"
+    if name in core.runs:
+        return Refusal.RUN_CLOSED, f"run {name!r} is closed and takes no more submits"
+    return Refusal.UNKNOWN_RUN, f"there is no run {name[:64]!r}"
 
 
 def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
@@ -234,10 +250,10 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
         _again(event, run.submits[known], turn)
         return
     if run.state.phase != "open":
-        turn.refuse(event.request, "run_closed", f"run {run.id!r} takes no more submits")
+        turn.refuse(event.request, *over(core, run.id))
         return
     if run.open is not None:
-        turn.refuse(event.request, "busy", f"submit {run.open} is still running; one runs at a time")
+        turn.refuse(event.request, Refusal.BUSY, f"submit {run.open} is still running; one runs at a time")
         return
     refused = refusal(
         event.env_instances,
@@ -247,10 +263,10 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
         available=run.ledger.available,
     )
     if refused is not None:
-        turn.refuse(event.request, refused.status, refused.message)
+        turn.refuse(event.request, *refused)
         return
     if event.bundle is None and event.bundle_error is None:
-        turn.refuse(event.request, "bad_request", "a submit names a bundle, or says why there is none")
+        turn.refuse(event.request, Refusal.BAD_REQUEST, "a submit names a bundle, or says why there is none")
         return
     _accept(core, run, event, turn)
 
@@ -259,7 +275,7 @@ def _again(event: events.SubmitRequested, row: SubmitRow, turn: Turn) -> None:
     """The answer to a key that is known: the same as the first time, if the request is."""
     if (event.env_instances, event.bundle) != (row.env_instances, row.bundle):
         text = f"key {event.key!r} was used for submit {row.submit_index} with another request"
-        turn.refuse(event.request, "key_conflict", text)
+        turn.refuse(event.request, Refusal.KEY_CONFLICT, text)
         return
     turn.reply(event.request, _accepted(row))
 
@@ -428,11 +444,11 @@ def results(core: Core, event: events.ResultsRequested, turn: Turn) -> None:
         if event.run in core.capabilities:
             turn.add(_page(event.request, event.run, event.submit_index, event.cursor, None, "", turn))
         else:
-            turn.refuse(event.request, "unknown_run", f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
     if not 0 <= event.submit_index < len(run.submits):
         text = f"run {run.id!r} has {len(run.submits)} submits, none of index {event.submit_index}"
-        turn.refuse(event.request, "unknown_submit", text)
+        turn.refuse(event.request, Refusal.UNKNOWN_SUBMIT, text)
         return
     target = train_group(run.id, event.submit_index)
     poll = Poll(event.request, "results", target, event.cursor)

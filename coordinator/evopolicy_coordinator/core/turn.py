@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal
 
 from evopolicy_common.messages.worker import Message, Refused
+from evopolicy_common.refusals import Refusal
 
 from .effects import Effect, Log, Persist, Reply
 from .events import RequestId
@@ -45,7 +46,7 @@ class Turn:
         """Answer a request."""
         self._out.append(Reply(request=request, message=message, stimulus_id=self.stimulus_id))
 
-    def refuse(self, request: RequestId, status: str, message: str) -> None:
+    def refuse(self, request: RequestId, status: Refusal, message: str) -> None:
         """Answer a request with the reason why it is not carried out."""
         self.reply(request, Refused(status=status, message=message))
 

@@ -73,7 +73,7 @@ def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, numb
         assert "Traceback" not in err
         assert running.alive() == []
     outcome = record_in(run_dir(tmp_path)).outcome
-    assert (outcome.status, outcome.closed_reason) == ("error", "cancelled")
+    assert (outcome.status, outcome.closed_reason) == ("cancelled", "cancelled")
     assert not (run_dir(tmp_path) / ".gateway").exists()
 
 

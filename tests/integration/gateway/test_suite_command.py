@@ -215,6 +215,55 @@ def test_a_dead_hosts_runs_are_taken_over_and_it_takes_their_results_when_it_is_
     assert [*hosts[0].glob("runs/t/*/*/*/run.json")] == []
 
 
+def test_a_host_whose_run_is_taken_over_during_a_submit_takes_the_others_result(
+    tmp_path: Path, operator_file: Path
+) -> None:
+    agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
+    flag.parent.mkdir()
+    agent.write_text(
+        "import json, os, sys, urllib.request\n"
+        "slow = '' if os.path.exists(sys.argv[1]) else 'time.sleep(0.5); '\n"
+        "open('system/policy.py', 'w').write(\n"
+        "    'import time\\nclass Policy:\\n  def __init__(self, *a): pass\\n  def reset(self, i): pass\\n'\n"
+        "    f'  def act(self, obs): {slow}return [0.0]\\n')\n"
+        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
+        "data = json.dumps({'env_instances': [0, 1]}).encode()\n"
+        "answer = urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
+        "open('answer.json', 'wb').write(answer)\n"
+    )
+    hosts = [tmp_path / "one", tmp_path / "two"]
+    for host in hosts:
+        host.mkdir()
+        (host / "t.toml").write_text(
+            'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 2\nvalidation = 1\nheldout = 1\n'
+            f'[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent} {flag}"\n'
+            f'[agents.jail]\nread = ["{flag.parent}"]\n'
+        )
+    arguments = ("--credentials", str(operator_file))
+    folder = hosts[0] / "runs/t/own/toy_line/t-0"
+    with sweep(hosts[0], *arguments) as one:
+        wait_until((folder / "workspace/feedback/submit_000.partial").exists, lambda: one.text)
+        os.kill(one.process.pid, signal.SIGSTOP)
+        flag.touch()
+        with sweep(hosts[1], *arguments) as two:
+            wait_until(lambda: "taken over from" in two.text, lambda: two.text)
+            wait_until((folder / "workspace/answer.json").exists, lambda: one.text)
+            os.kill(one.process.pid, signal.SIGCONT)
+            assert two.wait() == 0, two.text
+        assert one.wait() == 0, one.text
+        assert one.alive() == []
+    # The agent was told the truth, and so was nobody else told anything else.
+    kept = [*hosts[0].glob("runs/t/.attempts/**/workspace"), *hosts[0].glob("runs/t/own/*/*/workspace")]
+    (workspace,) = kept
+    assert json.loads((workspace / "answer.json").read_text())["status"] == "cancelled"
+    assert "Traceback" not in (workspace.parent / "logs/harness.log").read_text()
+    assert "starting it again" not in one.text
+    (entry,) = index_in(hosts[1] / "runs" / "t").values()
+    (told,) = index_in(hosts[0] / "runs" / "t").values()
+    assert (entry["state"], entry["attempt"]) == ("completed", 2)
+    assert (told["state"], told["score"], told["directory"]) == ("completed", entry["score"], "")
+
+
 def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
     tmp_path: Path, operator_file: Path
 ) -> None:
@@ -222,7 +271,7 @@ def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
     arguments = ("--credentials", str(operator_file), "--only", "fake claude/*")
     root = tmp_path / "runs" / "t"
     with sweep(tmp_path, *arguments) as first:
-        assert first.wait() == 1, first.text
+        assert first.wait() == 4, first.text
         assert "401" in first.text
     (entry,) = index_in(root).values()
     assert entry["state"] == "error"

@@ -92,7 +92,7 @@ def test_an_environment_that_does_not_repeat_itself_is_marked_in_the_record(tmp_
 def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
     outcome = run_record(plan(tmp_path), done, None, [], Times()).outcome
-    assert outcome.status == ("error" if status == "cancelled" else status)
+    assert outcome.status == status
     assert outcome.final_score is None
     assert outcome.heldout_returns == ()
     assert (outcome.error is not None) == (status == "cancelled")
@@ -210,10 +210,13 @@ def test_exit_codes_and_the_report_tell_how_runs_ended() -> None:
     )
     nothing = RunResult(env="b", run_directory="/r/b", status="no_ok_submit")
     failed = RunResult(env="c", run_directory="/r/c", status="error", error="worker lost")
-    assert exit_code([completed]) == 0
-    assert exit_code([completed, nothing]) == 3
-    assert exit_code([completed, nothing, failed]) == 1
+    gave_up = RunResult(env="d", run_directory="/r/d", status="completed", closed_reason="agent_failed")
+    cancelled = RunResult(env="e", run_directory="/r/e", status="cancelled", closed_reason="agent_failed")
+    seen = []
+    for result, code in ((completed, 0), (nothing, 3), (gave_up, 4), (cancelled, 5), (failed, 1)):
+        seen.append(result)
+        assert exit_code((one.status, one.closed_reason) for one in seen) == code
     out = io.StringIO()
-    report([completed, nothing, failed], Console(file=out, width=100))
-    for needed in ("no_ok_submit", "worker lost", "run directory: /r/a"):
+    report(seen, Console(file=out, width=100))
+    for needed in ("no_ok_submit", "worker lost", "run directory: /r/a", "agent failed", "cancelled"):
         assert needed in out.getvalue()

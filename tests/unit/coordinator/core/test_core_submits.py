@@ -12,7 +12,7 @@ from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.worker import Refused
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadResults
-from evopolicy_coordinator.core.records import SubmitRow
+from evopolicy_coordinator.core.records import SubmitRow, submit_done
 
 
 def started(**settings: Any) -> tuple[Rig, str]:
@@ -194,8 +194,11 @@ def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None
     rig.tell(events.RunCancelled(request="cancel", run="r1"))
     assert isinstance(rig.replies["page"], ReadResults)
     assert (rig.finished().status, rig.finished().budget_used) == ("cancelled", 0)
-    assert rig.row(SubmitRow, "r1", 0).refunded
+    row = rig.row(SubmitRow, "r1", 0)
+    assert (row.status, row.refunded) == ("cancelled", True)
+    done = submit_done(row)
+    assert (done.n_episodes, done.remaining_budget) == (0, 16)
     assert rig.beat(session, first).cancelled == (first.lease_id,)
-    assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_finished"
+    assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_cancelled"
     state = rig.tell(events.StateRequested(request="state", run="r1")).state
-    assert (state.is_finalized, state.remaining_budget) == (True, 16)
+    assert (state.is_finalized, state.cancelled, state.remaining_budget) == (True, True, 16)
