@@ -150,7 +150,7 @@ async def _request_error(request: Request, error: Exception) -> Response:
     document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
     if isinstance(error, ConflictError):
         return _json(409, document | {"submit_id": error.submit_id})
-    return _json(503 if error.status == "closed" else 400, document)
+    return _json({"closed": 503, "gateway_failed": 500}.get(error.status, 400), document)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

@@ -6,7 +6,9 @@ feedback tree from the answers. A torn last line (the machine died while it was 
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -72,14 +74,75 @@ class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
     """Accepted submits before it."""
 
 
+class Died(Entry, frozen=True, kw_only=True, tag="died"):
+    """A gateway ended while it worked on a submit, or on the feedback of some of its episodes."""
+
+    key: str
+    episodes: tuple[int, ...] = ()
+    """Their request indexes; empty: it was the submit as a whole."""
+
+
+class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
+    """A submit that the gateway could not go on with, twice: it has no feedback, and is not tried again."""
+
+    key: str
+    message: str
+
+
 class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
     """The coordinator was told that no more submits come."""
 
     reason: str
 
 
-AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Closed
+AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside | Closed
 _decoder = msgspec.json.Decoder(AnyEntry)
+
+
+class AtWork:
+    """Which episodes' files are being made, kept so that a process which is killed over one is known to have been.
+
+    One small record each, written in place: it has to survive the process only, and costs microseconds.
+    """
+
+    _RECORD = 64
+
+    def __init__(self, path: Path) -> None:
+        """`died_over` holds what the last process left; it is to be written down before the first `begin`."""
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self.died_over: list[tuple[str, int]] = []
+        """Submit's key and request index."""
+        data = os.pread(self._fd, 1 << 16, 0)
+        for at in range(0, len(data), self._RECORD):
+            key, _, index = (
+                data[at : at + self._RECORD].rstrip(b"\0").decode("ascii", "replace").partition(" ")
+            )
+            if key and index.isdecimal():
+                self.died_over.append((key, int(index)))
+        self._free: list[int] = []
+        self._n_records = 0
+
+    def clear(self) -> None:
+        """What was left is written down elsewhere."""
+        os.ftruncate(self._fd, 0)
+
+    @contextlib.contextmanager
+    def on(self, key: str, index: int) -> Iterator[None]:
+        """While inside, the episode is being worked on. To be entered and left on one thread."""
+        if not self._free:
+            self._free.append(self._n_records * self._RECORD)
+            self._n_records += 1
+        at = self._free.pop()
+        record = f"{key} {index}".encode()[: self._RECORD]
+        os.pwrite(self._fd, record.ljust(self._RECORD, b"\0"), at)
+        try:
+            yield
+        finally:
+            os.pwrite(self._fd, bytes(self._RECORD), at)
+            self._free.append(at)
+
+    def close(self) -> None:
+        os.close(self._fd)
 
 
 class Journal:
@@ -88,6 +151,8 @@ class Journal:
     def __init__(self, path: Path) -> None:
         """Opens or makes it. StorageError when a line other than the last cannot be read."""
         self._path = path
+        self.at_work = AtWork(path.with_name("at-work"))
+        """The episodes whose files are being made."""
         self.entries: list[AnyEntry] = []
         """All lines, oldest first."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -96,7 +161,7 @@ class Journal:
             self._load()
             fsync_directory(path.parent)
         except BaseException:
-            self._file.close()
+            self.close()
             raise
 
     def append(self, entry: AnyEntry) -> None:
@@ -112,6 +177,7 @@ class Journal:
 
     def close(self) -> None:
         self._file.close()
+        self.at_work.close()
 
     def _load(self) -> None:
         data = self._file.read() or b""

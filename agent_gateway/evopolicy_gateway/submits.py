@@ -12,15 +12,15 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import msgspec
 import structlog
 
 from evopolicy_common.blobs import BlobStore, digest_of
-from evopolicy_common.errors import RefusedError, RequestError, StorageError
+from evopolicy_common.errors import ProtocolError, RefusedError, RequestError, StorageError
 from evopolicy_common.messages.gateway import (
     CANCELLED,
     EpisodeFeedback,
@@ -32,17 +32,19 @@ from evopolicy_common.messages.gateway import (
 )
 from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway import formatting, snapshots
-from evopolicy_gateway.episode_files import episode_files
+from evopolicy_gateway.episode_files import episode_files, set_aside_files
 from evopolicy_gateway.feedback import SubmitTree
 from evopolicy_gateway.formatting import EpisodeScore
 from evopolicy_gateway.journal import (
     Accepted,
     AnyEntry,
     Closed,
+    Died,
     Journal,
     Refused,
     Rejected,
     Requested,
+    SetAside,
     Settled,
 )
 from evopolicy_gateway.session import Session
@@ -58,6 +60,8 @@ DISK_PAUSE_S = 2.0
 """Between tries to write feedback while the disk refuses."""
 MAX_REJECTED_KEPT = 1000
 FETCHES_AT_ONCE = 4
+MAX_DEATHS = 2
+"""So often a gateway may end over one submit, or over the files of one episode, before that is put aside."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
@@ -99,6 +103,9 @@ class Desk:
         self._clock = clock
         self._task: asyncio.Task[None] | None = None
         self._journal_lock = asyncio.Lock()
+        self._deaths: Counter[tuple[str, int | None]] = Counter()
+        """Gateways that ended over an episode of a submit, or (None) over the submit as a whole."""
+        self._write_down_deaths()
         self._recover()
 
     @property
@@ -201,6 +208,15 @@ class Desk:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
+    def _write_down_deaths(self) -> None:
+        """Puts into the journal what the last process was killed over."""
+        left = self._journal.at_work
+        for key in dict.fromkeys(key for key, _ in left.died_over):
+            episodes = tuple(index for of, index in left.died_over if of == key)
+            log.warning("the last gateway ended over the files of an episode", submit=key, episodes=episodes)
+            self._journal.append(Died(key=key, episodes=episodes))
+        left.clear()
+
     def _recover(self) -> None:
         """Rebuilds the tickets from the journal and goes on with the one that has no end."""
         by_key: dict[str, Ticket] = {}
@@ -216,6 +232,13 @@ class Desk:
                 self.tickets.remove(by_key.pop(entry.key))
             elif isinstance(entry, Rejected):
                 self.n_rejected += 1
+            elif isinstance(entry, Died):
+                self._deaths.update((entry.key, index) for index in entry.episodes or (None,))
+            elif isinstance(entry, SetAside):
+                ticket = by_key[entry.key]
+                ticket.fail(RequestError("gateway_failed", entry.message))
+                if ticket.accepted is None:
+                    self.tickets.remove(ticket)
             elif isinstance(entry, Closed):
                 self.closed = True
         for ticket in list(self.tickets):
@@ -240,22 +263,35 @@ class Desk:
             self.tickets.remove(ticket)
             ticket.fail(error)
         except RefusedError as error:
-            if error.status not in RUN_OVER:
-                self._give_up(ticket, error)
+            if error.status in RUN_OVER:
+                self._refused(error)
+                ticket.fail(self._refusal("budget_invalid" if ticket.accepted is None else "closed"))
+            elif not await self._goes_on_without(ticket, error):
                 return
-            self._refused(error)
-            ticket.fail(self._refusal("budget_invalid" if ticket.accepted is None else "closed"))
         except Exception as error:
-            self._give_up(ticket, error)
-            return
+            if not await self._goes_on_without(ticket, error):
+                return
         self.in_flight_s += time.monotonic() - started
         self.in_flight = None
         self._on_change()
 
-    def _give_up(self, ticket: Ticket, error: Exception) -> None:
+    async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
+        """Whether the submit is put aside. The first time this gateway ends over it instead, for the next one to try."""
+        key = ticket.request.key
         log.error("submit failed", submit=ticket.submit_id, exc_info=error)
-        if not self.fatal.done():
-            self.fatal.set_exception(error)
+        self._deaths[key, None] += 1
+        await self._note(Died(key=key))
+        if self._deaths[key, None] < MAX_DEATHS:
+            if not self.fatal.done():
+                self.fatal.set_exception(error)
+            return False
+        charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
+        message = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
+        await self._note(SetAside(key=key, message=message))
+        if ticket.accepted is None:
+            self.tickets.remove(ticket)
+        ticket.fail(RequestError("gateway_failed", message))
+        return True
 
     async def _snapshot(self, ticket: Ticket) -> None:
         """Takes the bundle as it is now, and writes the request down."""
@@ -346,7 +382,7 @@ class Desk:
         while done is None:
             page = await self._session.results(index, cursor)
             cursor, done = page.cursor, page.done
-            await self._write_page(tree, page, first, scores)
+            await self._write_page(tree, ticket.request.key, page, first, scores)
             ticket.n_done, ticket.waits_for = len(scores), page.waits_for
             self._on_change()
             if done is None and len(ticket.request.env_instances) - len(scores) >= LINGER_EPISODES:
@@ -360,19 +396,18 @@ class Desk:
         return committed
 
     async def _write_page(
-        self, tree: SubmitTree, page: ResultsPage, first: int, scores: dict[int, EpisodeScore]
+        self, tree: SubmitTree, key: str, page: ResultsPage, first: int, scores: dict[int, EpisodeScore]
     ) -> None:
         gate = asyncio.Semaphore(FETCHES_AT_ONCE)
+        wanted = [episode for episode in page.episodes if episode.index not in scores]
+        # What a gateway has ended over is written alone, so that no other episode is blamed for it.
+        suspects = [episode for episode in wanted if self._deaths[key, episode.index]]
 
         async def write(episode: EpisodeFeedback) -> None:
             async with gate:
-                trajectory = await self._session.fetch(episode.trajectory)
-                video = None if episode.video is None else await self._session.fetch(episode.video)
-                make = partial(
-                    episode_files, episode, trajectory, video, self.run.env.obs_storage, at=self._clock()
-                )
+                files = await self._files_of(key, episode)
                 name = formatting.episode_name(first + episode.index, self.run.episode_budget)
-                await asyncio.to_thread(lambda: tree.put_episode(name, make()))
+                await asyncio.to_thread(tree.put_episode, name, files)
                 scores[episode.index] = EpisodeScore(
                     index=episode.index,
                     episode_return=episode.episode_return,
@@ -382,10 +417,34 @@ class Desk:
                 )
 
         # All have ended before an error is raised: nothing may write on into a tree that is begun again.
-        writes = [write(episode) for episode in page.episodes if episode.index not in scores]
+        writes = [write(episode) for episode in wanted if episode not in suspects]
         for outcome in await asyncio.gather(*writes, return_exceptions=True):
             if isinstance(outcome, BaseException):
                 raise outcome
+        for episode in suspects:
+            await write(episode)
+
+    async def _files_of(self, key: str, episode: EpisodeFeedback) -> dict[str, bytes]:
+        """An episode's files; without its trajectory where that cannot be had, or a gateway has ended over it before."""
+        why = f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
+        if self._deaths[key, episode.index] < MAX_DEATHS:
+            try:
+                trajectory = await self._session.fetch(episode.trajectory)
+                video = None if episode.video is None else await self._session.fetch(episode.video)
+                storage, at = self.run.env.obs_storage, self._clock()
+                with self._journal.at_work.on(key, episode.index):
+                    return await asyncio.to_thread(episode_files, episode, trajectory, video, storage, at=at)
+            except RefusedError as error:
+                if error.status != Refusal.UNKNOWN_BLOB:
+                    raise
+                why = "this episode's trajectory or video is not stored any more"
+            except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
+                log.error(
+                    "an episode's files cannot be made", submit=key, index=episode.index, exc_info=error
+                )
+                why = "this episode's trajectory cannot be written"
+        log.error("episode put aside", submit=key, index=episode.index, why=why)
+        return set_aside_files(episode, why, at=self._clock())
 
     def _commit(
         self, tree: SubmitTree, index: int, done: SubmitDone, scores: dict[int, EpisodeScore]
