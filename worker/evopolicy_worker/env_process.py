@@ -52,7 +52,10 @@ class Channel:
         return found
 
     def send(self, message: messages.Message) -> None:
-        data = memoryview(messages.framed(message))
+        self.send_frame(messages.framed(message))
+
+    def send_frame(self, frame: bytes) -> None:
+        data = memoryview(frame)
         with self._lock:
             while data:
                 data = data[os.write(self._answers, data) :]
@@ -93,16 +96,16 @@ class EnvProcess:
         self._monitor.ticking = True
         self._monitor.wake()
         try:
-            outcomes = player.play(command.job, command.bundle, progress)
-            return messages.Played(outcomes=tuple(outcomes), cancelled=progress.cancelled)
+            player.play(command.job, command.bundle, progress, self._channel.send_frame)
+            return messages.Played(cancelled=progress.cancelled)
         except CancelledJobError:
-            return messages.Played(outcomes=(), cancelled=True)
+            return messages.Played(cancelled=True)
         except SlotDiedError as error:
-            return messages.Fault(kind="died", message=str(error))
+            return messages.Fault(kind="died", message=fault_of(error))
         except Exception as error:
             if progress.cancelled:
                 # Whatever it met on its way out.
-                return messages.Played(outcomes=(), cancelled=True)
+                return messages.Played(cancelled=True)
             kind = "sandbox" if isinstance(error, SandboxError) else "worker"
             return messages.Fault(kind=kind, message=fault_of(error))
         finally:

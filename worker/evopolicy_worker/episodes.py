@@ -7,7 +7,9 @@ Rules:
 - A recording that is played again takes the policy's place: its actions, to its last step; then the episode stops,
   whether or not the environment ended it.
 - A video is made of the episode's actions after its end (see `video.py`); playing it never draws.
-- What the policy did is a result; what the environment or the sandbox did wrong is raised.
+- What the policy did is a result, and so is what its actions did to the environment: an environment that breaks down on
+  them plays the episode once more, anew and with random actions alone. What the environment or the sandbox did wrong
+  otherwise is raised.
 """
 
 from __future__ import annotations
@@ -16,8 +18,10 @@ import contextlib
 import hashlib
 import math
 import os
+import sys
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +29,7 @@ import msgspec
 import numpy as np
 
 from evopolicy_common.blobs import digest_of
-from evopolicy_common.errors import EvopolicyError, WorkerError
+from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import (
     NO_POLICY,
     BlobRef,
@@ -38,6 +42,7 @@ from evopolicy_common.messages.episode import (
 from evopolicy_common.scratch import remove_tree
 from evopolicy_common.trajectory import Recorder, decode
 from evopolicy_worker import environments, float_environment
+from evopolicy_worker import slot_messages as messages
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
 from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
@@ -45,8 +50,16 @@ from evopolicy_worker.recording import VideoRecorder
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Zygote
 
+MAX_FAULT = 4000
+"""Characters of an error that are told."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
+
+
+BROKE_DOWN = (
+    "the environment broke down on the policy's actions; the episode was played again from its first step with random"
+    " actions"
+)
 
 
 class CancelledJobError(Exception):
@@ -85,33 +98,55 @@ class Player:
         self._folders: list[Path] = []
         self._videos = VideoRecorder()
 
-    def play(self, job: Job, folder: str | None, progress: Progress) -> list[EpisodeOutcome]:
-        """Play the job's episodes in order.
+    def play(self, job: Job, folder: str | None, progress: Progress, tell: Callable[[bytes], None]) -> None:
+        """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`.
 
         Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
         """
         environment = self._environment(job.env)
         files = self._read_bundle(folder) if job.bundle is not None else None
         policies = _Policies(self, job, files, environment)
-        outcomes: list[EpisodeOutcome] = []
         if not job.video:
             self._videos.close()
         try:
             for k, spec in enumerate(job.episodes):
                 if progress.cancelled:
                     raise CancelledJobError
-                outcome = _Episode(job, spec, environment, policies, progress, self._videos).play(k)
-                outcomes.append(outcome)
+                failure, frame = self._play(k, job, spec, policies, progress)
+                tell(frame)
                 progress.episodes_done += 1
-                if _yields_no_policy(job, outcome):
-                    assert outcome.failure is not None
-                    outcomes += [
-                        _unplayed(other.index, outcome.failure) for other in job.episodes[len(outcomes) :]
-                    ]
+                if failure is not None and _verdict_of_submit(job, spec, failure):
+                    for other in job.episodes[k + 1 :]:
+                        tell(_framed(_unplayed(other.index, failure)))
                     break
         finally:
             policies.close(progress)
-        return outcomes
+
+    def _play(
+        self, k: int, job: Job, spec: EpisodeSpec, policies: _Policies, progress: Progress
+    ) -> tuple[PolicyFailure | None, bytes]:
+        """The failure in one episode, and its outcome as it is told."""
+        episode = _Episode(job, spec, self._environment(job.env), policies, progress, self._videos)
+        try:
+            outcome = episode.play(k)
+            return outcome.failure, _framed(outcome)
+        except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
+            raise
+        except Exception as error:
+            if not episode.acted or progress.cancelled:
+                raise
+            # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
+            print(
+                f"{messages.NOTE}{job.env} broke down on a policy's actions: {fault_of(error)}",
+                file=sys.stderr,
+            )
+            self._environments.pop(job.env).close()
+            failure = episode.failure or PolicyFailure(
+                category="act_error", step_index=None, message=BROKE_DOWN
+            )
+        environment = self._environment(job.env)
+        episode = _Episode(job, spec, environment, policies, progress, self._videos, failure)
+        return failure, _framed(episode.play(k))
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
@@ -236,23 +271,27 @@ class _Episode:
         policies: _Policies,
         progress: Progress,
         videos: VideoRecorder,
+        failure: PolicyFailure | None = None,
     ) -> None:
+        """`failure`: why no policy is asked, and random actions are played from the first step on."""
         self._job = job
         self._spec = spec
         self._environment = environment
         self._policies = policies
         self._progress = progress
         self._videos = videos
-        self._failure: PolicyFailure | None = None
+        self.failure = failure
+        self.acted = False
+        """Whether an action of the policy's has reached the environment."""
 
     def play(self, k: int) -> EpisodeOutcome:
         job, spec = self._job, self._spec
         start = time.monotonic()
-        policy = self._begin(k) if job.bundle is not None else None
-        if self._failure is not None and _verdict_of_submit(job, spec, self._failure):
+        policy = self._begin(k) if job.bundle is not None and self.failure is None else None
+        if self.failure is not None and _verdict_of_submit(job, spec, self.failure):
             ended = self._policies.release()
             return msgspec.structs.replace(
-                _unplayed(spec.index, self._failure),
+                _unplayed(spec.index, self.failure),
                 stdout=ended.stdout,
                 stderr=ended.stderr,
                 policy_cpu_s=ended.cpu_s,
@@ -270,7 +309,7 @@ class _Episode:
             length=length,
             terminated=terminated,
             truncated=truncated,
-            failure=self._failure,
+            failure=self.failure,
             reward_components=components,
             trajectory=_blob(recorder.finish()),
             video=None if played is None else self._video(played.finish(), length),
@@ -304,7 +343,7 @@ class _Episode:
     def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
         if self._progress.cancelled:
             raise CancelledJobError
-        self._failure = msgspec.structs.replace(failure, step_index=step)
+        self.failure = msgspec.structs.replace(failure, step_index=step)
 
     def _steps(
         self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
@@ -330,6 +369,7 @@ class _Episode:
             if policy is not None:
                 try:
                     returned = policy.act(obs)
+                    self.acted = True
                     action, invalid = repair(returned)
                 except PolicyFailedError as error:
                     self._note(error.failure, t)
@@ -390,14 +430,6 @@ def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> b
     return spec.index == 0 and job.record == "full" and failure.category in NO_POLICY
 
 
-def _yields_no_policy(job: Job, outcome: EpisodeOutcome) -> bool:
-    return (
-        outcome.failure is not None
-        and outcome.length == 0
-        and _verdict_of_submit(job, job.episodes[0], outcome.failure)
-    )
-
-
 def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
     return EpisodeOutcome(
         index=index, episode_return=0.0, length=0, terminated=False, truncated=False, failure=failure
@@ -406,6 +438,10 @@ def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _framed(outcome: EpisodeOutcome) -> bytes:
+    return messages.framed(messages.Finished(outcome=outcome))
 
 
 def _blob(data: bytes) -> BlobRef:
@@ -433,4 +469,5 @@ def _read_files(folder: str) -> BundleFiles:
 
 def fault_of(error: BaseException) -> str:
     """An error of ours in one line, with its kind where it is not one raised on purpose."""
-    return str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"
+    text = str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"
+    return text.encode("utf-8", "replace").decode()[:MAX_FAULT]

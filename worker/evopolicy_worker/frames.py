@@ -11,7 +11,7 @@ import json
 import math
 import struct
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -28,6 +28,8 @@ MAX_REPLY_BYTES = (1 << 20) + (1 << 16)
 MAX_DEPTH = 24
 MAX_AXES = 16
 """Axes of an array in an action."""
+MAX_USED = 1 << 53
+"""No process has more bytes than this; a float still counts them one by one."""
 VALUE_BYTES = 16
 """An action of so many bytes may hold one value for each such piece of them: Python's objects take more than bytes do."""
 
@@ -50,15 +52,18 @@ class BadReplyError(Exception):
     """The policy's process sent what is no reply; the message says what."""
 
 
+_Word = Annotated[str, msgspec.Meta(max_length=200)]
+
+
 class Report(msgspec.Struct, frozen=True):
     """What the policy's own code raised, as its process tells it: text that the policy may have forged."""
 
-    stage: str
-    kind: str | None
-    message: str
-    traceback: str
-    missing: str | None = None
-    used: int | None = None
+    stage: _Word
+    kind: _Word | None
+    message: Annotated[str, msgspec.Meta(max_length=4000)]
+    traceback: Annotated[str, msgspec.Meta(max_length=20_000)]
+    missing: _Word | None = None
+    used: Annotated[int, msgspec.Meta(ge=0, le=MAX_USED)] | None = None
     """Of an action that is too large: its bytes."""
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import structlog
 
-from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 from evopolicy_common.scratch import remove_tree
 from evopolicy_worker import environments
@@ -99,21 +99,24 @@ class Slot:
         """Play a job: an outcome for each of its episodes, in order, trajectories inline.
 
         `bundle` is the unpacked bundle's folder, None for random actions; `on_progress` is told episodes and steps done.
-        A cancelled job gives what was done, possibly nothing. Raises SlotDiedError, SandboxError or WorkerError.
+        A cancelled job gives nothing. Raises SlotDiedError, SandboxError or WorkerError.
         """
         if self._process is None:
             raise WorkerError("the slot is not started")
         if job.tier != self._start.tier:
             raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
         self._idle.clear()
+        outcomes: list[EpisodeOutcome] = []
         try:
             await self._send(messages.Play(job=job, bundle=None if bundle is None else str(bundle)))
             while True:
                 answer = await self._answer()
                 if isinstance(answer, messages.Told):
                     on_progress(answer.episodes_done, answer.steps)
+                elif isinstance(answer, messages.Finished):
+                    outcomes.append(answer.outcome)
                 elif isinstance(answer, messages.Played):
-                    return answer.outcomes
+                    return () if answer.cancelled else tuple(outcomes)
                 else:
                     raise _error(answer)
         except asyncio.CancelledError:
@@ -173,6 +176,8 @@ class Slot:
             if length > MAX_ANSWER_BYTES:
                 raise SlotDiedError(f"the slot's process announced an answer of {length} bytes")
             return messages.answers.decode(await process.stdout.readexactly(length))
+        except DECODE_ERRORS as error:
+            raise WorkerError(f"an answer of the slot's process cannot be read: {error}") from error
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             raise SlotDiedError(await self._last_words()) from error
 

@@ -28,14 +28,14 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job; answered by Told, again and again, then by Played or Fault."""
+    """Play this job; answered by Told, again and again, Finished for each episode, then by Played or Fault."""
 
     job: Job
     bundle: str | None
 
 
 class Cancel(Message, frozen=True, kw_only=True, tag="cancel"):
-    """Stop the running job, which is answered by Played with what was done."""
+    """Stop the running job, which is answered by Played."""
 
 
 class Ready(Message, frozen=True, kw_only=True, tag="ready"):
@@ -49,10 +49,15 @@ class Told(Message, frozen=True, kw_only=True, tag="progress"):
     steps: int
 
 
-class Played(Message, frozen=True, kw_only=True, tag="played"):
-    """What came of a job, in its order."""
+class Finished(Message, frozen=True, kw_only=True, tag="finished"):
+    """What came of the job's next episode."""
 
-    outcomes: tuple[EpisodeOutcome, ...]
+    outcome: EpisodeOutcome
+
+
+class Played(Message, frozen=True, kw_only=True, tag="played"):
+    """The job is done: every episode of it has been told, or it was cancelled."""
+
     cancelled: bool = False
 
 
@@ -65,7 +70,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 
 
 Command = Start | Play | Cancel
-Answer = Ready | Told | Played | Fault
+Answer = Ready | Told | Finished | Played | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)

@@ -100,7 +100,14 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
     if indexes != list(range(job.first, job.first + job.n)):
         return f"outcomes of episodes {indexes[:8]} for a job of {job.first} to {job.first + job.n - 1}"
     for outcome in episodes:
-        numbers = (outcome.episode_return, outcome.wall_s, *outcome.reward_components.values())
+        numbers = [
+            outcome.episode_return,
+            outcome.wall_s,
+            outcome.policy_cpu_s,
+            *outcome.reward_components.values(),
+        ]
+        if outcome.failure is not None:
+            numbers += [outcome.failure.limit or 0.0, outcome.failure.used or 0.0]
         if not all(math.isfinite(number) for number in numbers):
             return f"episode {outcome.index} has a number that is not finite: {numbers}"
         if outcome.length < 0:

@@ -186,6 +186,12 @@ BREAKERS = (
         verdict="killed",
     ),
     Breaker(
+        name="a forged count that no encoder takes",
+        act='b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
+        "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)",
+        verdict="killed",
+    ),
+    Breaker(
         name="a forged fault of the sandbox",
         act="os.write(4, struct.pack('<IBxxx', 4, 7) + b'ours'); time.sleep(60)",
         verdict="killed",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 from core_rig import BUNDLE, Rig, done, outcome_of, result
 
@@ -170,11 +171,14 @@ def test_scope_submit_is_one_job_and_hidden_cases_come_in_chunks_of_the_same_len
 def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
     rig, session = started()
     rig.submit(0)
+    endless = PolicyFailure(category="act_error", step_index=0, message="", used=float("inf"))
     bad = [
         (outcome_of(1),),
         (),
         (outcome_of(0, float("nan")),),
         (outcome_of(0), outcome_of(0)),
+        (msgspec.structs.replace(outcome_of(0), policy_cpu_s=float("inf")),),
+        (msgspec.structs.replace(outcome_of(0), failure=endless),),
     ]
     for episodes in bad:
         rig.pass_time(10.0)
@@ -182,7 +186,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (lease,) = rig.poll(session, 1, wait_s=0.5)
         rig.hand_in(session, result(lease, "done", episodes=episodes))
         assert rig.core.groups["r1/s0/train"].done == 0
-    assert rig.core.runs["r1"].state.infrastructure_retries == 4
+    assert rig.core.runs["r1"].state.infrastructure_retries == len(bad)
 
 
 def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None:

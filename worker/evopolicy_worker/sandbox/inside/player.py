@@ -355,8 +355,8 @@ def reply_failure(stage: str, error: BaseException) -> None:
         "kind": kind,
         "message": sendable(message[:2000]),
         "traceback": sendable(text[-MAX_TEXT:]),
-        "missing": sendable(missing) if type(missing) is str else None,
-        "used": error.used if type(error) is TooLargeError else None,
+        "missing": sendable(missing[:200]) if type(missing) is str else None,
+        "used": min(error.used, 1 << 53) if type(error) is TooLargeError else None,
     }
     reply(FAILED, json.dumps(report).encode())
 
