@@ -181,8 +181,9 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (msgspec.structs.replace(outcome_of(0), failure=endless),),
     ]
     for episodes in bad:
-        rig.pass_time(10.0)
-        rig.beat(session)
+        for _ in range(4):
+            rig.pass_time(10.0)
+            rig.beat(session)
         (lease,) = rig.poll(session, 1, wait_s=0.5)
         rig.hand_in(session, result(lease, "done", episodes=episodes))
         assert rig.core.groups["r1/s0/train"].done == 0
