@@ -24,7 +24,9 @@ def info_document(run: RunOpened, state: RunState, closed: bool, in_flight: Tick
         "obs_storage": env.obs_storage,
     }
     if env.reward_components:
-        env_meta["reward_components"] = list(env.reward_components)
+        env_meta["reward_components"] = {
+            name: env.reward_texts.get(name, "") for name in env.reward_components
+        }
     limits = msgspec.to_builtins(run.limits)
     return {
         "protocol_version": PROTOCOL_VERSION,

@@ -50,8 +50,8 @@ class Policy:
 Observations arrive {form}. Other files in `system/` can be imported and read: the working
 directory and `sys.path[0]` are the policy's own copy of `system/`, writable and thrown away afterwards.
 An episode ends by itself or after {run.env.max_episode_steps} steps.
-An action outside the action space is repaired (clipped, broadcast, or the lowest value), and the step's
-`info.action_invalid` is true.
+An action outside the action space is repaired, and the step's `info.action_invalid` is true: numbers are clipped, shapes
+broadcast, and an action that cannot be read counts as zeros (the lowest choice where there are choices).
 
 Observation space:
 

@@ -5,6 +5,7 @@ Rules that this module owns:
   the dtype of what it stands for. The texts `"NaN"`, `"Inf"` and `"-Inf"` are numbers wherever one belongs.
 - An action is what was played, not part of what came of it: of two trajectories only the answers to it are compared.
 - The mark `policy_failed` in an info is of the policy, not of the environment, and is left out.
+- Runs from before `info.steps` was recorded have the parts of `info.rewards` in `info` itself; they are read as such.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
                 return f"step {t}: {what} {ours!r} and {theirs!r}"
         if full and not same(recorded.obs_at(t), replayed.obs_at(t)):
             return f"step {t}: the observations differ"
-        if full and not same(_unmarked(recorded.infos[t]), _unmarked(replayed.infos[t])):
+        if full and not same(*_comparable(recorded.infos[t], replayed.infos[t])):
             return f"step {t}: the infos differ"
     if recorded.n != replayed.n:
         return f"{recorded.n} and {replayed.n} steps"
@@ -114,7 +115,7 @@ def files_difference(
             if not reads_as(told.get(name), value):
                 shown = f" {told.get(name)!r} and {value!r}" if isinstance(value, float | bool | int) else ""
                 return f"step {t}: {name} differs{shown}"
-        if not reads_as(_unmarked(told.get("info") or {}), _unmarked(row.info)):
+        if not reads_as(*_comparable(told.get("info") or {}, row.info)):
             return f"step {t}: info differs"
     if len(rows) != episode.n:
         return f"{len(rows)} and {episode.n} steps"
@@ -185,8 +186,16 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
     return None
 
 
-def _unmarked(info: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in info.items() if key not in _MARKS}
+def _comparable(recorded: dict[str, Any], replayed: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Both infos without marks, the replayed one in the recorded one's form."""
+    left_out = _MARKS
+    if "steps" in replayed and "steps" not in recorded:
+        left_out = _MARKS | {"steps", "rewards"}
+        replayed = replayed | replayed.get("rewards", {})
+    recorded, replayed = (
+        {key: value for key, value in info.items() if key not in left_out} for info in (recorded, replayed)
+    )
+    return recorded, replayed
 
 
 def _action(told: Any) -> Any:

@@ -208,6 +208,8 @@ class _Policies:
             "action_space": description.action_space,
             "obs_storage": description.obs_storage,
         }
+        if description.reward_components:
+            self._env_meta["reward_components"] = dict(description.reward_texts)
         self._policy: PolicyProcess | None = None
 
     def take(self, k: int, spec: EpisodeSpec, progress: Progress) -> PolicyProcess:
@@ -381,8 +383,9 @@ class _Episode:
                 returned = recorded[t]
                 action, invalid = repair(returned)
             next_obs, reward, terminated, truncated, info = step(action)
+            told = info.get("rewards", info)
             for name in names:
-                sums[name] += _number(info.get(name))
+                sums[name] += _number(told.get(name))
             if invalid:
                 info = {**info, "action_invalid": True}
             if failed:

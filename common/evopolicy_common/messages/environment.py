@@ -40,7 +40,9 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Where feedback keeps observations: in the trajectory's rows, or in `observations.npy` / `.npz` beside it."""
     max_episode_steps: int
     reward_components: tuple[str, ...] = ()
-    """Names under which `info` reports parts of the reward; summed per episode in the summary."""
+    """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
+    reward_texts: dict[str, str] = {}
+    """What each of them stands for; empty from workers of older versions."""
     task_text: str
     """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
     deterministic: bool = True

@@ -42,6 +42,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "obs_storage": "'inline' | 'npy' | 'npz'",
         "max_episode_steps": "int",
         "reward_components": "[str]",
+        "reward_texts": "{str: str}",
         "task_text": "str",
         "deterministic": "bool",
         "renders": "bool",

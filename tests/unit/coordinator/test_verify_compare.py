@@ -88,6 +88,16 @@ def test_a_failed_policys_mark_is_no_difference_of_the_environment() -> None:
     assert first_difference(episode(info={"x": 1.5, "policy_failed": True}), episode()) is None
 
 
+def test_infos_from_before_steps_were_recorded_are_read_in_their_own_form() -> None:
+    old = episode(info={"x": 1.5, "speed": 2.0})
+    assert first_difference(old, episode(info={"x": 1.5, "steps": 3, "rewards": {"speed": 2.0}})) is None
+    assert first_difference(old, episode(info={"x": 1.5, "steps": 3, "rewards": {"speed": 2.5}})) is not None
+    assert (
+        first_difference(episode(info={"x": 1.5, "steps": 3}), episode(info={"x": 1.5, "steps": 4}))
+        is not None
+    )
+
+
 def test_zeros_of_both_signs_and_other_dtypes_are_not_the_same() -> None:
     assert not same(0.0, -0.0)
     assert not same(np.zeros(2, np.float32), np.zeros(2, np.float64))

@@ -6,9 +6,9 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
   fraction counts as an integer; a Box action is cast to the dtype of the space, and may stick out of its bounds by the
   rounding of a float32.
 - Everything else is marked `invalid` and repaired: a number out of bounds is clipped; a wrong shape is broadcast where
-  that is possible; NaN becomes the lowest value of its element; a missing part of a Dict or Tuple, the lowest value of
-  that part; and anything that is no number at all (None, strings, ragged lists, objects) the lowest value of the space.
-- The lowest value of an element without a lower bound is zero, or the upper bound where that is negative.
+  that is possible; NaN becomes the neutral value of its element; a missing part of a Dict or Tuple, the neutral value of
+  that part; and anything that is no number at all (None, strings, ragged lists, objects) the neutral value of the space.
+- The neutral value of a Box is zero, or the bound nearest to it; that of the discrete spaces is the lowest one.
 - What is returned is fresh, of exactly the dtype and shape of the space, and finite.
 """
 
@@ -42,8 +42,8 @@ class ActionCodec(Protocol):
         Bounded elements are uniform; unbounded ones normal; those with one bound shifted exponential.
         """
 
-    def lowest(self) -> Any:
-        """The lowest value of the space."""
+    def neutral(self) -> Any:
+        """What stands for an action that cannot be read."""
 
 
 def compile_actions(schema: SpaceSchema) -> ActionCodec:
@@ -83,7 +83,7 @@ class _Discrete:
     def sample(self, rng: np.random.Generator) -> int:
         return self._low + int(rng.integers(self._n))
 
-    def lowest(self) -> int:
+    def neutral(self) -> int:
         return self._low
 
 
@@ -102,7 +102,7 @@ class _Box:
         self._clip_high = np.minimum(self._high, _inside(limits.max))
         self._rounded_low = self._clip_low - _float32_spacing(self._clip_low)
         self._rounded_high = self._clip_high + _float32_spacing(self._clip_high)
-        self._lowest = np.where(self._bounded_below, self._low, np.minimum(self._high, 0.0))
+        self._neutral: NDArray[np.float64] = np.clip(np.zeros(self._shape), self._low, self._high)
         self._limits = tuple(
             zip(self._clip_low.ravel().tolist(), self._clip_high.ravel().tolist(), strict=True)
         )
@@ -130,11 +130,11 @@ class _Box:
         numbers = _numbers(raw)
         shaped, invalid = _shaped(numbers, self._shape) if numbers is not None else (None, True)
         if shaped is None:
-            return self.lowest(), True
+            return self.neutral(), True
         values = shaped.astype(np.float64)
         lost = np.isnan(values)
         if lost.any():
-            values = np.where(lost, self._lowest, values)
+            values = np.where(lost, self._neutral, values)
             invalid = True
         if bool((values < self._rounded_low).any() or (values > self._rounded_high).any()):
             invalid = True
@@ -160,8 +160,8 @@ class _Box:
             values = np.minimum(np.maximum(np.floor(values), self._clip_low), self._clip_high)
         return values.astype(self._dtype)
 
-    def lowest(self) -> NDArray[Any]:
-        return self._lowest.astype(self._dtype)
+    def neutral(self) -> NDArray[Any]:
+        return self._neutral.astype(self._dtype)
 
 
 class _MultiDiscrete:
@@ -174,7 +174,7 @@ class _MultiDiscrete:
         numbers = _numbers(raw)
         shaped, invalid = _shaped(numbers, self._n.shape) if numbers is not None else (None, True)
         if shaped is None:
-            return self.lowest(), True
+            return self.neutral(), True
         if shaped.dtype.kind == "f":
             with np.errstate(all="ignore"):
                 whole = shaped == np.trunc(shaped)  # False for NaN, True for infinities, which are clipped
@@ -186,7 +186,7 @@ class _MultiDiscrete:
     def sample(self, rng: np.random.Generator) -> NDArray[np.int64]:
         return (rng.random(self._n.shape) * self._n).astype(np.int64) + self._low
 
-    def lowest(self) -> NDArray[np.int64]:
+    def neutral(self) -> NDArray[np.int64]:
         return self._low.copy()
 
 
@@ -202,7 +202,7 @@ class _MultiBinary:
     def sample(self, rng: np.random.Generator) -> NDArray[np.int8]:
         return rng.integers(low=0, high=2, size=self._shape, dtype=np.int8)
 
-    def lowest(self) -> NDArray[np.int8]:
+    def neutral(self) -> NDArray[np.int8]:
         return np.zeros(self._shape, dtype=np.int8)
 
 
@@ -213,7 +213,7 @@ class _Text:
 
     def repair(self, raw: object) -> tuple[str, bool]:
         if not isinstance(raw, str):
-            return self.lowest(), True
+            return self.neutral(), True
         if len(raw) > self._max:
             return raw[: self._max], True
         return raw.ljust(self._min), len(raw) < self._min
@@ -222,7 +222,7 @@ class _Text:
         length = int(rng.integers(self._min, self._max + 1))
         return "".join(_CHARACTERS[k] for k in rng.integers(len(_CHARACTERS), size=length).tolist())
 
-    def lowest(self) -> str:
+    def neutral(self) -> str:
         return " " * self._min
 
 
@@ -232,7 +232,7 @@ class _Dict:
 
     def repair(self, raw: object) -> tuple[dict[str, Any], bool]:
         if not isinstance(raw, dict):
-            return self.lowest(), True
+            return self.neutral(), True
         invalid = raw.keys() != self._parts.keys()
         action = {}
         for key, part in self._parts.items():
@@ -243,8 +243,8 @@ class _Dict:
     def sample(self, rng: np.random.Generator) -> dict[str, Any]:
         return {key: part.sample(rng) for key, part in self._parts.items()}
 
-    def lowest(self) -> dict[str, Any]:
-        return {key: part.lowest() for key, part in self._parts.items()}
+    def neutral(self) -> dict[str, Any]:
+        return {key: part.neutral() for key, part in self._parts.items()}
 
 
 class _Tuple:
@@ -255,7 +255,7 @@ class _Tuple:
         if isinstance(raw, np.ndarray) and raw.ndim:
             raw = list(raw[: len(self._parts) + 1])
         if not isinstance(raw, list | tuple):
-            return self.lowest(), True
+            return self.neutral(), True
         invalid = len(raw) != len(self._parts)
         given = [*raw[: len(self._parts)], *[None] * (len(self._parts) - len(raw))]
         action = []
@@ -268,8 +268,8 @@ class _Tuple:
     def sample(self, rng: np.random.Generator) -> tuple[Any, ...]:
         return tuple(part.sample(rng) for part in self._parts)
 
-    def lowest(self) -> tuple[Any, ...]:
-        return tuple(part.lowest() for part in self._parts)
+    def neutral(self) -> tuple[Any, ...]:
+        return tuple(part.neutral() for part in self._parts)
 
 
 def _integer(raw: object) -> int | None:

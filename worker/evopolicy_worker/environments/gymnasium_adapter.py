@@ -43,8 +43,8 @@ class GymnasiumFamily:
     """Distributions whose versions decide what is played, the one that registers the environments first."""
     modules: tuple[str, ...] = ("gymnasium",)
     """Packages to import; a family is offered where all of them are installed."""
-    components: Mapping[str, tuple[str, ...]] = {}
-    """Names in `info` of the parts of the reward, by Gymnasium id."""
+    components: Mapping[str, Mapping[str, str]] = {}
+    """Parts of the reward, by Gymnasium id: their names in `info` (or in its `rewards`), and what each stands for."""
 
     def installed(self) -> bool:
         """Whether all packages are there, found out without importing them."""
@@ -118,6 +118,7 @@ class GymnasiumEnvironment(Environment):
         self._observe = compile_observation(obs_schema)
         self._plain = family.info
         self.action_codec = compile_actions(action_schema)
+        components = family.components.get(entry.gymnasium_id or "", {})
         self.description = EnvironmentDescription(
             env=entry.id,
             env_version=family.version(entry),
@@ -125,7 +126,8 @@ class GymnasiumEnvironment(Environment):
             action_space=action_schema,
             obs_storage=spaces.obs_storage(obs_schema),
             max_episode_steps=self._limit,
-            reward_components=tuple(family.components.get(entry.gymnasium_id or "", ())),
+            reward_components=tuple(components),
+            reward_texts=dict(components),
             task_text=task_text(entry.id),
             deterministic=family.deterministic(entry)
             and not (self._env.spec is not None and self._env.spec.nondeterministic),
@@ -146,12 +148,14 @@ class GymnasiumEnvironment(Environment):
     def step(self, action: Any) -> Step:
         obs, reward, terminated, truncated, info = self._env.step(action)
         self._steps += 1
+        plain = self._plain(info)
+        plain["steps"] = self._steps
         return Step(
             self._observe(obs),
             float(reward),
             bool(terminated),
             bool(truncated) or self._steps >= self._limit,
-            self._plain(info),
+            plain,
         )
 
     def render(self) -> Frame:

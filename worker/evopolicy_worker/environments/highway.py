@@ -15,13 +15,19 @@ class HighwayFamily(GymnasiumFamily):
     distributions = ("highway-env",)
     modules = ("gymnasium", "highway_env")
     components = {
-        "roundabout-v0": ("collision_reward", "high_speed_reward", "lane_change_reward", "on_road_reward"),
+        "roundabout-v0": {
+            "collision_reward": "1 when the car has crashed, without its weight",
+            "high_speed_reward": "grows with the chosen speed, from 0 to 1, without its weight",
+            "lane_change_reward": "1 when a lane change was asked for, without its weight",
+            "on_road_reward": "1 on the road; the whole reward is 0 off it",
+        },
     }
 
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
-        """The nested `rewards` (unweighted, some of them bools) become numbers under their own names."""
+        """The nested `rewards` (unweighted, some of them bools) become numbers."""
         plain = plain_info(info)
-        plain.update({name: float(value) for name, value in plain.pop("rewards", {}).items()})
+        if "rewards" in plain:
+            plain["rewards"] = {name: float(value) for name, value in plain["rewards"].items()}
         return plain
 
 

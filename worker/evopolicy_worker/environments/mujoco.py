@@ -19,11 +19,23 @@ class MujocoFamily(GymnasiumFamily):
 
     distributions: tuple[str, ...] = ("gymnasium", "mujoco")
     modules: tuple[str, ...] = ("gymnasium", "mujoco")
-    components: Mapping[str, tuple[str, ...]] = {
-        "Reacher-v5": ("reward_dist", "reward_ctrl"),
-        "HalfCheetah-v5": ("reward_forward", "reward_ctrl"),
-        "Ant-v5": ("reward_forward", "reward_ctrl", "reward_contact", "reward_survive"),
-        "Pusher-v5": ("reward_dist", "reward_ctrl", "reward_near"),
+    components: Mapping[str, Mapping[str, str]] = {
+        "Reacher-v5": {
+            "reward_dist": "cost of the distance between fingertip and target",
+            "reward_ctrl": "cost of torque",
+        },
+        "HalfCheetah-v5": {"reward_forward": "forward speed", "reward_ctrl": "cost of torque"},
+        "Ant-v5": {
+            "reward_forward": "speed along positive x",
+            "reward_ctrl": "cost of torque",
+            "reward_contact": "cost of contact forces",
+            "reward_survive": "bonus while healthy",
+        },
+        "Pusher-v5": {
+            "reward_dist": "cost of the distance between cylinder and goal",
+            "reward_ctrl": "cost of torque",
+            "reward_near": "cost of the distance between wrist and cylinder",
+        },
     }
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:

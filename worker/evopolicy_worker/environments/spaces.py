@@ -1,9 +1,9 @@
 """Spaces as plain dicts: from a Gymnasium space to the schema that policies, `/info` and the codecs read.
 
-Forms (protocol, section Policy): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
+Forms (as in the published protocol): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
 value_range, storage}`, `MultiDiscrete {nvec, start?}`, `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
-{min_length, max_length}`. Infinities are `"inf"` and `"-inf"`; a Box of more than 32 values states `min` and `max`
-over all of its values in place of `low` and `high`. A schema is JSON and msgpack by construction.
+{min_length, max_length}`. Infinities are `"inf"` and `"-inf"`. `low` and `high` are nested lists, or one number for all values
+where a Box has more than 32 and they are equal. A schema is JSON and msgpack by construction.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ if TYPE_CHECKING:
     import gymnasium
 
 MAX_LISTED_BOUNDS = 32
-"""A Box with more values than this states one minimum and one maximum."""
+"""A Box with more values than this states a bound that all of them share as one number."""
+MAX_INLINE_BYTES = 4096
+"""Observations of more bytes a step are stored outside the rows, as the published protocol does."""
 MIN_IMAGE_SIDE = 16
 """A uint8 height × width × {1, 3} array is a picture from this side on; smaller ones are symbolic grids."""
 
 
-def to_schema(space: gymnasium.Space[Any], *, storage: ObsStorage = "npy") -> SpaceSchema:
-    """`space` as a plain dict. `storage` is what an Image at the top says; nested Images say `npz`.
-
-    TypeError for a kind of space that the protocol has no form for.
-    """
+def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
+    """`space` as a plain dict. TypeError for a kind of space that the protocol has no form for."""
     from gymnasium import spaces
 
     if isinstance(space, spaces.Discrete):
@@ -39,7 +38,7 @@ def to_schema(space: gymnasium.Space[Any], *, storage: ObsStorage = "npy") -> Sp
             schema["start"] = int(space.start)
         return schema
     if isinstance(space, spaces.Box):
-        return _box(space.shape, space.dtype, space.low, space.high, storage)
+        return _box(space.shape, space.dtype, space.low, space.high)
     if isinstance(space, spaces.MultiDiscrete):
         schema = {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
         if np.any(space.start):
@@ -52,11 +51,11 @@ def to_schema(space: gymnasium.Space[Any], *, storage: ObsStorage = "npy") -> Sp
             "n": int(n) if isinstance(n, int | np.integer) else [int(k) for k in n],
         }
     if isinstance(space, spaces.Tuple):
-        return {"type": "Tuple", "spaces": [to_schema(part, storage="npz") for part in space.spaces]}
+        return {"type": "Tuple", "spaces": [to_schema(part) for part in space.spaces]}
     if isinstance(space, spaces.Dict):
         return {
             "type": "Dict",
-            "spaces": {key: to_schema(part, storage="npz") for key, part in space.spaces.items()},
+            "spaces": {key: to_schema(part) for key, part in space.spaces.items()},
         }
     if isinstance(space, spaces.Text):
         return {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
@@ -66,10 +65,10 @@ def to_schema(space: gymnasium.Space[Any], *, storage: ObsStorage = "npy") -> Sp
 
 
 def obs_storage(schema: SpaceSchema) -> ObsStorage:
-    """Where feedback keeps observations of this space: in the rows, or beside them when there is a picture in it."""
-    if schema["type"] == "Image":
-        return "npy"
-    return "npz" if _has_image(schema) else "inline"
+    """Where feedback keeps observations of this space: in the rows, or beside them when they are large or hold a picture."""
+    if not _has_image(schema) and _bytes(schema) <= MAX_INLINE_BYTES:
+        return "inline"
+    return "npz" if parts(schema) else "npy"
 
 
 def parts(schema: SpaceSchema) -> list[SpaceSchema]:
@@ -79,37 +78,56 @@ def parts(schema: SpaceSchema) -> list[SpaceSchema]:
 
 
 def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape."""
+    """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape.
+
+    Schemas that were stored by older versions may have `min` and `max` in place of `low` and `high`.
+    """
     shape = tuple(schema["shape"])
     if schema["type"] == "Image":
         lowest, highest = schema["value_range"]
         return np.full(shape, float(lowest)), np.full(shape, float(highest))
-    if "low" in schema:
-        return _floats(schema["low"]).reshape(shape), _floats(schema["high"]).reshape(shape)
-    return np.full(shape, float(schema["min"])), np.full(shape, float(schema["max"]))
+    low, high = (schema["low"], schema["high"]) if "low" in schema else (schema["min"], schema["max"])
+    return _floats(low, shape), _floats(high, shape)
 
 
 def _has_image(schema: SpaceSchema) -> bool:
     return schema["type"] == "Image" or any(_has_image(part) for part in parts(schema))
 
 
-def _box(
-    shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[Any], storage: ObsStorage
-) -> SpaceSchema:
+def _bytes(schema: SpaceSchema) -> int:
+    """What the arrays of one observation take, bytes."""
+    if "shape" in schema:
+        return math.prod(schema["shape"]) * np.dtype(schema["dtype"]).itemsize
+    if schema["type"] in ("MultiDiscrete", "MultiBinary"):
+        width = 8 if schema["type"] == "MultiDiscrete" else 1
+        size = np.size(schema["nvec"]) if "nvec" in schema else math.prod(np.atleast_1d(schema["n"]).tolist())
+        return int(size) * width
+    return sum(map(_bytes, parts(schema)))
+
+
+def _box(shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[Any]) -> SpaceSchema:
     name = np.dtype(dtype).name
     if name == "uint8" and len(shape) == 3 and min(shape[:2]) >= MIN_IMAGE_SIDE and shape[2] in (1, 3):
         return {
             "type": "Image",
             "shape": list(shape),
             "dtype": name,
-            "layout": "HWC",
+            "layout": "height_width_channels",
             "value_range": [0, 255],
-            "storage": storage,
+            "storage": "external",
         }
-    schema: SpaceSchema = {"type": "Box", "shape": list(shape), "dtype": name}
-    if low.size > MAX_LISTED_BOUNDS:
-        return schema | {"min": _number(low.min()), "max": _number(high.max())}
-    return schema | {"low": _numbers(low.tolist()), "high": _numbers(high.tolist())}
+    return {
+        "type": "Box",
+        "shape": list(shape),
+        "dtype": name,
+        "low": _bound(low),
+        "high": _bound(high),
+    }
+
+
+def _bound(values: NDArray[Any]) -> Any:
+    shared = values.size > MAX_LISTED_BOUNDS and bool((values == values.flat[0]).all())
+    return _number(values.flat[0]) if shared else _numbers(values.tolist())
 
 
 def _mission(space: Any) -> SpaceSchema:
@@ -130,8 +148,8 @@ def _numbers(value: Any) -> Any:
     return [_numbers(item) for item in value] if isinstance(value, list) else _number(value)
 
 
-def _floats(value: Any) -> NDArray[np.float64]:
+def _floats(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     def convert(item: Any) -> Any:
         return [convert(part) for part in item] if isinstance(item, list) else float(item)
 
-    return np.array(convert(value), dtype=np.float64)
+    return np.array(np.broadcast_to(np.array(convert(value), dtype=np.float64), shape))

@@ -36,7 +36,7 @@ class _Toy(Environment):
         render: bool,
         obs_space: SpaceSchema,
         action_space: SpaceSchema,
-        reward_components: tuple[str, ...],
+        reward_components: dict[str, str],
     ) -> None:
         self.description = EnvironmentDescription(
             env=entry.id,
@@ -44,7 +44,8 @@ class _Toy(Environment):
             obs_space=obs_space,
             action_space=action_space,
             max_episode_steps=entry.max_episode_steps,
-            reward_components=reward_components,
+            reward_components=tuple(reward_components),
+            reward_texts=reward_components,
             task_text=task_text(entry.id),
             renders=True,
         )
@@ -91,7 +92,10 @@ class Line(_Toy):
                 "high": limits,
             },
             action_space={"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]},
-            reward_components=("reward_distance", "reward_effort"),
+            reward_components={
+                "reward_distance": "cost of the distance from the target",
+                "reward_effort": "cost of pushing",
+            },
         )
 
     def reset(self, case: Case) -> Observation:
@@ -118,7 +122,7 @@ class Line(_Toy):
             distance + effort,
             False,
             self._steps >= self._limit,
-            {"reward_distance": distance, "reward_effort": effort},
+            {"reward_distance": distance, "reward_effort": effort, "steps": self._steps},
         )
 
     def _target(self) -> float:
@@ -167,7 +171,7 @@ class Maze(_Toy):
                 },
             },
             action_space={"type": "Discrete", "n": 4},
-            reward_components=(),
+            reward_components={},
         )
 
     def reset(self, case: Case) -> Observation:
@@ -195,7 +199,13 @@ class Maze(_Toy):
             self._column += right
         self._steps += 1
         found = (self._row, self._column) == self._exit
-        return Step(self._observe(), -1.0, found, self._steps >= self._limit, {"bumped": bool(bumped)})
+        return Step(
+            self._observe(),
+            -1.0,
+            found,
+            self._steps >= self._limit,
+            {"bumped": bool(bumped), "steps": self._steps},
+        )
 
     @classmethod
     def _path(cls, grid: np.ndarray[Any, Any], start: tuple[int, int], end: tuple[int, int]) -> int:

@@ -27,10 +27,7 @@ MAX_ONE_HOT = 64
 def bounds(schema: Schema) -> tuple[Vector, Vector]:
     """Lowest and highest value of every element of a Box, flat; infinite where there is none."""
     size = math.prod(schema["shape"])
-    if "low" in schema:
-        low, high = _floats(schema["low"]), _floats(schema["high"])
-    else:
-        low, high = [float(schema["min"])], [float(schema["max"])]
+    low, high = _floats(schema["low"]), _floats(schema["high"])
     return np.broadcast_to(low, size).astype(float), np.broadcast_to(high, size).astype(float)
 
 

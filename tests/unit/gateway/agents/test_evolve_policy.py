@@ -19,16 +19,16 @@ from evopolicy_gateway.agents.search import Candidate, Search
 from evopolicy_gateway.agents.staging import stage_candidates, stage_code
 
 BOX = {"type": "Box", "shape": [2], "dtype": "float32", "low": [-2.0, 0.0], "high": [2.0, "inf"]}
-WIDE = {"type": "Box", "shape": [40], "dtype": "float64", "min": "-inf", "max": "inf"}
+WIDE = {"type": "Box", "shape": [40], "dtype": "float64", "low": "-inf", "high": "inf"}
 IMAGE = {
     "type": "Image",
     "shape": [20, 24, 3],
     "dtype": "uint8",
-    "layout": "HWC",
+    "layout": "height_width_channels",
     "value_range": [0, 255],
-    "storage": "npy",
+    "storage": "external",
 }
-GRID = {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "min": 0, "max": 255}
+GRID = {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "low": 0, "high": 255}
 TEXT = {"type": "Text", "min_length": 2, "max_length": 9}
 MULTI = {"type": "MultiDiscrete", "nvec": [2, 3]}
 GOAL = {

@@ -29,7 +29,7 @@ OPEN = {
     "low": ["-inf", 0.5, "-inf", -2.0],
     "high": ["inf", "inf", -3.0, 2.0],
 }
-WIDE = {"type": "Box", "shape": [40], "dtype": "float32", "min": -2.0, "max": 2.0}
+WIDE = {"type": "Box", "shape": [40], "dtype": "float32", "low": -2.0, "high": 2.0}
 BYTES = {"type": "Box", "shape": [2], "dtype": "uint8", "low": [0, 10], "high": [255, 20]}
 LONGS = {"type": "Box", "shape": [1], "dtype": "int64", "low": [-(2**63)], "high": [2**63 - 1]}
 MULTI = {"type": "MultiDiscrete", "nvec": [2, 5], "start": [0, 1]}
@@ -181,18 +181,18 @@ def test_rounding_beyond_a_bound_is_not_marked_but_clipped() -> None:
         ([2.0, -1.0, 0.5], [1.0, 0.0, 0.5]),
         (np.array([np.inf, -np.inf, 0.0]), [1.0, 0.0, 0.0]),
         (np.array([1e300, 0.0, 0.0]), [1.0, 0.0, 0.0]),
-        ([float("nan"), 0.5, float("nan")], [-1.0, 0.5, 0.0]),
+        ([float("nan"), 0.5, float("nan")], [0.0, 0.5, 0.0]),
         (0.5, [0.5, 0.5, 0.5]),
         ([-7], [-1.0, 0.0, 0.0]),
-        ([0.1, 0.2], [-1.0, 0.0, 0.0]),
-        ([0.1, 0.2, 0.3, 0.4], [-1.0, 0.0, 0.0]),
-        ([10**400, 0, 0], [-1.0, 0.0, 0.0]),
-        ([[0.1, 0.2], [0.3]], [-1.0, 0.0, 0.0]),
-        (["0.1", "0.2", "0.3"], [-1.0, 0.0, 0.0]),
-        ([None, 0.0, 0.0], [-1.0, 0.0, 0.0]),
-        (np.array([1j, 0, 0]), [-1.0, 0.0, 0.0]),
-        ("abc", [-1.0, 0.0, 0.0]),
-        ({}, [-1.0, 0.0, 0.0]),
+        ([0.1, 0.2], [0.0, 0.0, 0.0]),
+        ([0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 0.0]),
+        ([10**400, 0, 0], [0.0, 0.0, 0.0]),
+        ([[0.1, 0.2], [0.3]], [0.0, 0.0, 0.0]),
+        (["0.1", "0.2", "0.3"], [0.0, 0.0, 0.0]),
+        ([None, 0.0, 0.0], [0.0, 0.0, 0.0]),
+        (np.array([1j, 0, 0]), [0.0, 0.0, 0.0]),
+        ("abc", [0.0, 0.0, 0.0]),
+        ({}, [0.0, 0.0, 0.0]),
     ],
     ids=repr,
 )
@@ -209,12 +209,12 @@ def test_a_row_is_broadcast_to_a_matrix_and_marked() -> None:
     assert action.tolist() == [[0.1, 0.2, 0.3]] * 2
     action, invalid = compile_actions(MATRIX).repair([[0.1] * 2] * 3)  # transposed: not what was meant
     assert invalid
-    assert action.tolist() == [[-1.0] * 3] * 2
+    assert action.tolist() == [[0.0] * 3] * 2
 
 
 def test_elements_without_bounds_stay_finite() -> None:
     codec = compile_actions(OPEN)
-    assert codec.repair(None)[0].tolist() == [0.0, 0.5, -3.0, -2.0]
+    assert codec.repair(None)[0].tolist() == [0.0, 0.5, -3.0, 0.0]
     action, invalid = codec.repair([np.inf, np.inf, -np.inf, 0.0])
     assert invalid
     assert bool(np.isfinite(action).all())

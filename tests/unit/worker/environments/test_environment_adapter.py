@@ -102,7 +102,7 @@ def test_step_values_are_plain_and_observations_are_copies() -> None:
     environment.step(0)
     assert (first.tolist(), step.obs.tolist()) == ([0.0], [1.0])
     assert [type(value) for value in step[1:4]] == [float, bool, bool]
-    assert step.info == {"count": 1}
+    assert step.info == {"count": 1, "steps": 1}
 
 
 def test_an_environment_is_kept_between_episodes() -> None:

@@ -42,18 +42,18 @@ def test_bounds_are_nested_lists_by_shape_with_infinities_spelled() -> None:
     assert "-0.0" not in json.dumps(to_schema(box))
 
 
-def test_bounds_of_more_than_32_values_are_summed_up() -> None:
-    assert "low" in to_schema(spaces.Box(-1, 1, (32,)))
+def test_bound_that_more_than_32_values_share_is_one_number() -> None:
+    assert to_schema(spaces.Box(-1, 1, (32,)))["low"] == [-1.0] * 32
     assert to_schema(spaces.Box(-np.inf, 1, (33,))) == {
         "type": "Box",
         "shape": [33],
         "dtype": "float32",
-        "min": "-inf",
-        "max": 1.0,
+        "low": "-inf",
+        "high": 1.0,
     }
     symbolic = to_schema(spaces.Box(0, 255, (7, 7, 3), np.uint8))
-    assert symbolic == {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "min": 0, "max": 255}
-    assert type(symbolic["max"]) is int
+    assert symbolic == {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "low": 0, "high": 255}
+    assert type(symbolic["high"]) is int
 
 
 @pytest.mark.parametrize("shape", [(96, 96, 3), (16, 16, 1), (210, 160, 3)])
@@ -63,27 +63,57 @@ def test_a_picture_is_an_image_stored_beside_the_rows(shape: tuple[int, ...]) ->
         "type": "Image",
         "shape": list(shape),
         "dtype": "uint8",
-        "layout": "HWC",
+        "layout": "height_width_channels",
         "value_range": [0, 255],
-        "storage": "npy",
+        "storage": "external",
     }
     assert obs_storage(schema) == "npy"
     low, high = bounds(schema)
     assert (low.min(), high.max(), low.shape) == (0.0, 255.0, shape)
 
 
-@pytest.mark.parametrize("shape", [(7, 7, 3), (15, 96, 3), (96, 96), (96, 96, 4), (3, 96, 96)])
-def test_other_bytes_are_a_box_kept_in_the_rows(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("shape", "storage"),
+    [
+        ((7, 7, 3), "inline"),
+        ((64, 64), "inline"),
+        ((15, 96, 3), "npy"),
+        ((65, 64), "npy"),
+        ((3, 96, 96), "npy"),
+    ],
+)
+def test_other_bytes_are_a_box_kept_in_the_rows_unless_they_are_many(
+    shape: tuple[int, ...], storage: str
+) -> None:
     schema = to_schema(spaces.Box(0, 255, shape, np.uint8))
     assert schema["type"] == "Box"
-    assert obs_storage(schema) == "inline"
+    assert obs_storage(schema) == storage
+
+
+def test_large_observations_of_several_parts_are_stored_in_an_archive() -> None:
+    half = spaces.Box(-1, 1, (300,), np.float64)
+    assert obs_storage(to_schema(spaces.Dict({"a": half}))) == "inline"
+    assert obs_storage(to_schema(spaces.Tuple([half, half]))) == "npz"
+    assert obs_storage(to_schema(spaces.MultiDiscrete([2] * 513))) == "npy"
+    assert obs_storage(to_schema(spaces.MultiBinary(4096))) == "inline"
+
+
+def test_bounds_of_a_schema_of_an_older_version_are_read() -> None:
+    low, high = bounds({"type": "Box", "shape": [40], "dtype": "float64", "min": "-inf", "max": 1.0})
+    assert (low.shape, low.max(), high.min()) == ((40,), -np.inf, 1.0)
+
+
+def test_large_box_with_different_bounds_lists_them_all() -> None:
+    schema = to_schema(spaces.Box(np.arange(40.0) - 50, np.full(40, np.inf), dtype=np.float64))
+    assert schema["low"] == [float(k) - 50 for k in range(40)]
+    assert schema["high"] == "inf"
 
 
 def test_a_picture_inside_a_dict_is_stored_in_an_archive() -> None:
     schema = to_schema(
         spaces.Dict({"eye": spaces.Box(0, 255, (64, 64, 3), np.uint8), "dir": spaces.Discrete(4)})
     )
-    assert schema["spaces"]["eye"]["storage"] == "npz"
+    assert schema["spaces"]["eye"]["storage"] == "external"
     assert obs_storage(schema) == "npz"
     assert [part["type"] for part in parts(schema)] == ["Discrete", "Image"]
 

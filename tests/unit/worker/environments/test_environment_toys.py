@@ -88,5 +88,5 @@ def test_the_walls_of_the_maze_stop_a_step() -> None:
         before = obs["position"].tolist()
         action = seed % 4
         step = environment.step(action)
-        assert step.info == {"bumped": bool(obs["blocked"][action])}
+        assert step.info["bumped"] == bool(obs["blocked"][action])
         assert (step.obs["position"].tolist() == before) == step.info["bumped"]
