@@ -113,6 +113,7 @@ def test_the_policy_is_given_spaces_and_env_meta_and_nothing_of_the_case(slots: 
         "obs_space": description.obs_space,
         "action_space": description.action_space,
         "obs_storage": "inline",
+        "reward_components": description.reward_texts,
     }
     assert reset[0] == 1
     assert reset[1] == reset[2] == "/home/policy/system"
@@ -196,7 +197,7 @@ def test_without_a_policy_the_actions_are_keyed_and_uniform(slots: Slots) -> Non
     rng = random_actions(b"k" * 16)
     for row in rows(outcome):
         assert row.action.tobytes() == line.action_codec.sample(rng).tobytes()
-        assert row.info.keys() == {"reward_distance", "reward_effort"}
+        assert row.info.keys() == {"reward_distance", "reward_effort", "steps"}
     assert (outcome.failure, outcome.stdout, outcome.policy_cpu_s) == (None, b"", 0.0)
 
 
