@@ -13,13 +13,13 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import msgspec
 import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_difference import differences, left_out
+from evopolicy_common.terminal import say_json, say_lines, terminal
 from evopolicy_gateway import door, options, processes, trials
 from evopolicy_gateway.door import Door
 from evopolicy_gateway.gateway import folder_of
@@ -162,7 +162,7 @@ def play_random(
 
 def _tell_left_out(wanted: bool) -> None:
     if wanted:
-        typer.echo("\n".join(left_out()))
+        say_lines(left_out())
         raise typer.Exit
 
 
@@ -184,9 +184,9 @@ def diff_runs(
     """
     found = differences(left, right)
     if as_json:
-        typer.echo(msgspec.json.encode(found).decode())
+        say_json(found, indent=False)
     else:
-        typer.echo("\n".join(found) if found else "no difference (times and logs aside)")
+        say_lines(found or ["no difference (times and logs aside)"])
     raise typer.Exit(1 if found else 0)
 
 
@@ -232,10 +232,10 @@ def _plans(
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
-    console = options.console(stderr=as_json)
+    console = terminal(stderr=as_json)
     results = _run(play_all(plans, where, parallel, console))
     if as_json:
-        print(msgspec.json.format(msgspec.json.encode(results)).decode())
+        say_json(results)
     else:
         report_runs(results, console)
     _exit(exit_code((result.status, result.closed_reason) for result in results))

@@ -9,7 +9,6 @@ from typing import Annotated, get_args
 
 import msgspec
 import typer
-from rich.console import Console
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
@@ -43,12 +42,6 @@ Audit = Annotated[
         help="Share of the episodes that a second local worker plays again from their actions, compared bit for bit.",
     ),
 ]
-
-
-def console(*, stderr: bool) -> Console:
-    """For people: as wide as their terminal, and wide enough for a table where there is none."""
-    found = Console(stderr=stderr)
-    return found if found.is_terminal else Console(stderr=stderr, width=160)
 
 
 def tier_of(text: str) -> Tier:

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
 from rich.table import Table
 
 from evopolicy_common import transport
@@ -17,6 +16,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.local_cluster import local_cluster, unless_failed
 from evopolicy_common.run_record import RunRecord
+from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.operations import Operations, find_credentials
 from evopolicy_gateway.play import Plan, RunPlay
 from evopolicy_gateway.watch import Watch, watching
@@ -81,7 +81,9 @@ async def connected(
         yield Operations(link), gateway, failed
 
 
-async def play_all(plans: Sequence[Plan], where: Cluster, parallel: int, console: Console) -> list[RunResult]:
+async def play_all(
+    plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal
+) -> list[RunResult]:
     """Plays all plans, so many at once; one that fails does not stop the others."""
     results: dict[int, RunResult] = {}
     with watching(console) as watch:
@@ -115,7 +117,7 @@ def _end(status: str, closed_reason: str) -> str:
     return status if status in EXIT_CODES or status == "completed" else "error"
 
 
-def report(results: Sequence[RunResult], console: Console) -> None:
+def report(results: Sequence[RunResult], console: Terminal) -> None:
     """A table of what the runs came to, and where each of them is."""
     table = Table(box=None, pad_edge=False)
     for title in ("environment", "score", "random", "best submit", "budget used", "ended"):
@@ -134,11 +136,11 @@ def report(results: Sequence[RunResult], console: Console) -> None:
     console.print(table)
     for result in results:
         if result.error:
-            console.print(f"{result.env}: {result.error}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"{result.env}: {result.error}", soft_wrap=True)
         if result.in_question:
             text = f"{result.env}: audits put these results in question; see `audit` in run.json"
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
-        console.print(f"run directory: {result.run_directory}", markup=False, highlight=False, soft_wrap=True)
+            console.print(text, soft_wrap=True)
+        console.print(f"run directory: {result.run_directory}", soft_wrap=True)
 
 
 async def _play(plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> RunResult:

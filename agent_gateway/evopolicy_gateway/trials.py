@@ -7,9 +7,9 @@ import math
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import pstdev
 
 import msgspec
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
@@ -19,7 +19,7 @@ from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
-from evopolicy_gateway import options
+from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
 from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_gateway.formatting import cut_text
 from evopolicy_gateway.operations import Operations
@@ -42,28 +42,45 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
     """One episode of a trial."""
 
     case: int
-    episode_return: float
+    episode_return: float | None
+    """None where nothing was played, because the first case showed that there is no Policy to play."""
     length: int
     failure: str | None = None
-    """Category, step and message, when the policy failed."""
+    """Category, step and message, when the policy failed. Uniform random actions played from that step on."""
+    failed_at: int | None = None
+    """The step at which it failed; None where it did not, or failed before its first."""
     folder: str | None = None
+
+    @property
+    def played_by(self) -> str:
+        """Whose actions the return is of."""
+        if self.episode_return is None:
+            return "not played"
+        if self.failure is None:
+            return "policy"
+        return f"policy to step {self.failed_at}, then random" if self.failed_at else "random"
 
 
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     """What a trial came to."""
 
     env: str
-    mean_return: float
-    std_return: float
-    """Population standard deviation."""
+    mean_return: float | None
+    """Over the cases in which the policy did not fail; None where there is none."""
+    std_return: float | None
+    """Population standard deviation over the same cases."""
+    n_failed: int
+    """Cases in which the policy failed; their returns, mostly of random actions, are in no mean."""
     episodes: tuple[TriedEpisode, ...]
     folder: str | None = None
+    other_cases_next_time: bool = False
+    """The cases came from the secret of a cluster that is gone now: another call has others under the same ids."""
 
 
 async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
     bundle = _bundle(trial.policy)
-    console = options.console(stderr=as_json)
+    console = terminal(stderr=as_json)
     results: list[TrialResult] = []
 
     async def work(operations: Operations) -> None:
@@ -84,7 +101,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
             await _tried(outcome, case, folder, operations)
             for outcome, case in zip(outcomes, trial.cases, strict=True)
         ]
-        results.append(_result(trial.env, episodes, folder))
+        results.append(_result(trial.env, episodes, where, folder))
 
     async with connected(where, [trial.env]) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
@@ -101,7 +118,7 @@ async def play_random(
     as_json: bool,
 ) -> int:
     """Plays uniform random actions and prints the returns."""
-    console = options.console(stderr=as_json)
+    console = terminal(stderr=as_json)
     results: list[TrialResult] = []
 
     async def work(operations: Operations) -> None:
@@ -121,7 +138,7 @@ async def play_random(
                 TriedEpisode(case=case, episode_return=outcome.episode_return, length=outcome.length)
                 for outcome, case in zip(outcomes, ids, strict=True)
             ]
-            results.append(_result(env_id, episodes, None))
+            results.append(_result(env_id, episodes, where))
 
     async with connected(where, env_ids) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
@@ -132,7 +149,7 @@ async def play_random(
     return 0
 
 
-async def _outcomes(operations: Operations, message: Evaluate, console: Console) -> list[EpisodeOutcome]:
+async def _outcomes(operations: Operations, message: Evaluate, console: Terminal) -> list[EpisodeOutcome]:
     """All outcomes in the order asked for."""
     outcomes: list[EpisodeOutcome] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -147,15 +164,17 @@ async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: O
     target = folder / f"ep_{outcome.index:03d}"
     packed = None if outcome.trajectory is None else await operations.fetch(outcome.trajectory)
     await asyncio.to_thread(_write, target, packed, outcome)
-    failure = None
-    if outcome.failure is not None:
-        at = "" if outcome.failure.step_index is None else f" at step {outcome.failure.step_index}"
-        failure = f"{outcome.failure.category}{at}: {outcome.failure.message}"
+    failed, failure, failed_at = outcome.failure, None, None
+    if failed is not None:
+        failed_at = failed.step_index
+        at = "" if failed_at is None else f" at step {failed_at}"
+        failure = f"{failed.category}{at}: {failed.message}"
     return TriedEpisode(
         case=case,
-        episode_return=outcome.episode_return,
+        episode_return=outcome.episode_return if outcome.length else None,
         length=outcome.length,
         failure=failure,
+        failed_at=failed_at,
         folder=str(target),
     )
 
@@ -194,45 +213,74 @@ def _new_folder(out: Path, env: str) -> Path:
             number += 1
 
 
-def _result(env: str, episodes: Sequence[TriedEpisode], folder: Path | None) -> TrialResult:
-    returns = [episode.episode_return for episode in episodes]
-    mean = math.fsum(returns) / len(returns)
-    std = math.sqrt(math.fsum((value - mean) * (value - mean) for value in returns) / len(returns))
+def _result(
+    env: str, episodes: Sequence[TriedEpisode], where: Cluster, folder: Path | None = None
+) -> TrialResult:
+    returns = [
+        one.episode_return for one in episodes if one.failure is None and one.episode_return is not None
+    ]
+    mean = math.fsum(returns) / len(returns) if returns else None
     return TrialResult(
         env=env,
         mean_return=mean,
-        std_return=std,
+        std_return=None if mean is None else pstdev(returns, mean),
+        n_failed=sum(one.failure is not None for one in episodes),
         episodes=tuple(episodes),
         folder=None if folder is None else str(folder),
+        other_cases_next_time=where.local_slots is not None and where.state is None and where.data is None,
     )
 
 
-def _print(results: Sequence[TrialResult], as_json: bool, console: Console) -> None:
+def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> None:
     if as_json:
-        print(msgspec.json.format(msgspec.json.encode(results)).decode())
+        say_json(results)
         return
     for result in results:
         table = Table(box=None, pad_edge=False)
-        for title in ("case", "return", "steps", "failure"):
-            table.add_column(title, justify="left" if title == "failure" else "right")
-        for episode in result.episodes:
-            table.add_row(
-                str(episode.case), f"{episode.episode_return:.4g}", str(episode.length), episode.failure or ""
-            )
+        for title in ("case", "return", "steps", "played by", "failure"):
+            table.add_column(title, justify="right" if title in ("case", "return", "steps") else "left")
+        for one in result.episodes:
+            shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
+            table.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
         console.print(table)
-        console.print(
-            f"{result.env}: mean return {result.mean_return:.4g} ± {result.std_return:.4g}", highlight=False
-        )
+        console.print(_summary(result), soft_wrap=True)
         if result.folder is not None:
-            console.print(f"trajectories: {result.folder}", highlight=False, soft_wrap=True)
+            console.print(f"trajectories: {result.folder}", soft_wrap=True)
+    _tell_of_cases(results, console)
 
 
-def _print_means(results: Sequence[TrialResult], console: Console) -> None:
+def _summary(result: TrialResult) -> str:
+    n, failed = len(result.episodes), result.n_failed
+    if result.mean_return is None:
+        return f"{result.env}: no mean return, the policy failed in {'all ' * (n > 1)}{_cases(n)}"
+    over = f"{n - failed} of {_cases(n)}" if failed else _cases(n)
+    left_out = f"; {_cases(failed)} left out, in which the policy failed" if failed else ""
+    return (
+        f"{result.env}: mean return {result.mean_return:.4g}, population standard deviation {result.std_return:.4g},"
+        f" over {over}{left_out}"
+    )
+
+
+def _cases(n: int) -> str:
+    return f"{n} case{'s' * (n != 1)}"
+
+
+def _tell_of_cases(results: Sequence[TrialResult], console: Terminal) -> None:
+    if any(result.other_cases_next_time for result in results):
+        console.print(
+            "note: this cluster's cases end with it, the next call has others under the same ids;"
+            " --state DIR, --data DIR or --connect keeps them the same",
+            soft_wrap=True,
+        )
+
+
+def _print_means(results: Sequence[TrialResult], console: Terminal) -> None:
     table = Table(box=None, pad_edge=False)
-    for title in ("environment", "episodes", "mean return", "std"):
+    for title in ("environment", "episodes", "mean return", "population std"):
         table.add_column(title, justify="left" if title == "environment" else "right")
     for result in results:
         table.add_row(
             result.env, str(len(result.episodes)), f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
         )
     console.print(table)
+    _tell_of_cases(results, console)

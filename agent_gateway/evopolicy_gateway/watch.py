@@ -6,12 +6,12 @@ import contextlib
 from collections.abc import Iterator
 from typing import Protocol
 
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.terminal import Terminal, harmless
 from evopolicy_gateway.control import AgentDoing, Progress
 
 PHASES = {
@@ -45,12 +45,12 @@ class Watch(Protocol):
 class Lines:
     """A line for each submit and phase: for logs and pipes."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Terminal) -> None:
         self._console = console
         self._seen: dict[str, tuple[object, ...]] = {}
 
     def note(self, run: str, text: str) -> None:
-        self._console.print(harmless(f"{run}: {text}"), markup=False, highlight=False, soft_wrap=True)
+        self._console.print(f"{run}: {text}", soft_wrap=True)
 
     def progress(self, run: str, progress: Progress) -> None:
         if progress.last_submit_id is not None and self._changed(f"{run} submit", progress.last_submit_id):
@@ -90,7 +90,7 @@ class Lines:
 class LiveTable:
     """A table with a row a run, drawn anew as things happen; notes scroll by above it."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Terminal) -> None:
         self._console = console
         self._rows: dict[str, _Row] = {}
         self._live = Live(console=console, get_renderable=self._table, refresh_per_second=4, transient=True)
@@ -102,7 +102,7 @@ class LiveTable:
 
     def note(self, run: str, text: str) -> None:
         self._row(run)
-        self._console.print(harmless(f"{run}: {text}"), markup=False, highlight=False)
+        self._console.print(f"{run}: {text}")
 
     def progress(self, run: str, progress: Progress) -> None:
         row = self._row(run)
@@ -173,7 +173,7 @@ class _Row:
 
 
 @contextlib.contextmanager
-def watching(console: Console) -> Iterator[Watch]:
+def watching(console: Terminal) -> Iterator[Watch]:
     """A live table on a terminal, lines elsewhere."""
     if console.is_terminal:
         with LiveTable(console).shown() as table:
@@ -190,10 +190,3 @@ def _bar(part: int, whole: int, width: int = 12) -> str:
 def first_line(text: str) -> str:
     """The start of a text's first line, harmless."""
     return harmless((text.strip().splitlines() or [""])[0][:120])
-
-
-def harmless(text: str) -> str:
-    """Without what steers a terminal: an agent's words must not clear the operator's screen, nor write over what it says."""
-    return "".join(
-        letter if letter.isprintable() or letter == "\n" else "\N{REPLACEMENT CHARACTER}" for letter in text
-    )

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TextIO, cast
 
@@ -15,6 +15,7 @@ import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.terminal import harmless, say
 
 Connect = Annotated[
     list[str] | None,
@@ -60,6 +61,14 @@ def bytes_text(n: float) -> str:
     return f"{n:.1f} TiB"
 
 
+def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """What a policy or an agent said may stand in any of them; JSON lines escape it by themselves."""
+    for name, value in event.items():
+        if isinstance(value, str):
+            event[name] = harmless(value)
+    return event
+
+
 def setup_logging(level: str = "info") -> None:
     """Structured logs on stderr: for people on a terminal, JSON lines otherwise."""
     terminal = sys.stderr.isatty()
@@ -69,6 +78,7 @@ def setup_logging(level: str = "info") -> None:
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso" if not terminal else "%H:%M:%S", utc=not terminal),
             structlog.processors.format_exc_info,
+            *((_harmless_values,) if terminal else ()),
             structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
@@ -79,7 +89,7 @@ def setup_logging(level: str = "info") -> None:
 
 def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
     """Ends the command with one line on stderr."""
-    print(f"error: {message}", file=sys.stderr)
+    say(f"error: {message}", err=True)
     raise SystemExit(code)
 
 

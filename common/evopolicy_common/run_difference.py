@@ -86,14 +86,18 @@ def _file_differences(name: str, left: Path, right: Path) -> list[str]:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
     try:
         ours, theirs = (_parse(name, path.read_bytes()) for path in (left, right))
+        return [
+            f"{name}: {path or 'content'}: {_short(a)} and {_short(b)}"
+            for path, a, b in _value_differences("", ours, theirs)
+            if not any(path == each or path.startswith(f"{each}.") for each in excluded)
+            and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
+        ]
     except ValueError as error:
         return [f"{name}: cannot be read: {error}"]
-    return [
-        f"{name}: {path or 'content'}: {_short(a)} and {_short(b)}"
-        for path, a, b in _value_differences("", ours, theirs)
-        if not any(path == each or path.startswith(f"{each}.") for each in excluded)
-        and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
-    ]
+    except RecursionError:
+        return [
+            f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same, nested too deeply to be read"
+        ]
 
 
 def _parse(name: str, data: bytes) -> Any:

@@ -10,12 +10,12 @@ from typing import Annotated, get_args
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.credentials import MachineRole, default_state_dir
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_coordinator import certs, machines
 from evopolicy_coordinator.machines import Machine, Machines
 from evopolicy_coordinator.state import cluster_of
@@ -75,10 +75,10 @@ def init(
         machines.init(root, name, _with_loopback(hosts), _now(), days, anew=force)
         made = machines.coordinators_certificate(root)
         assert made is not None
-        print(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
-        print(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
-        print(f"next: evopolicy-coordinator --listen tls/0.0.0.0:{PORT}{_state_option(state)}")
-        print(f"and for each machine: evopolicy-coordinator certs issue worker NAME{_state_option(state)}")
+        say(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
+        say(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
+        say(f"next: evopolicy-coordinator --listen tls/0.0.0.0:{PORT}{_state_option(state)}")
+        say(f"and for each machine: evopolicy-coordinator certs issue worker NAME{_state_option(state)}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs issue worker gpu-7 --out ./gpu-7")
@@ -125,13 +125,13 @@ def issue(
             again=renew,
         )
         if as_json:
-            print(
+            say(
                 msgspec.json.encode(
                     {"folder": str(folder), "machines": [_told(one) for one in made]}
                 ).decode()
             )
             return
-        print(
+        say(
             f"{folder}: {' and '.join(one.identity for one in made)}, until {made[0].expires:%Y-%m-%d}"
             f" (a secret: scp -rp {folder} MACHINE:)"
         )
@@ -141,9 +141,9 @@ def issue(
             "operator": "evopolicy run --env gym/acrobot --agent evolve",
         }.get(role)
         if start is not None and kind != "gateway":
-            print(f"there: {start} --credentials {folder.name}")
+            say(f"there: {start} --credentials {folder.name}")
         if kind == "router":
-            print(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
+            say(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs revoke gpu-7")
@@ -159,9 +159,9 @@ def revoke(
     with fail_on_our_errors():
         gone = machines.revoke(state or default_state_dir(), name, _now())
         if as_json:
-            print(msgspec.json.encode([_told(one) for one in gone]).decode())
+            say_json([_told(one) for one in gone], indent=False)
         else:
-            print(f"revoked: {', '.join(one.identity for one in gone)}")
+            say(f"revoked: {', '.join(one.identity for one in gone)}")
 
 
 @app.command("list", epilog="Example: evopolicy-coordinator certs list --json")
@@ -176,7 +176,7 @@ def list_(state: State = None, as_json: Json = False) -> None:
         rows = [_told(machine) for machine in Machines(root).all()]
         if as_json:
             told = {"hosts": own.hosts, "expires": own.expires}
-            print(msgspec.json.format(msgspec.json.encode({"coordinator": told, "machines": rows})).decode())
+            say_json({"coordinator": told, "machines": rows})
             return
         table = Table(box=None, pad_edge=False)
         for heading in ("name", "role", "expires", "state"):
@@ -184,7 +184,7 @@ def list_(state: State = None, as_json: Json = False) -> None:
         table.add_row(", ".join(own.hosts), "coordinator", *_validity(own.expires, None, now))
         for machine in Machines(root).all():
             table.add_row(machine.name, machine.role, *_validity(machine.expires, machine.revoked, now))
-        Console().print(table)
+        terminal().print(table)
 
 
 def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetime) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.credentials import default_state_dir
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.ready import Ready
+from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import certs_cli, process, router_config
 from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.core.settings import CoreSettings
@@ -126,9 +127,9 @@ def backup(
     with fail_on_our_errors():
         copied = back_up(state or default_state_dir(), target)
     if as_json:
-        print(msgspec.json.encode(copied).decode())
+        say_json(copied, indent=False)
     else:
-        print(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
+        say(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
 
 
 async def _run(options: Options, ready_file: Path | None) -> None:
@@ -138,7 +139,7 @@ async def _run(options: Options, ready_file: Path | None) -> None:
         loop.add_signal_handler(number, stop.set)
 
     def on_ready(ready: Ready) -> None:
-        print(_ready_line(ready), flush=True)
+        say(_ready_line(ready))
         if ready_file is not None:
             write_atomically(ready_file, msgspec.json.format(msgspec.json.encode(ready)) + b"\n", mode=0o600)
 

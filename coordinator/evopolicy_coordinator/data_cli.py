@@ -6,7 +6,6 @@ reachable from an agent's host. Exit codes: 0 all well, 1 findings, 2 wrong usag
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 from pathlib import Path
@@ -15,12 +14,12 @@ from typing import Annotated, Any, NoReturn
 import msgspec
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_coordinator import splits
 
 app = typer.Typer(
@@ -63,12 +62,10 @@ def make(
     except OSError as error:
         _usage(f"cannot write {error.filename}: {error.strerror}")
     if as_json:
-        typer.echo(json.dumps({"root": str(root), "written": [str(path) for path in written]}))
+        say_json({"root": str(root), "written": [str(path) for path in written]}, indent=False)
         return
     kept = len(planned) - len(written)
-    typer.echo(
-        f"{len(written)} files written under {root}" + (f", {kept} were the same already" if kept else "")
-    )
+    say(f"{len(written)} files written under {root}" + (f", {kept} were the same already" if kept else ""))
 
 
 def _plan(
@@ -131,7 +128,7 @@ def check(
         _usage(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
     if as_json:
-        typer.echo(json.dumps({"ok": not any(r["findings"] for r in reports), "environments": reports}))
+        say_json({"ok": not any(r["findings"] for r in reports), "environments": reports}, indent=False)
     else:
         _print(reports)
     if any(report["findings"] for report in reports):
@@ -171,14 +168,14 @@ def _print(reports: list[dict[str, Any]]) -> None:
         counts = [str(report["cases"][split]) for split in splits.SPLITS]
         hashes = " ".join(report["sha256"][split][:8] for split in splits.SPLITS)
         table.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
-    console = Console()
+    console = terminal()
     # A row broken over several lines is worse than one that the terminal wraps.
     console.print(table, width=max(console.width, 130))
     for report in reports:
         for finding in report["findings"]:
-            console.print(finding, style="red", markup=False, highlight=False, soft_wrap=True)
+            console.print(finding, style="red", soft_wrap=True)
 
 
 def _usage(message: str) -> NoReturn:
-    typer.echo(f"error: {message}", err=True)
+    say(f"error: {message}", err=True)
     raise typer.Exit(2)

@@ -6,7 +6,6 @@ written, 1 no complete run among what was given, 2 wrong usage, 3 the runs are n
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import say, say_json, say_lines, terminal
 from evopolicy_coordinator.analysis.comparability import UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reader import load_runs
 from evopolicy_coordinator.analysis.scores import ScoreTable, read_score_csv
@@ -98,7 +97,7 @@ def report(
     except ConfigError as error:
         _fail(str(error), USAGE)
     if unknown := sum(run.record.hidden_isolation == "unknown" for run in study.runs):
-        typer.echo(
+        say(
             f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
             " they are from before it was recorded",
             err=True,
@@ -110,12 +109,11 @@ def report(
             "runs": len(study.runs),
             "left_out": left_out,
         }
-        typer.echo(json.dumps(found))
+        say_json(found, indent=False)
     else:
-        for item in study.left_out:
-            typer.echo(f"left out: {item.path}: {item.reason}", err=True)
+        say_lines((f"left out: {item.path}: {item.reason}" for item in study.left_out), err=True)
         if index is not None:
-            typer.echo(
+            say(
                 f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
             )
     if index is None:
@@ -151,7 +149,7 @@ def _read_table(path: Path) -> ScoreTable:
 @contextmanager
 def _progress() -> Iterator[Tell]:
     """A bar for each stage on standard error, when that is a terminal."""
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         tasks = {}
@@ -165,5 +163,5 @@ def _progress() -> Iterator[Tell]:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"evopolicy report: {message}", err=True)
+    say(f"evopolicy report: {message}", err=True)
     raise typer.Exit(code)

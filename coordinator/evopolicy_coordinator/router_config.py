@@ -24,6 +24,7 @@ from evopolicy_common.blobs import write_atomically
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.credentials import TlsFiles, default_state_dir
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import say
 from evopolicy_coordinator import certs
 from evopolicy_coordinator.certs_cli import PORT, first_endpoint
 from evopolicy_coordinator.machines import Machine, Machines
@@ -153,7 +154,5 @@ def router_config(
             installed_at=installed_at,
         )
         there = (installed_at or folder).absolute()
-        print(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
-        print(
-            f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none"
-        )
+        say(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
+        say(f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none")

@@ -11,10 +11,9 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-import msgspec
 import typer
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -30,6 +29,7 @@ from evopolicy_common.messages.operator import (
     StatusRequest,
 )
 from evopolicy_common.requests import operator_requests
+from evopolicy_common.terminal import say, say_json, terminal
 
 T = TypeVar("T")
 
@@ -110,13 +110,13 @@ def status(
         return
     reply = _asking(connect, file, Operator.status)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(reply)).decode())
+        say_json(reply)
     else:
-        _console().print(render(reply))
+        terminal().print(render(reply))
 
 
 async def _watch(operator: Operator) -> None:
-    with Live(console=_console(), auto_refresh=False) as live:
+    with Live(console=terminal(), auto_refresh=False) as live:
         while True:
             started = time.monotonic()
             live.update(render(await operator.status()), refresh=True)
@@ -125,7 +125,7 @@ async def _watch(operator: Operator) -> None:
 
 async def _watch_lines(operator: Operator) -> None:
     while True:
-        print(msgspec.json.encode(await operator.status()).decode(), flush=True)
+        say_json(await operator.status(), indent=False)
         await asyncio.sleep(1.0)
 
 
@@ -137,7 +137,7 @@ def drain(
 ) -> None:
     """Give a worker no more work: it finishes what runs, then ends."""
     _asking(connect, file, lambda operator: operator.set_worker(worker, "draining"))
-    typer.echo(f"{worker} is draining")
+    say(f"{worker} is draining")
 
 
 @workers_app.command(epilog="Example: evopolicy workers pause lab-3f2a")
@@ -148,7 +148,7 @@ def pause(
 ) -> None:
     """Give a worker no more work until it is resumed: it finishes what it holds, and stays."""
     _asking(connect, file, lambda operator: operator.set_worker(worker, "paused"))
-    typer.echo(f"{worker} is paused")
+    say(f"{worker} is paused")
 
 
 @workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
@@ -159,7 +159,7 @@ def resume(
 ) -> None:
     """Take a worker back that was paused or drained, or quarantined by an audit."""
     _asking(connect, file, lambda operator: operator.set_worker(worker, "active"))
-    typer.echo(f"{worker} is active")
+    say(f"{worker} is active")
 
 
 @runs_app.callback()
@@ -175,7 +175,7 @@ def cancel(
 ) -> None:
     """End a run without a score; what of it is played stops."""
     _asking(connect, file, lambda operator: operator.cancel_run(run))
-    typer.echo(f"{run} is cancelled")
+    say(f"{run} is cancelled")
 
 
 @runs_app.command(
@@ -192,7 +192,7 @@ def repin(
 ) -> None:
     """Let a run go on with workers of other library versions, when those it began with are gone."""
     _asking(connect, file, lambda operator: operator.repin_run(run, fingerprint_class, reason))
-    typer.echo(f"{run} goes on with workers of class {fingerprint_class}")
+    say(f"{run} goes on with workers of class {fingerprint_class}")
 
 
 def render(reply: StatusReply) -> RenderableType:
@@ -279,12 +279,6 @@ def _table(*headings: str) -> Table:
     for heading in headings:
         table.add_column(heading, no_wrap=True)
     return table
-
-
-def _console() -> Console:
-    console = Console()
-    # Where nobody looks at it live, a cut-off table is worse than a long line.
-    return console if console.is_terminal else Console(width=200)
 
 
 def _age(seconds: float) -> str:

@@ -8,12 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import bytes_text, fail_on_our_errors
 from evopolicy_common.credentials import default_state_dir
+from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import upkeep
 
 gc_app = typer.Typer(
@@ -50,17 +50,15 @@ def collect(
     with fail_on_our_errors():
         done = upkeep.collect(state or default_state_dir(), older_than * DAY_S, dry_run=dry_run)
     if as_json:
-        typer.echo(msgspec.json.encode(done))
+        say_json(done, indent=False)
         return
     verb = "would remove" if dry_run else "removed"
-    typer.echo(
+    say(
         f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,} blobs:"
         f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
-        typer.echo(
-            "a coordinator is running: the database keeps its size, and what comes next uses the space"
-        )
+        say("a coordinator is running: the database keeps its size, and what comes next uses the space")
 
 
 @disk_app.command(epilog="Example: evopolicy disk --env core16 --budget 128 --runs 5")
@@ -86,20 +84,18 @@ def disk(
         needed = upkeep.estimate(root, planned) if planned else None
         directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
     if as_json:
-        typer.echo(
-            msgspec.json.encode({"environments": used, "planned": needed, "run_directories": directories})
-        )
+        say_json({"environments": used, "planned": needed, "run_directories": directories}, indent=False)
     else:
         for each in used:
-            typer.echo(
+            say(
                 f"{each.env:<32}{each.runs:>5} runs{each.train_episodes:>9,} episodes{bytes_text(each.bytes):>12}"
                 f"{bytes_text(each.bytes_per_episode):>12} an episode"
             )
         if needed is not None:
             guessed = f"; guessed for want of runs: {', '.join(needed.guessed)}" if needed.guessed else ""
-            typer.echo(
+            say(
                 f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{guessed}"
             )
-            typer.echo(f"their run directories, wherever they are: at most {bytes_text(directories)}")
+            say(f"their run directories, wherever they are: at most {bytes_text(directories)}")
     if needed is not None and not needed.fits:
         raise typer.Exit(1)

@@ -15,7 +15,6 @@ from typing import Annotated, cast, get_args
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common import credentials, transport
@@ -23,6 +22,7 @@ from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail,
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.local_cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
 from evopolicy_coordinator.verify_run import Report, Verifier
 from evopolicy_coordinator.verify_source import read_run, sample
 
@@ -110,9 +110,7 @@ def verify(
         tier=cast(Tier | None, tier),
         policy=policy,
     )
-    console = Console(stderr=True) if as_json else Console()
-    if not console.is_terminal:
-        console = Console(stderr=as_json, width=200)
+    console = terminal(stderr=as_json)
     with fail_on_our_errors():
         try:
             report = asyncio.run(_verify(options, console))
@@ -121,13 +119,13 @@ def verify(
         except EvopolicyError as error:
             fail(str(error), UNCHECKED)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(report)).decode())
+        say_json(report)
     else:
         _print(report, console)
     raise typer.Exit(0 if report.identical else DIFFERS)
 
 
-async def _verify(options: _Options, console: Console) -> Report:
+async def _verify(options: _Options, console: Terminal) -> Report:
     end_on_sigterm()
     run = read_run(options.run)
     async with _link(options) as (link, cluster):
@@ -147,7 +145,7 @@ async def _verify(options: _Options, console: Console) -> Report:
                 progress.update(task, completed=came)
                 if waits_for and waits_for not in waited:
                     waited.add(waits_for)
-                    console.print(f"waits for {waits_for}", markup=False, highlight=False)
+                    console.print(f"waits for {waits_for}")
 
             verifier = Verifier(link, run, tell, options.tier)
             knows_run = await verifier.check_cases()
@@ -199,9 +197,9 @@ async def _link(options: _Options) -> AsyncIterator[tuple[transport.Link, LocalC
         yield await stack.enter_async_context(transport.connect(found)), cluster
 
 
-def _print(report: Report, console: Console) -> None:
+def _print(report: Report, console: Terminal) -> None:
     def say(text: str) -> None:
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.print(one_line(text), soft_wrap=True)
 
     def listed(heading: str, lines: list[str]) -> None:
         if lines:

@@ -55,6 +55,36 @@ def test_the_coordinators_core_does_no_io() -> None:
         assert not imports_of(path) & banned, f"{path.relative_to(ROOT)}"
 
 
+OWN_STDOUT = {
+    "evopolicy_gateway/agents": "programs of their own, whose stdout is an agent's log",
+    "evopolicy_gateway/jail/doorway.py": "inside the jail, with the standard library alone",
+    "evopolicy_gateway/serve_cli.py": "URLs of its own, for a shell to read",
+    "evopolicy_common/leash.py": "becomes another program, with the standard library alone",
+    "evopolicy_worker/episodes.py": "speaks with the process that started it",
+    "evopolicy_worker/recording.py": "speaks with the process that started it",
+    "evopolicy_worker/sandbox/inside": "inside the sandbox, with the standard library alone",
+    "evopolicy_common/terminal.py": "is the one place",
+}
+
+
+def test_what_commands_print_goes_through_the_terminal_module() -> None:
+    for room, folder in ROOMS.items():
+        for path in sorted(folder.rglob("*.py")):
+            name = f"{room}/{path.relative_to(folder).as_posix()}"
+            if any(name.startswith(own) for own in OWN_STDOUT):
+                continue
+            calls = [
+                node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+            ]
+            named = {call.id for call in calls if isinstance(call, ast.Name)}
+            named |= {call.attr for call in calls if isinstance(call, ast.Attribute)} & {
+                "echo",
+                "secho",
+                "Console",
+            }
+            assert not named & {"print", "echo", "secho", "Console"}, name
+
+
 def test_every_package_is_where_it_should_be() -> None:
     for name, folder in ROOMS.items():
         assert (folder / "__init__.py").is_file(), name

@@ -14,10 +14,8 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import structlog
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from evopolicy_common import catalogue, credentials, host, keys, transport
@@ -26,6 +24,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.scratch import scratch_folder
+from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_worker import environments
 from evopolicy_worker.cores import Cores
 from evopolicy_worker.fingerprint import fingerprint
@@ -127,15 +126,15 @@ def doctor(
     checks = examine()
     best = best_tier(checks)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode({"tier": best, "checks": checks})).decode())
+        say_json({"tier": best, "checks": checks})
     else:
         table = Table(box=None, pad_edge=False)
         for heading in ("check", "verdict", "found", "what to do"):
             table.add_column(heading, overflow="fold")
         for check in checks:
             table.add_row(check.name, check.verdict, check.found, check.advice)
-        Console().print(table)
-        typer.echo(
+        terminal().print(table)
+        say(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )
     raise typer.Exit(0 if best else 1)

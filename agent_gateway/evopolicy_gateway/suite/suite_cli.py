@@ -17,12 +17,12 @@ from typing import Annotated
 
 import msgspec
 import typer
-from rich.console import Console
 
 from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway import options
 from evopolicy_gateway.runs import Cluster, connected, exit_code
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
@@ -111,7 +111,7 @@ def suite(
 
 
 async def _suite(order: Order) -> int:
-    console = Console(stderr=order.as_json)
+    console = terminal(stderr=order.as_json)
     with _alone(order.root):
         index = suite_index.load(order.root, order.suite.name)
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
@@ -144,26 +144,25 @@ async def _suite(order: Order) -> int:
     if not order.as_json:
         console.print(results_table(entries))
         if (told := suite_index.told(index)) is not None:
-            console.print(told, markup=False)
-        console.print(f"index: {order.root / suite_index.FILE_NAME}", markup=False, soft_wrap=True)
+            console.print(told)
+        console.print(f"index: {order.root / suite_index.FILE_NAME}", soft_wrap=True)
     missing = [("error", "")] * (len(names) - len(entries))
     return exit_code([*missing, *((entry.state, entry.closed_reason) for entry in entries)])
 
 
-def _tell(order: Order, index: Index, decided: list[Decision], console: Console) -> None:
+def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal) -> None:
     known = {run.name for run in order.runs}
     # Runs that --only leaves out are still the file's.
     in_file = {run.name for run in suite_file.expand(order.suite, Path.cwd())}
     left_alone = [name for name in index.runs if name not in known and name not in in_file]
     for line in decisions.told(decided, left_alone):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     needed, free = decisions.feedback_bytes(decided), shutil.disk_usage(order.root).free
     if needed:
         fits = "" if needed <= free else "; it may not fit: make room, or choose another --runs"
         console.print(
             f"feedback takes at most {bytes_text(needed)} of the {bytes_text(free)} that are free in"
             f" {order.root}{fits}",
-            markup=False,
             highlight=False,
             soft_wrap=True,
         )

@@ -10,17 +10,17 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import orjson
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.terminal import Terminal, say_json
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
-from evopolicy_gateway.watch import PHASES, first_line, harmless
+from evopolicy_gateway.watch import PHASES, first_line
 
 _SHOWN_ROWS = 24
 _WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30}
@@ -186,13 +186,13 @@ class JsonView(SuiteView):
 
     def event(self, kind: str, run: str, **more: Any) -> None:
         document = {"event": kind, "at": round(time.time(), 3), **({"run": run} if run else {}), **more}
-        print(orjson.dumps(document).decode(), flush=True)
+        say_json(document, indent=False)
 
 
 class LinesView(SuiteView):
     """A line for each event; the totals with every finished run."""
 
-    def __init__(self, names: list[str], parallel: int, console: Console) -> None:
+    def __init__(self, names: list[str], parallel: int, console: Terminal) -> None:
         super().__init__(names, parallel)
         self._console = console
 
@@ -204,7 +204,7 @@ class LinesView(SuiteView):
             self._print(self.totals())
 
     def _print(self, text: str) -> None:
-        self._console.print(harmless(text), markup=False, highlight=False, soft_wrap=True)
+        self._console.print(text, soft_wrap=True)
 
 
 class TableView(LinesView):
@@ -268,7 +268,7 @@ def words(kind: str, told: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def viewing(names: list[str], parallel: int, console: Console, *, as_json: bool) -> Iterator[SuiteView]:
+def viewing(names: list[str], parallel: int, console: Terminal, *, as_json: bool) -> Iterator[SuiteView]:
     """The view that fits where the output goes."""
     if as_json:
         yield JsonView(names, parallel)

@@ -32,6 +32,70 @@ def test_try_shows_returns_and_where_the_trajectories_are(operator_file: Path, t
     assert "nothing_like_it" in out
 
 
+def test_try_leaves_cases_with_a_failure_out_of_the_mean(operator_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "policy.py").write_text(
+        "class Policy:\n"
+        "  def __init__(self, obs_space, action_space, env_meta): pass\n"
+        "  def reset(self, i): self.i, self.t = i, 0\n"
+        "  def act(self, obs):\n"
+        "    self.t += 1\n"
+        "    if self.i == 1 and self.t == 3: raise ValueError('[/x] \\x1b[2J broken')\n"
+        "    return [obs[2] - obs[0]]\n"
+    )
+    where = ["--env", "toy/line", "--credentials", str(operator_file), "--cases", "0-2"]
+    with command(tmp_path, "try", ".", "--json", *where) as running:
+        code, out, err = running.finish()
+    assert code == 1, err
+    (result,) = json.loads(out)
+    returns = [episode["episode_return"] for episode in result["episodes"]]
+    assert [episode["failed_at"] for episode in result["episodes"]] == [None, 2, None]
+    assert result["mean_return"] == (returns[0] + returns[2]) / 2
+    assert (result["n_failed"], result["other_cases_next_time"]) == (1, False)
+    with command(tmp_path, "try", ".", *where) as running:
+        code, out, err = running.finish()
+    assert code == 1, err
+    assert "policy to step 2, then random" in out
+    assert "[/x] \ufffd[2J broken" in out
+    assert "over 2 of 3 cases; 1 case left out, in which the policy failed" in out
+
+
+def test_a_policy_that_fails_in_every_case_has_no_mean(operator_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "policy.py").write_text("class Policy:\n  pass\n")
+    where = ["--env", "toy/line", "--credentials", str(operator_file), "--cases", "0-1"]
+    with command(tmp_path, "try", ".", "--json", *where) as running:
+        code, out, err = running.finish()
+    assert code == 1, err
+    (result,) = json.loads(out)
+    assert (result["mean_return"], result["std_return"], result["n_failed"]) == (None, None, 2)
+    assert result["episodes"][0]["episode_return"] is None
+
+
+def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "policy.py").write_text(
+        "class Policy:\n"
+        "  def __init__(self, obs_space, action_space, env_meta): pass\n"
+        "  def reset(self, i): pass\n"
+        "  def act(self, obs): return [obs[2] - obs[0]]\n"
+    )
+    where = ["--env", "toy/line", "--credentials", str(operator_file), "--json"]
+    found = []
+    for cases in ("0-3", "2,3,0,1"):
+        with command(tmp_path, "try", ".", *where, "--cases", cases) as running:
+            code, out, err = running.finish()
+        assert code == 0, err
+        found.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
+    assert found[0] == found[1]
+    assert len(set(found[0].values())) == 4
+
+
+def test_a_cluster_that_is_thrown_away_says_that_its_cases_are_too(tmp_path: Path) -> None:
+    for more, told in (((), True), (("--state", str(tmp_path / "kept")), False)):
+        with command(tmp_path, "random", "--env", "toy/line", "--cases", "0", *more) as running:
+            code, out, err = running.finish()
+        assert code == 0, err
+        assert ("the next call has others under the same ids" in out) == told
+
+
 def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:
     where = ["--env", "toy", "--cases", "0-3", "--json", "--credentials", str(operator_file)]
     with command(tmp_path, "random", *where) as running:

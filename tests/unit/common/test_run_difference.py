@@ -74,6 +74,33 @@ def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
     assert found == ["workspace/feedback/submit_000/summary.json: extra: 1 and nothing"]
 
 
+def test_json_without_end_of_nesting_is_a_difference_and_no_crash(tmp_path: Path) -> None:
+    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    for folder, deepest in ((left, "1"), (right, "2")):
+        # The first is too deep to be read, the second to be compared.
+        for name, opens, closes in (
+            ("summary.json", "[" * 100_000, "]" * 100_000),
+            ("error.txt", '{"a":' * 700, "}" * 700),
+        ):
+            (folder / "workspace" / name).write_text(opens + deepest + closes)
+    found = differences(left, right)
+    assert [line.partition(":")[0] for line in found] == ["workspace/error.txt", "workspace/summary.json"]
+
+
+def test_file_names_neither_steer_the_terminal_nor_forge_lines(tmp_path: Path) -> None:
+    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    for name in (b"x\nno difference (times and logs aside)", b"\x1b]8;;evil\x1b\\", b"\xff[x]"):
+        with open(bytes(left) + b"/" + name, "wb"):
+            pass
+    told = CliRunner().invoke(app, ["diff", str(left), str(right)])
+    assert told.exit_code == 1
+    assert len(told.output.splitlines()) == 3
+    assert "\x1b" not in told.output
+    told = CliRunner().invoke(app, ["diff", "--json", str(left), str(right)])
+    assert told.exit_code == 1
+    assert len(json.loads(told.output)) == 3
+
+
 def test_the_list_of_what_is_left_out_is_told_with_reasons_and_covers_what_differs(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["diff", "--left-out"])
     assert done.exit_code == 0, done.output

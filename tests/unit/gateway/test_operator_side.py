@@ -11,12 +11,12 @@ import pytest
 from finished_run import SETTINGS, finished
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.run_record import decode_run_record, encode_run_record
+from evopolicy_common.terminal import Terminal
 from evopolicy_gateway import control
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.journal import Rejected
@@ -155,7 +155,7 @@ def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
 
 def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
     out = io.StringIO()
-    with watching(Console(file=out, width=200)) as watch:
+    with watching(Terminal(file=out, width=200)) as watch:
         progress = Progress(
             episode_budget=8,
             remaining_budget=4,
@@ -184,7 +184,7 @@ def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
 
 def test_watchers_on_a_terminal_draw_a_table() -> None:
     out = io.StringIO()
-    console = Console(file=out, force_terminal=True, width=160)
+    console = Terminal(file=out, force_terminal=True, width=160)
     with watching(console) as watch:
         watch.note("toy/line", "run r-1")
         watch.progress(
@@ -217,6 +217,6 @@ def test_exit_codes_and_the_report_tell_how_runs_ended() -> None:
         seen.append(result)
         assert exit_code((one.status, one.closed_reason) for one in seen) == code
     out = io.StringIO()
-    report(seen, Console(file=out, width=100))
+    report(seen, Terminal(file=out, width=100))
     for needed in ("no_ok_submit", "worker lost", "run directory: /r/a", "agent failed", "cancelled"):
         assert needed in out.getvalue()

@@ -6,13 +6,13 @@ import io
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.terminal import Terminal, harmless
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite.suite_view import LinesView, TableView
-from evopolicy_gateway.watch import Lines, LiveTable, first_line, harmless
+from evopolicy_gateway.watch import Lines, LiveTable, first_line
 
 STEERING = (
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen
@@ -25,7 +25,7 @@ STEERING = (
 @pytest.mark.parametrize("text", STEERING)
 def test_an_agents_words_do_not_steer_the_terminal(text: str) -> None:
     out = io.StringIO()
-    console = Console(file=out, width=200)
+    console = Terminal(file=out, width=200)
     lines = Lines(console)
     lines.turn("run", 1, text)
     lines.note("run", f"agent failed: {text}")
@@ -50,7 +50,7 @@ def test_what_can_be_shown_is_shown_as_it_is() -> None:
 
 def test_what_a_run_waits_for_is_said_once_and_a_free_slot_is_no_news() -> None:
     out = io.StringIO()
-    console = Console(file=out, width=200)
+    console = Terminal(file=out, width=200)
     missing = "a worker that offers toy/line with sandbox tier bwrap"
     for view in (Lines(console), LinesView(["run"], 1, console)):
         for what in (missing, missing, ""):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Decision, Found, check_changes, decide, feedback_bytes, told
@@ -257,7 +257,7 @@ def test_a_sweeps_use_adds_up_over_its_runs(tmp_path: Path) -> None:
 def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     runs = suite_in(tmp_path)
     out = io.StringIO()
-    console = Console(file=out, width=160)
+    console = Terminal(file=out, width=160)
     view = TableView([run.name for run in runs], 2, console)
     first, second, third, failed = runs[:4]
     known = entry(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")

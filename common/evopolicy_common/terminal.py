@@ -1,0 +1,86 @@
+"""Everything that a command prints goes through here.
+
+Texts of policies, agents, exceptions and file names reach a terminal. An escape sequence in one of them could clear the
+screen, forge a link or write over what stands there; square brackets could be taken for markup. So no markup is read, and
+every character that is not printable is shown as U+FFFD. `tests/unit/test_rooms.py` holds the rooms to it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import rich.console
+from rich.console import ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.text import Text
+
+_ODD = re.compile(r"[^\n\t -~]")
+WIDTH = 200
+"""Columns where there is no terminal: a table that is cut off is worse than a long line."""
+
+
+def harmless(text: str) -> str:
+    """`text` with U+FFFD for every character that is not printable; newlines and tabs stay."""
+    return _ODD.sub(_shown, text)
+
+
+def one_line(text: str) -> str:
+    """As `harmless`, with spaces for newlines and tabs: nothing in it can pass for a further line."""
+    return harmless(text.replace("\n", " ").replace("\t", " "))
+
+
+def _shown(found: re.Match[str]) -> str:
+    # Surrogates, which no stream can encode, are not printable either.
+    return found[0] if found[0].isprintable() else "\N{REPLACEMENT CHARACTER}"
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Prints `text` and a newline on stdout, or on stderr."""
+    print(harmless(text), file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
+    """Prints each of `lines` as exactly one line."""
+    for line in lines:
+        say(one_line(line), err=err)
+
+
+def say_json(value: Any, *, indent: bool = True) -> None:
+    """Prints `value` as JSON on stdout: over several lines, or on one. Characters that are not printable are escaped."""
+    try:
+        data = msgspec.json.encode(value)
+        text = (msgspec.json.format(data, indent=2) if indent else data).decode()
+    except UnicodeEncodeError:
+        # A file name that is no UTF-8 is in it.
+        text = json.dumps(msgspec.to_builtins(value), indent=2 if indent else None)
+    print(_ODD.sub(_escaped, text), flush=True)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
+
+
+class Terminal(rich.console.Console):
+    """A console that takes texts as they are: no markup, no emoji codes, nothing that is not printable."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(harmless(text), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            # Control segments are rich's own: they move the cursor of a live table.
+            yield segment if segment.control else segment._replace(text=harmless(segment.text))
+
+
+def terminal(*, stderr: bool = False) -> Terminal:
+    """For people: as wide as their terminal, and `WIDTH` columns where there is none."""
+    found = Terminal(stderr=stderr)
+    return found if found.is_terminal else Terminal(stderr=stderr, width=WIDTH)
