@@ -12,7 +12,7 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
-from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
@@ -77,6 +77,8 @@ def limits_of(texts: Sequence[str]) -> ResourceLimits:
             raise ConfigError(f"--limit {text!r}: {value!r} is no number") from None
         if not 0 < number < float("inf"):
             raise ConfigError(f"--limit {text!r}: a limit is a finite number above zero")
+        if number > (most := LARGEST_LIMITS.get(name, LARGEST_LIMIT)):
+            raise ConfigError(f"--limit {text!r}: {name} can be {most:,} at most")
         values[name] = int(number) if isinstance(getattr(usual, name), int) else number
     return msgspec.structs.replace(usual, **values)
 

@@ -6,11 +6,13 @@ what is not finite. Unknown fields are skipped, so an older peer may be told mor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import GatewayReply, GatewayRequest
 from evopolicy_common.messages.operator import OperatorReply, OperatorRequest
 from evopolicy_common.messages.worker import Message, WorkerReply, WorkerRequest
@@ -24,6 +26,12 @@ CHUNK_BYTES = 48 * 1024
 INLINE_BYTES = 24 * 1024
 """A blob up to this size travels inside the message that names it."""
 
+MAX_MESSAGE_BYTES = (16 << 20) - (64 << 10)
+"""No longer message is made or read. Zenoh's own limit, beyond which it drops a message without a word, is 16 MiB."""
+
+MAX_PACKED_BYTES = 256 << 20
+"""Of a job's outcomes packed as one blob."""
+
 _encoder = msgspec.msgpack.Encoder()
 worker_requests: msgspec.msgpack.Decoder[WorkerRequest] = msgspec.msgpack.Decoder(WorkerRequest)
 worker_replies: msgspec.msgpack.Decoder[WorkerReply] = msgspec.msgpack.Decoder(WorkerReply)
@@ -31,20 +39,48 @@ gateway_requests: msgspec.msgpack.Decoder[GatewayRequest] = msgspec.msgpack.Deco
 gateway_replies: msgspec.msgpack.Decoder[GatewayReply] = msgspec.msgpack.Decoder(GatewayReply)
 operator_requests: msgspec.msgpack.Decoder[OperatorRequest] = msgspec.msgpack.Decoder(OperatorRequest)
 operator_replies: msgspec.msgpack.Decoder[OperatorReply] = msgspec.msgpack.Decoder(OperatorReply)
+_outcomes = msgspec.msgpack.Decoder(tuple[EpisodeOutcome, ...])
 
 T = TypeVar("T")
 
 
 def encode(message: Message) -> bytes:
-    """The message's bytes."""
-    return _encoder.encode(message)
+    """The message's bytes; ProtocolError when they are too many for the transport."""
+    data = _encoder.encode(message)
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise ProtocolError(
+            f"a {type(message).__name__} of {len(data):,} bytes cannot be sent; {MAX_MESSAGE_BYTES:,} are the limit"
+        )
+    return data
 
 
 def decode(decoder: msgspec.msgpack.Decoder[T], data: bytes) -> T:
     """The message in `data`; ProtocolError when it is none that `decoder` knows."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise ProtocolError(f"a message of {len(data):,} bytes; {MAX_MESSAGE_BYTES:,} are the limit")
     try:
         return decoder.decode(data)
     except DECODE_ERRORS as error:
         raise ProtocolError(
             f"{len(data)} bytes are not a message of wire version {WIRE_VERSION}: {error}"
         ) from error
+
+
+def pack_outcomes(outcomes: Sequence[EpisodeOutcome]) -> bytes:
+    """Outcomes as one blob; ProtocolError when they are too many bytes."""
+    data = _encoder.encode(outcomes)
+    if len(data) > MAX_PACKED_BYTES:
+        raise ProtocolError(
+            f"{len(outcomes)} outcomes of {len(data):,} bytes; {MAX_PACKED_BYTES:,} are the limit"
+        )
+    return data
+
+
+def unpack_outcomes(data: bytes) -> tuple[EpisodeOutcome, ...]:
+    """What `pack_outcomes` was given; ProtocolError when `data` is not that."""
+    if len(data) > MAX_PACKED_BYTES:
+        raise ProtocolError(f"outcomes of {len(data):,} bytes; {MAX_PACKED_BYTES:,} are the limit")
+    try:
+        return _outcomes.decode(data)
+    except DECODE_ERRORS as error:
+        raise ProtocolError(f"{len(data)} bytes are not the outcomes of a job: {error}") from error

@@ -23,6 +23,7 @@ class Refusal(StrEnum):
     INVALID_ENV_INSTANCE = "invalid_env_instance"
     BUSY = "busy"
     KEY_CONFLICT = "key_conflict"
+    TOO_LARGE = "too_large"
 
     # What it names is not there.
     MISSING_BLOB = "missing_blob"

@@ -20,7 +20,7 @@ import structlog
 
 from evopolicy_common import codec
 from evopolicy_common.blobs import BlobStore, digest_of, is_digest
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import ProtocolError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
@@ -228,6 +228,15 @@ def lane_of(asker: str) -> int:
     return crc32(asker.encode())
 
 
+def answer_bytes(message: Message) -> bytes:
+    """The bytes of an answer; of a refusal where they would be more than can be sent, lest it be asked for again for ever."""
+    try:
+        return codec.encode(message)
+    except ProtocolError as error:
+        log.error("an answer is too large", error=str(error))
+        return codec.encode(Refused(status=Refusal.TOO_LARGE, message=str(error)))
+
+
 def answer_to(query: IncomingQuery, asker: str) -> Answer:
     """Answers the query, or ends it without an answer."""
 
@@ -235,6 +244,6 @@ def answer_to(query: IncomingQuery, asker: str) -> Answer:
         if message is None:
             query.drop()
         else:
-            query.reply(codec.encode(message), lane_of(asker))
+            query.reply(answer_bytes(message), lane_of(asker))
 
     return answer

@@ -21,6 +21,7 @@ from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
@@ -158,10 +159,17 @@ class Intake:
         except ProtocolError:
             return False
 
+    @staticmethod
+    def reads_files(message: Message) -> bool:
+        """Whether `event` reads splits or blobs for it."""
+        if isinstance(message, worker.HandIn):
+            return any(result.packed is not None for result in message.results)
+        return isinstance(message, operator.CreateRun | operator.Evaluate)
+
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
         """The event that the request is for the core; RefusedError when it cannot be served as it is.
 
-        Not for blob and status requests. Reads files for `CreateRun` and `Evaluate`, which therefore belong on a thread.
+        Not for blob and status requests. What `reads_files` belongs on a thread.
         """
         make: Callable[[Any, int, str], AnyEvent] = _EVENTS[type(parsed.message)]
         return make(self, parsed.message, request, stimulus_id)  # type: ignore[call-arg, arg-type]
@@ -208,18 +216,31 @@ class Intake:
         )
 
     def results_handed_in(self, m: worker.HandIn, request: int, stimulus: str) -> AnyEvent:
-        for result in m.results:
+        results = tuple(map(self._unpacked, m.results))
+        for result in results:
             for outcome in result.episodes:
                 for ref in (outcome.trajectory, outcome.video):
                     check_inline(ref)
                 for ref in stored_blobs(outcome):
-                    if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
-                        raise RefusedError(
-                            Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here"
-                        )
+                    self._check_stored(ref)
         return events.ResultsHandedIn(
-            stimulus_id=stimulus, request=request, worker=m.worker, session=m.session, results=m.results
+            stimulus_id=stimulus, request=request, worker=m.worker, session=m.session, results=results
         )
+
+    def _unpacked(self, result: worker.JobResult) -> worker.JobResult:
+        """The result with its outcomes, where these came as a blob."""
+        if result.packed is None:
+            return result
+        self._check_stored(result.packed)
+        try:
+            outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
+        except ProtocolError as error:
+            raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
+        return msgspec.structs.replace(result, episodes=outcomes, packed=None)
+
+    def _check_stored(self, ref: BlobRef) -> None:
+        if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
+            raise RefusedError(Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here")
 
     # Gateways.
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hmac
-import math
 
 from evopolicy_common import codec, keys
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import worker
-from evopolicy_common.messages.episode import BlobRef, ResourceLimits
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits
 from evopolicy_common.refusals import Refusal
 
 MAX_COUNT = 2**31 - 1
@@ -28,12 +27,13 @@ def finite_cursor(cursor: int) -> int:
 
 
 def check_limits(limits: ResourceLimits) -> None:
-    """Every limit is a finite number above zero."""
+    """Every limit is a finite number above zero, and no larger than can be kept."""
     for name in limits.__struct_fields__:
         value = getattr(limits, name)
-        if value is not None and not (math.isfinite(value) and value > 0):
+        most = LARGEST_LIMITS.get(name, LARGEST_LIMIT)
+        if value is not None and not 0 < value <= most:
             raise RefusedError(
-                Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and finite"
+                Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and at most {most:,}"
             )
 
 

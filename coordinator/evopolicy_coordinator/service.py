@@ -24,13 +24,13 @@ from importlib import metadata
 import msgspec
 import structlog
 
-from evopolicy_common import bundles, codec
+from evopolicy_common import bundles
 from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.transport import IncomingQuery
-from evopolicy_coordinator.answers import Answers, answer_to, lane_of
+from evopolicy_coordinator.answers import Answers, answer_bytes, answer_to, lane_of
 from evopolicy_coordinator.claims import Claims
 from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
 from evopolicy_coordinator.core.events import (
@@ -60,7 +60,6 @@ _LONGEST_PAUSE_S = 5.0
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _STALLS_TOLD = 5
-_READS_FILES = (operator.CreateRun, operator.Evaluate)
 
 
 class Service:
@@ -174,7 +173,7 @@ class Service:
         elif isinstance(message, operator.Claim):
             self._spawn(self._serve_claim(query, message))
         elif isinstance(message, operator.StatusRequest):
-            query.reply(codec.encode(self._status(core)), lane_of(parsed.asker))
+            query.reply(answer_bytes(self._status(core)), lane_of(parsed.asker))
         elif isinstance(message, operator.RecordedRequest):
             self._answers.recorded(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
@@ -185,7 +184,7 @@ class Service:
                 {repr(each.profile.fingerprint): each.profile.fingerprint for each in offering}.values()
             )
             self._spawn(self._serve_description(query, message, fingerprints))
-        elif isinstance(message, _READS_FILES):
+        elif self._intake.reads_files(message):
             self._spawn(self._serve_from_thread(query, parsed))
         else:
             request = self._pending.admit(query, parsed.asker)
@@ -249,7 +248,7 @@ class Service:
             known = operator.EnvironmentState(
                 split_hashes=hashes, knows_run=secret is not None, fingerprints=fingerprints
             )
-            query.reply(codec.encode(known))
+            query.reply(answer_bytes(known))
 
     async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
         """Claims are beside the core: what they decide changes no run."""
@@ -264,7 +263,7 @@ class Service:
             log.exception("request failed", key=query.key)
             query.drop()
             return
-        query.reply(codec.encode(answer))
+        query.reply(answer_bytes(answer))
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
         most = MAX_BUNDLE_BYTES
@@ -305,7 +304,7 @@ class Service:
         log.info("refused", key=query.key, status=error.status, why=error.message)
         answer = Refused(status=error.status, message=error.message)
         self._turned_away.answered(query.key, query.payload, answer, self.now())
-        query.reply(codec.encode(answer))
+        query.reply(answer_bytes(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core nothing can be served; who would change something is told why."""
@@ -315,7 +314,7 @@ class Service:
                 query.key
             ):  # the reason names paths, which no agent needs to know
                 why += f": {self._storage_error}"
-            query.reply(codec.encode(Refused(status=Refusal.UNAVAILABLE, message=why)))
+            query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
         else:
             query.drop()
 
@@ -426,7 +425,7 @@ class Service:
             if pending is not None:
                 query = pending.query
                 self._turned_away.answered(query.key, query.payload, effect.message, self.now())
-                query.reply(codec.encode(effect.message), lane_of(pending.asker))
+                query.reply(answer_bytes(effect.message), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._pending.take(effect.request)
             if pending is not None:

@@ -31,6 +31,7 @@ import numpy as np
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import (
+    LARGEST_LIMITS,
     NO_POLICY,
     BlobRef,
     EpisodeOutcome,
@@ -52,6 +53,10 @@ from evopolicy_worker.sandbox.zygote import Child, Zygote
 
 MAX_FAULT = 4000
 """Characters of an error that are told."""
+MAX_JOB_OUTPUT_BYTES = 64 << 20
+"""Of what is kept of a job's stdout, stderr and tracebacks, each episode has an equal share: 327 may use their limits up."""
+MAX_BLOB_BYTES = 1 << 30
+"""Of one trajectory or video."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
 
@@ -104,6 +109,7 @@ class Player:
         Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
         """
         environment = self._environment(job.env)
+        job = msgspec.structs.replace(job, limits=_within_share(job))
         files = self._read_bundle(folder) if job.bundle is not None else None
         policies = _Policies(self, job, files, environment)
         if not job.video:
@@ -433,6 +439,26 @@ def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> b
     return spec.index == 0 and job.record == "full" and failure.category in NO_POLICY
 
 
+def _share(job: Job) -> int:
+    """Bytes that one episode of the job may say."""
+    return max(1024, MAX_JOB_OUTPUT_BYTES // len(job.episodes))
+
+
+def _within_share(job: Job) -> ResourceLimits:
+    """The job's limits with the output that there is room for in its results."""
+    most = min(LARGEST_LIMITS["output_bytes"], _share(job) // 3)
+    return msgspec.structs.replace(job.limits, output_bytes=min(job.limits.output_bytes, most))
+
+
+def _brief(outcome: EpisodeOutcome, share: int) -> EpisodeOutcome:
+    """The outcome with no more of a traceback than its share; of that the end tells most."""
+    failure = outcome.failure
+    if failure is None or 4 * len(failure.traceback) <= share // 3:
+        return outcome
+    kept = failure.traceback[-(share // 12) :]
+    return msgspec.structs.replace(outcome, failure=msgspec.structs.replace(failure, traceback=kept))
+
+
 def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
     return EpisodeOutcome(
         index=index, episode_return=0.0, length=0, terminated=False, truncated=False, failure=failure
@@ -448,6 +474,8 @@ def _framed(outcome: EpisodeOutcome) -> bytes:
 
 
 def _blob(data: bytes) -> BlobRef:
+    if len(data) > MAX_BLOB_BYTES:
+        raise WorkerError(f"a recording of {len(data):,} bytes; {MAX_BLOB_BYTES:,} are the limit")
     return BlobRef(digest=digest_of(data), size=len(data), inline=data)
 
 

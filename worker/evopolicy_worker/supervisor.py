@@ -24,11 +24,9 @@ import structlog
 from evopolicy_common import codec, keys
 from evopolicy_common.errors import EvopolicyError, RefusedError, SlotDiedError, TransportError
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
     Fingerprint,
-    HandIn,
-    HandInReply,
     HeartbeatReply,
     HeldLease,
     JobResult,
@@ -46,14 +44,11 @@ from evopolicy_common.requests import Requester
 from evopolicy_common.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
+from evopolicy_worker.outbox import Outbox
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 LEASE_POLL_S = 10.0
-MAX_HAND_IN_BYTES = 4 << 20
-MAX_HAND_IN = 64
-MAX_OUTBOX = 256
-"""Results waiting to be handed in before the slots stop taking jobs: a coordinator that is away must not fill memory."""
 RESTART_PAUSE_S = 1.0
 LONGEST_RESTART_PAUSE_S = 30.0
 CANCEL_PATIENCE_S = 2.0
@@ -109,10 +104,9 @@ class Supervisor:
         self._queue: OrderedDict[str, Lease] = OrderedDict()
         self._work_arrived = asyncio.Event()
         self._capacity_freed = asyncio.Event()
-        self._outbox: list[JobResult] = []
-        self._outbox_filled = asyncio.Event()
-        self._outbox_emptied = asyncio.Event()
-        self._outbox_emptied.set()
+        self._outbox = Outbox(
+            self._ask, options.name, lambda: self._session, self._register_again, self._settled
+        )
         self._running: dict[str, SlotLike] = {}
         self._cancelled: set[str] = set()
         self._session = ""
@@ -126,11 +120,11 @@ class Supervisor:
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
         # The hand-in task outlives the others: what was played is handed in before the worker goes.
-        hand_in = asyncio.create_task(self._hand_in_loop())
+        hand_in = asyncio.create_task(self._outbox.run())
         try:
             await self._work()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._outbox_emptied.wait(), self._options.grace_s)
+                await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
         finally:
             self._heartbeat.stop()
             hand_in.cancel()
@@ -224,7 +218,7 @@ class Supervisor:
         while not self._draining.is_set():
             self._capacity_freed.clear()
             slots = self._options.slots
-            if len(self._queue) > max(slots, depth // 2) or len(self._outbox) >= MAX_OUTBOX:
+            if len(self._queue) > max(slots, depth // 2) or self._outbox.full:
                 await self._capacity_freed.wait()
                 continue
             wanted = max(1, 2 * slots - len(self._queue) - len(self._running))
@@ -371,7 +365,7 @@ class Supervisor:
     def _put_result(
         self, lease: Lease, kind: ResultKind, episodes: tuple[EpisodeOutcome, ...] = (), error: str = ""
     ) -> None:
-        self._outbox.append(
+        self._outbox.put(
             JobResult(
                 lease_id=lease.lease_id,
                 job_id=lease.job.job_id,
@@ -381,66 +375,10 @@ class Supervisor:
                 error=error[:2000],
             )
         )
-        self._outbox_filled.set()
-        self._outbox_emptied.clear()
 
-    async def _hand_in_loop(self) -> None:
-        while True:
-            while not self._outbox:
-                self._outbox_emptied.set()
-                self._outbox_filled.clear()
-                await self._outbox_filled.wait()
-            batch: list[JobResult] = []
-            size = 0
-            for index in range(min(MAX_HAND_IN, len(self._outbox))):
-                ready = self._outbox[index] = await self._upload_large(self._outbox[index])
-                weight = _weight(ready)
-                if batch and size + weight > MAX_HAND_IN_BYTES:
-                    break
-                batch.append(ready)
-                size += weight
-            session = self._session
-            message = HandIn(worker=self._options.name, session=session, results=tuple(batch))
-            try:
-                await self._ask.until_answered("done", message, HandInReply)
-            except RefusedError as error:
-                if error.status == Refusal.UNKNOWN_WORKER:
-                    await self._register_again(session)
-                else:
-                    log.error("results not taken; trying again", status=error.status, why=error.message)
-                    await asyncio.sleep(RESTART_PAUSE_S)
-                continue
-            del self._outbox[: len(batch)]
-            for result in batch:
-                self._held.drop(result.lease_id)
-            self._capacity_freed.set()
-
-    async def _upload_large(self, result: JobResult) -> JobResult:
-        episodes = []
-        for outcome in result.episodes:
-            episodes.append(
-                msgspec.structs.replace(
-                    outcome,
-                    trajectory=await self._by_digest(outcome.trajectory),
-                    video=await self._by_digest(outcome.video),
-                )
-            )
-        return msgspec.structs.replace(result, episodes=tuple(episodes))
-
-    async def _by_digest(self, blob: BlobRef | None) -> BlobRef | None:
-        if blob is None or blob.inline is None or blob.size <= codec.INLINE_BYTES:
-            return blob
-        while True:
-            session = self._session
-            try:
-                await self._ask.upload(self._options.name, session, blob.digest, blob.inline)
-                return msgspec.structs.replace(blob, inline=None)
-            except RefusedError as error:
-                if error.status == Refusal.UNKNOWN_WORKER:
-                    await self._register_again(session)
-                    continue
-                log.error("blob not taken; trying again", status=error.status, why=error.message)
-                await asyncio.sleep(RESTART_PAUSE_S)
+    def _settled(self, result: JobResult) -> None:
+        self._held.drop(result.lease_id)
+        self._capacity_freed.set()
 
     # Ending.
 
@@ -476,17 +414,6 @@ def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0
         running=running,
         episodes_done=episodes_done,
         steps=steps,
-    )
-
-
-def _weight(result: JobResult) -> int:
-    """Bytes of the result's bulky parts."""
-    return 1000 + sum(
-        len(outcome.stdout)
-        + len(outcome.stderr)
-        + (len(outcome.trajectory.inline or b"") if outcome.trajectory else 0)
-        + (len(outcome.video.inline or b"") if outcome.video else 0)
-        for outcome in result.episodes
     )
 
 

@@ -70,6 +70,17 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 
 
+LARGEST_LIMITS: dict[str, int] = {
+    # Feedback keeps no more, and an outcome has to fit into a message.
+    "output_bytes": 64 << 10,
+    "action_bytes": 1 << 20,
+    "episode_action_bytes": 64 << 20,
+}
+"""Limits that cannot be set higher."""
+LARGEST_LIMIT = 1 << 53
+"""The same for all others."""
+
+
 class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
     """Names bytes in a content-addressed store, or carries them where they are few."""
 

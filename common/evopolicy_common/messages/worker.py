@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.refusals import Refusal
 
 
@@ -143,6 +143,8 @@ class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     kind: ResultKind
     episodes: tuple[EpisodeOutcome, ...] = ()
     """In the job's order; empty unless `done`."""
+    packed: BlobRef | None = None
+    """`codec.pack_outcomes` of the episodes, uploaded before, where they are too large for a message."""
     error: str = ""
     """For operators; never shown to an agent."""
 

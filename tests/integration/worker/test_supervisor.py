@@ -28,16 +28,22 @@ from coordinator_harness import (
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
+from evopolicy_common.requests import Requester
 from evopolicy_common.transport import connect
-from evopolicy_worker import supervisor
+from evopolicy_worker import outbox, supervisor
 from evopolicy_worker.supervisor import Options, Supervisor
 
 
 class ScriptedSlot:
-    """Plays as the harness's `play` does, after what `script` does with the job."""
+    """Plays as the harness's `play` does, after what `script` does with the job; `dress` changes each outcome."""
 
-    def __init__(self, script: Callable[[ScriptedSlot, Job], Awaitable[None]]) -> None:
+    def __init__(
+        self,
+        script: Callable[[ScriptedSlot, Job], Awaitable[None]],
+        dress: Callable[[EpisodeOutcome], EpisodeOutcome],
+    ) -> None:
         self.script = script
+        self.dress = dress
         self.started = 0
         self.stopped = asyncio.Event()
 
@@ -52,7 +58,7 @@ class ScriptedSlot:
         self.stopped.clear()
         await self.script(self, job)
         on_progress(1, 10)
-        return tuple(large(play(job, spec)) for spec in job.episodes)
+        return tuple(self.dress(play(job, spec)) for spec in job.episodes)
 
     async def cancel(self) -> None:
         self.stopped.set()
@@ -79,6 +85,11 @@ def make_data(folder: Path) -> None:
         )
 
 
+def talkative(outcome: EpisodeOutcome) -> EpisodeOutcome:
+    """The outcome of a policy that prints whatever is kept of it."""
+    return msgspec.structs.replace(outcome, stdout=b"o" * 65536, stderr=b"e" * 65536)
+
+
 async def at_once(slot: ScriptedSlot, job: Job) -> None:
     await asyncio.sleep(0)
 
@@ -92,6 +103,7 @@ async def supervising(
     name: str = "w-1",
     slots: int = 2,
     grace_s: float = 5.0,
+    dress: Callable[[EpisodeOutcome], EpisodeOutcome] = large,
 ) -> AsyncIterator[Supervisor]:
     """A supervisor that works in the background and is drained at the end."""
     options = Options(
@@ -106,7 +118,7 @@ async def supervising(
     )
 
     def make_slot(index: int, tier: Tier) -> ScriptedSlot:
-        return ScriptedSlot(script)
+        return ScriptedSlot(script, dress)
 
     async with connect(coordinator.credentials("worker")) as link:
         found = Supervisor(link, options, make_slot)
@@ -236,6 +248,81 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
         raise SandboxError("cancelled")
 
     run(lambda: leaves_in_the_middle(coordinator, tmp_path, stuck, reached))
+
+
+def test_a_submit_of_128_talkative_episodes_is_handed_in_and_blocks_nothing(
+    coordinator: Coordinator, tmp_path: Path
+) -> None:
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, dress=talkative), operator_of(coordinator) as operator:
+            created = await operator.create(policy_scope="submit", budget=128, n_validation=2, n_heldout=2)
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("loud"), tuple(range(64)) * 2, "k")
+                episodes, done = await gateway.results(0)
+                await gateway.close()
+            assert (done.status, len(episodes)) == ("ok", 128)
+            assert {(len(each.stdout), len(each.stderr)) for each in episodes} == {(65536, 65536)}
+            finished = await operator.finished(created.run)
+            assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
+
+    run(scenario)
+
+
+def test_what_the_coordinator_has_lost_is_sent_again(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost: list[str] = []
+    real = Requester.upload
+
+    async def upload(self: Requester[Any], sender: str, token: str, digest: str, data: bytes) -> None:
+        await real(self, sender, token, digest, data)
+        blob = coordinator.state / "blobs" / digest[:2] / digest
+        if sender == "w-1" and len(lost) < 3 and blob.exists():
+            lost.append(digest)
+            blob.unlink()
+
+    monkeypatch.setattr(Requester, "upload", upload)
+    monkeypatch.setattr(outbox, "PAUSE_S", 0.05)
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path):
+            assert (await whole_run(coordinator))["status"] == "completed"
+        assert len(lost) == 3
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("bulk", [40, 40_000, 2_000_000])
+def test_a_result_that_is_refused_for_good_blocks_no_other(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bulk: int
+) -> None:
+    monkeypatch.setattr(outbox, "PAUSE_S", 0.05)
+    broken: list[int] = []
+
+    def wrong(outcome: EpisodeOutcome) -> EpisodeOutcome:
+        """Bytes that are not those of their digest: as a part of the message, as a blob, or as a part of a packed blob."""
+        if outcome.index in (2, 3) and len(broken) < 4:
+            broken.append(outcome.index)
+            size = 40_000 if bulk == 40_000 else 40
+            blob = BlobRef(digest=digest_of(b"other"), size=size, inline=bytes(size))
+            return msgspec.structs.replace(
+                outcome, trajectory=blob, stdout=bytes(bulk if bulk > 40_000 else 0)
+            )
+        return large(outcome)
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, dress=wrong), operator_of(coordinator) as operator:
+            created = await operator.create(n_validation=1, n_heldout=1)
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("policy"), tuple(range(8)), "k")
+                episodes, done = await gateway.results(0)
+                await gateway.close()
+            assert (done.status, len(episodes)) == ("ok", 8)
+            finished = await operator.finished(created.run)
+            assert finished.status == "completed"
+            assert finished.infrastructure_retries == len(broken) == 4
+
+    run(scenario)
 
 
 def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
