@@ -123,7 +123,7 @@ def check(
     """Check that split files are well-formed and disjoint, and print their hashes."""
     if not folder.is_dir():
         _usage(f"{folder} is not a folder")
-    folders = [folder] if _holds_splits(folder) else sorted(p for p in folder.iterdir() if _holds_splits(p))
+    folders = splits.folders_below(folder)
     if not folders:
         _usage(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
@@ -133,10 +133,6 @@ def check(
         _print(reports)
     if any(report["findings"] for report in reports):
         raise typer.Exit(1)
-
-
-def _holds_splits(folder: Path) -> bool:
-    return any((folder / f"{stem}.json").is_file() for stem in splits.FILE_STEMS.values())
 
 
 def _report(folder: Path) -> dict[str, Any]:

@@ -62,8 +62,26 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def folder_name(env: str) -> str:
-    """The folder that holds the split files of `env`."""
+    """The folder that `data make` writes the split files of `env` to."""
     return env.replace("/", "_")
+
+
+def folder_of(root: Path, env: str) -> Path:
+    """Where the split files of `env` are below `root`: in `gym_acrobot/`, or as published in `gym/acrobot/`."""
+    published = root / env
+    return published if holds_splits(published) else root / folder_name(env)
+
+
+def folders_below(root: Path) -> list[Path]:
+    """The folders of both forms that hold split files, in order; `root` alone where it is such a folder itself."""
+    if holds_splits(root):
+        return [root]
+    return sorted(folder for pattern in ("*", "*/*") for folder in root.glob(pattern) if holds_splits(folder))
+
+
+def holds_splits(folder: Path) -> bool:
+    """Whether any split file is in `folder`."""
+    return any((folder / f"{stem}.json").is_file() for stem in FILE_STEMS.values())
 
 
 def cases_hash(cases: Iterable[Case]) -> str:
@@ -193,9 +211,9 @@ def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> 
         findings.append(f"{name} says it is split {content.split!r}")
     if content.env != env:
         findings.append(f"{name} is of environment {content.env!r}, train.json of {env!r}")
-    if folder_name(content.env) != folder.name:
+    if folder.name != folder_name(content.env) and not folder.as_posix().endswith(f"/{content.env}"):
         findings.append(
-            f"{name} is of environment {content.env!r}, which belongs in {folder_name(content.env)}/"
+            f"{name} is of environment {content.env!r}, which belongs in {folder_name(content.env)}/ or {content.env}/"
         )
     if not content.cases:
         findings.append(f"{name} has no cases")
@@ -242,7 +260,7 @@ class SplitSource:
             return EnvironmentSplits(
                 env=env, secret=True, **_by_field(derive(self._secret, suite, env, counts))
             )
-        folder = self._data / folder_name(env)
+        folder = folder_of(self._data, env)
         splits, findings = load(folder)
         if splits is None or findings:
             more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""

@@ -67,6 +67,16 @@ def test_check_tells_what_is_wrong_and_exits_1(tmp_path: Path) -> None:
     assert "toy_maze/valid.json" in result.stdout.replace("\n", "")
 
 
+def test_check_reads_the_published_tree(tmp_path: Path) -> None:
+    call("make", "--env", "toy/*", "--root", tmp_path / "ours", "--seed", 7)
+    (tmp_path / "theirs" / "toy").mkdir(parents=True)
+    for name in ("line", "maze"):
+        (tmp_path / "ours" / f"toy_{name}").rename(tmp_path / "theirs" / "toy" / name)
+    result = call("check", tmp_path / "theirs", "--json")
+    assert result.exit_code == 0, result.stdout
+    assert [report["env"] for report in json.loads(result.stdout)["environments"]] == ["toy/line", "toy/maze"]
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

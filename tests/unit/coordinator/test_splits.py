@@ -15,7 +15,14 @@ from hypothesis import strategies as st
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case
 from evopolicy_coordinator import splits
-from evopolicy_coordinator.splits import SPLITS, SplitSource, derive, load, load_or_create_secret
+from evopolicy_coordinator.splits import (
+    SPLITS,
+    SplitSource,
+    derive,
+    folders_below,
+    load,
+    load_or_create_secret,
+)
 
 COUNTS = {"train": 64, "validation": 16, "heldout": 32}
 
@@ -114,6 +121,16 @@ def test_wrong_files_are_found_out_and_not_played(
     assert any(re.search(finding, text) for text in findings), findings
     with pytest.raises(ConfigError, match="evopolicy data check"):
         SplitSource(data=folder.parent, secret=b"").splits("toy", "toy/line", {})
+
+
+def test_published_tree_is_read_as_ours_is(folder: Path, tmp_path: Path) -> None:
+    published = tmp_path / "main-128" / "toy" / "line"
+    published.parent.mkdir(parents=True)
+    folder.rename(published)
+    source = SplitSource(data=tmp_path / "main-128", secret=b"")
+    assert source.splits("toy", "toy/line", {}).cases("train")[0].seed == 1
+    assert folders_below(tmp_path / "main-128") == [published]
+    assert folders_below(published) == [published]
 
 
 def test_same_seed_with_other_options_is_another_case(folder: Path) -> None:
