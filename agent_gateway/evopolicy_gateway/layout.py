@@ -106,8 +106,8 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def lock(self) -> Path:
-        """Held by the process that plays the run."""
-        return self.state / "lock"
+        """Held by the process that plays the run, or replaces it: beside the folder, which may be removed meanwhile."""
+        return self.root.with_name(f".{self.root.name}.lock")
 
     @property
     def intended(self) -> Path:

@@ -10,12 +10,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
-import os
 import sys
 import time
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +26,7 @@ from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import children, control, harnesses, record
+from evopolicy_gateway.alone import alone, check_free
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
     AgentDoing,
@@ -87,6 +85,11 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     def check(self) -> None:
         """ConfigError when the agent cannot start, or its jail or the run's folder cannot be had, such as one that may not
         be overwritten."""
+        check_free(self.folder.lock, self.folder.root)
+        self._check()
+
+    def _check(self) -> None:
+        """`check` for who may hold the folder's lock."""
         check_agent(self.agent, self.door)
         harnesses.make(self.agent, self.started_in, self.config).check()
         self.jail.check()
@@ -116,8 +119,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             return None
 
     def claim(self) -> None:
-        """Makes the run's folder, empty. ConfigError as `check`."""
-        self.check()
+        """Makes the run's folder, empty, for who holds its lock. ConfigError as `check`."""
+        self._check()
         if self.folder.root.exists():
             remove_tree(self.folder.root)
         self.folder.root.mkdir(parents=True)
@@ -172,6 +175,20 @@ class RunPlay:
 
     async def play(self) -> RunRecord:
         """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._play()
+
+    async def go_on(self) -> RunRecord:
+        """What the folder asks for: `play` where nothing was begun, `resume` where it was; a finished run's record."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._go_on()
+
+    async def resume(self) -> RunRecord:
+        """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._resume()
+
+    async def _play(self) -> RunRecord:
         plan = self._plan
         plan.claim()
         self._folder.state.mkdir(mode=0o700)
@@ -184,7 +201,7 @@ class RunPlay:
         except BaseException:
             remove_tree(self._folder.root)
             raise
-        return await self._to_the_end(run, agents_side=True)
+        return await self._played(run, agents_side=True)
 
     async def _open(self, key: str) -> str:
         created = await self._operations.create(self._plan.settings, key)
@@ -194,8 +211,7 @@ class RunPlay:
         self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
         return created.run
 
-    async def go_on(self) -> RunRecord:
-        """What the folder asks for: `play` where nothing was begun, `resume` where it was; a finished run's record."""
+    async def _go_on(self) -> RunRecord:
         folder = self._folder
         if folder.run_json.exists():
             # Killed between the two, the command has left the gateway's folder.
@@ -203,13 +219,12 @@ class RunPlay:
             return decode_run_record(folder.run_json.read_bytes())
         intended = self._plan.intended()
         if intended is None:
-            return await self.play()
+            return await self._play()
         if not folder.opened.exists():
-            return await self._to_the_end(await self._open(intended.key), agents_side=True)
-        return await self.resume()
+            return await self._played(await self._open(intended.key), agents_side=True)
+        return await self._resume()
 
-    async def resume(self) -> RunRecord:
-        """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
+    async def _resume(self) -> RunRecord:
         run = msgspec.json.decode(self._folder.opened.read_bytes(), type=OpenedRun).run
         capability = credentials.read(self._folder.credentials).token
         found = msgspec.structs.replace(self._credentials, token=capability)
@@ -218,11 +233,7 @@ class RunPlay:
         if phase is None:
             raise ConfigError(f"the cluster does not know run {run} of {self._folder.root} any more")
         self._watch.note(self._name, f"goes on with run {run} in {self._folder.root}")
-        return await self._to_the_end(run, agents_side=phase == "open")
-
-    async def _to_the_end(self, run: str, *, agents_side: bool) -> RunRecord:
-        with _held(self._folder):
-            return await self._played(run, agents_side=agents_side)
+        return await self._played(run, agents_side=phase == "open")
 
     async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
         self.run = run
@@ -432,17 +443,3 @@ class RunPlay:
                 finished = await self._finish(run)
                 times = self._stopwatch.times
                 await record.write(self._folder, self._plan, finished, self._operations, times, why)
-
-
-@contextlib.contextmanager
-def _held(folder: RunFolder) -> Iterator[None]:
-    """Only one process at a time plays a run: ConfigError when another does. Let go of by its death, too."""
-    fd = os.open(folder.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{folder.root}: another command plays this run at the moment") from None
-        yield
-    finally:
-        os.close(fd)

@@ -21,6 +21,7 @@ from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_a
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
+from evopolicy_gateway.alone import alone
 from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed
 from evopolicy_gateway.gateway import Close, Gateway, folder_of
 from evopolicy_gateway.layout import RunFolder
@@ -61,7 +62,11 @@ def serve(
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():
         folder = folder_of(run_directory)
-        closed = asyncio.run(_serve(folder, tuple(connect or ()), credentials_file, json_output, controlled))
+        # The command that controls a gateway holds the folder for both.
+        with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
+            closed = asyncio.run(
+                _serve(folder, tuple(connect or ()), credentials_file, json_output, controlled)
+            )
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
     os._exit(0 if closed or not controlled else 3)

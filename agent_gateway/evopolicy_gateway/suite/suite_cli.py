@@ -7,11 +7,7 @@ submit, 4 an agent failed, 5 a run was cancelled, 130 interrupted (started again
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import fcntl
-import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +20,7 @@ from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.run_record import decode_run_record
 from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway import options
+from evopolicy_gateway.alone import alone
 from evopolicy_gateway.runs import Cluster, connected, exit_code
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
@@ -112,7 +109,7 @@ def suite(
 
 async def _suite(order: Order) -> int:
     console = terminal(stderr=order.as_json)
-    with _alone(order.root):
+    with alone(order.root / ".lock", order.root):
         index = suite_index.load(order.root, order.suite.name)
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
         async with connected(order.where, env_ids) as (operations, gateway, failed):
@@ -183,20 +180,3 @@ def _keep(order: Order, index: Index, decision: Decision) -> None:
         if entry is not None:
             known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}
         index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, **known)
-
-
-@contextlib.contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Holds the sweep's folder; ConfigError when another command has it."""
-    root.mkdir(parents=True, exist_ok=True)
-    file = os.open(root / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"another `evopolicy suite` plays in {root}; choose another --runs to take part from here"
-            ) from None
-        yield
-    finally:
-        os.close(file)

@@ -28,6 +28,7 @@ from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import harnesses
+from evopolicy_gateway.alone import alone
 from evopolicy_gateway.control import AgentDoing
 from evopolicy_gateway.harnesses import session
 from evopolicy_gateway.layout import OpenedRun, RunFolder
@@ -203,7 +204,8 @@ class Sweep:
         self._view.started(run.name, decision.attempt)
         try:
             if decision.kind in ("restart", "new"):
-                await self._put_aside(folder, decision.attempt - 1)
+                with alone(folder.lock, folder.root):
+                    await self._put_aside(folder, decision.attempt - 1)
             record = await self._played(decision)
             if record.outcome.status == "cancelled" and await self._is_taken_over(run):
                 self._view.note(run.name, "another host has it now and has cancelled it here")

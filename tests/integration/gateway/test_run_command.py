@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from commands import agent, record_in, run_dir, run_on
+import pytest
+from commands import agent, command, record_in, run_arguments, run_dir, run_on
+from waiting import wait_until
 
 from evopolicy_common.summary import decode_summary
 
@@ -207,3 +209,52 @@ def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
     assert run_on(operator_file, tmp_path, stop_at_once, "--overwrite")[0] == 3
     assert (run_dir(tmp_path) / "run.json").read_bytes() != before
+
+
+@pytest.mark.parametrize("more", [["--overwrite"], ["--resume"], []])
+def test_a_run_that_is_played_is_nobody_elses_to_replace(
+    operator_file: Path, tmp_path: Path, more: list[str]
+) -> None:
+    code = "submit([0])\nopen('here', 'w')\nwhile not os.path.exists('go'): time.sleep(0.05)\nsubmit([1])\n"
+    arguments = run_arguments(operator_file, agent(tmp_path, code))
+    with command(tmp_path, *arguments) as first:
+        wait_until(lambda: [*tmp_path.glob("runs/*/toy_line/t/workspace/here")], lambda: first.text)
+        with command(tmp_path, *arguments, *more) as second:
+            exit_code, _, err = second.finish()
+        assert exit_code == 2, err
+        if more:
+            assert f"process {first.process.pid}" in err
+            assert len(err.splitlines()) == 1
+        workspace = run_dir(tmp_path) / "workspace"
+        (workspace / "go").touch()
+        assert first.wait() == 0, first.text
+    outcome = record_in(run_dir(tmp_path)).outcome
+    assert (outcome.status, outcome.budget_used) == ("completed", 2)
+    assert [path.name for path in run_dir(tmp_path).parent.iterdir()] == ["t"]
+
+
+def test_of_two_commands_that_overwrite_one_run_at_once_one_plays_it(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code = (
+        "submit([0])\nopen(f'played-{os.getpid()}', 'w')\nwhile not os.path.exists('go'): time.sleep(0.05)\n"
+    )
+    arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--overwrite"]
+    with command(tmp_path, *arguments) as one, command(tmp_path, *arguments) as two:
+        wait_until(lambda: one.process.poll() is not None or two.process.poll() is not None)
+        wait_until(lambda: [*tmp_path.glob("runs/*/toy_line/t/workspace/played-*")])
+        (run_dir(tmp_path) / "workspace/go").touch()
+        codes = sorted([one.wait(), two.wait()])
+        assert codes == [0, 2], one.text + two.text
+        assert "is in use" in one.text + two.text
+    assert record_in(run_dir(tmp_path)).outcome.status == "completed"
+    assert len([*(run_dir(tmp_path) / "workspace").glob("played-*")]) == 1
+
+
+def test_an_agent_that_fails_after_its_submits_has_an_exit_code_of_its_own(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, "submit([0])\nsys.exit(7)"))
+    assert code == 4
+    assert "agent failed" in out
+    assert record_in(run_dir(tmp_path)).outcome.status == "completed"
