@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import contextlib
-import multiprocessing
 import os
 import secrets
 import signal
@@ -20,7 +18,7 @@ from rich.table import Table
 
 from evopolicy_common import catalogue, credentials, host, keys, transport
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.scratch import scratch_folder
@@ -35,6 +33,9 @@ from evopolicy_worker.supervisor import Options, Supervisor
 
 app = typer.Typer(add_completion=False, no_args_is_help=False)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+DESCRIBE_TRIES = 5
+DESCRIBE_PAUSE_S = 0.5
 
 
 @app.callback(invoke_without_command=True)
@@ -140,11 +141,25 @@ def doctor(
     raise typer.Exit(0 if best else 1)
 
 
-def describe_all(env_ids: list[str]) -> tuple[EnvironmentDescription, ...]:
-    """Descriptions of environments, made in a process of its own: this one must stay free of simulators."""
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-        return tuple(pool.map(environments.describe, env_ids))
+async def describe_all(env_ids: list[str], tier: Tier, scratch: Path) -> tuple[EnvironmentDescription, ...]:
+    """Descriptions of environments, made in a slot of that tier: this process must stay free of simulators.
+
+    A slot whose processes are killed meanwhile is started again; the WorkerError of the last try, when all fail.
+    """
+    for tries_left in reversed(range(DESCRIBE_TRIES)):
+        slot = Slot(None, tier, scratch / "describing")
+        try:
+            await slot.start()
+            return await slot.describe(env_ids)
+        except WorkerError as error:
+            died = isinstance(error, SlotDiedError) or isinstance(error.__cause__, SlotDiedError)
+            if not tries_left or not died:
+                raise
+            log.warning("environments are not described yet; trying again", why=str(error))
+            await asyncio.sleep(DESCRIBE_PAUSE_S)
+        finally:
+            await slot.close()
+    raise AssertionError("unreachable")
 
 
 async def _run(
@@ -158,7 +173,7 @@ async def _run(
     grace_s: float,
 ) -> None:
     cores = Cores()
-    descriptions = await asyncio.to_thread(describe_all, env_ids)
+    descriptions = await describe_all(env_ids, tiers[0], scratch)
     options = Options(
         name=name,
         slots=slots or cores.count,

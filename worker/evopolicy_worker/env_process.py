@@ -1,7 +1,8 @@
 """The environment's process of a slot: `python -m evopolicy_worker.env_process`, started and told by `slot.Slot`.
 
 It owns seeds, rewards and trajectories, imports the simulators it plays and nothing of Zenoh, and ends with its parent.
-Commands come on standard input, answers go to what was standard output; whatever simulators print goes to standard
+It begins inside a jail (`sandbox.env_jail`), starts the policies' sandbox there, and seals itself before it imports a
+simulator: what comes later may be anyone's code. Commands come on standard input, answers go to what was standard output; whatever simulators print goes to standard
 error. The main thread plays; the monitor's thread hears commands meanwhile.
 """
 
@@ -15,12 +16,14 @@ import threading
 import time
 from pathlib import Path
 
-from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError
+from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_worker import environments
 from evopolicy_worker import slot_messages as messages
 from evopolicy_worker.child_pipes import take_pipes
 from evopolicy_worker.episodes import CancelledJobError, Player, Progress, fault_of
 from evopolicy_worker.monitor import Monitor
-from evopolicy_worker.sandbox import jail
+from evopolicy_worker.policy_process import BundleFiles
+from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import Zygote
 
 _PROGRESS_S = 0.25
@@ -66,7 +69,10 @@ class EnvProcess:
 
     def __init__(self, channel: Channel, commands: int) -> None:
         self._channel = channel
-        self._jobs: queue.SimpleQueue[messages.Play] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[messages.Play, Progress] | messages.Describe] = (
+            queue.SimpleQueue()
+        )
+        self._bundle: tuple[str, BundleFiles] | None = None
         self._progress: Progress | None = None
         self._told = (0.0, 0)
         self._monitor = Monitor(commands, self._hear, self._tell)
@@ -78,25 +84,31 @@ class EnvProcess:
         scratch = Path(start.scratch)
         # Without its parents: a worker that has gone meanwhile has taken them with it.
         scratch.mkdir(exist_ok=True)
-        plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed)
-        player = Player(Zygote(plan, scratch), plan, self._monitor, scratch)
+        env_jail.enclose(start.tier, scratch)
+        plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed, user=start.user)
+        with env_jail.expendable():
+            zygote = Zygote(plan, scratch)
+        env_jail.seal(start.tier, scratch, plan.user)
+        player = Player(zygote, plan, self._monitor, scratch)
         for command in early:
             self._take(command)
         self._monitor.start()
         player.prepare()
         self._channel.send(messages.Ready())
         while True:
-            command = self._jobs.get()
-            self._channel.send(self._play(player, command))
+            work = self._jobs.get()
+            if isinstance(work, messages.Describe):
+                self._channel.send(_described(work.environments))
+                continue
+            self._channel.send(self._play(player, *work))
             with contextlib.suppress(SandboxError):
                 player.prepare()
 
-    def _play(self, player: Player, command: messages.Play) -> messages.Answer:
-        progress = self._progress = Progress()
+    def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Answer:
         self._monitor.ticking = True
         self._monitor.wake()
         try:
-            player.play(command.job, command.bundle, progress, self._channel.send_frame)
+            player.play(command.job, self._files(command.bundle), progress, self._channel.send_frame)
             return messages.Played(cancelled=progress.cancelled)
         except CancelledJobError:
             return messages.Played(cancelled=True)
@@ -112,13 +124,26 @@ class EnvProcess:
             self._progress = None
             self._monitor.ticking = False
 
+    def _files(self, bundle: messages.Files | None) -> BundleFiles | None:
+        if bundle is None:
+            return None
+        if bundle.names is not None:
+            self._bundle = bundle.key, BundleFiles(bundle.names, bundle.data)
+        if self._bundle is None or self._bundle[0] != bundle.key:
+            raise WorkerError("a job came without its bundle's files")
+        return self._bundle[1]
+
     def _hear(self) -> None:
         for command in self._channel.receive():
             self._take(command)
 
     def _take(self, command: messages.Command) -> None:
-        if isinstance(command, messages.Play):
+        if isinstance(command, messages.Describe):
             self._jobs.put(command)
+        elif isinstance(command, messages.Play):
+            # From now on it can be cancelled, also before it is taken up.
+            self._progress = Progress()
+            self._jobs.put((command, self._progress))
         elif isinstance(command, messages.Cancel):
             progress = self._progress
             if progress is not None:
@@ -133,6 +158,13 @@ class EnvProcess:
         if progress.steps != steps and now - at >= _PROGRESS_S:
             self._told = now, progress.steps
             self._channel.send(messages.Told(episodes_done=progress.episodes_done, steps=progress.steps))
+
+
+def _described(env_ids: tuple[str, ...]) -> messages.Answer:
+    try:
+        return messages.Described(environments=tuple(environments.describe(env_id) for env_id in env_ids))
+    except Exception as error:
+        return messages.Fault(kind="worker", message=fault_of(error))
 
 
 def main() -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
-import os
 import sys
 import time
 from collections import OrderedDict
@@ -97,20 +96,22 @@ class Player:
         self._monitor = monitor
         self._scratch = scratch
         self._environments: OrderedDict[str, Environment] = OrderedDict()
-        self._bundle: tuple[str, BundleFiles] | None = None
         self._prepared: Child | None = None
         self._n_policies = 0
         self._folders: list[Path] = []
         self._videos = VideoRecorder()
 
-    def play(self, job: Job, folder: str | None, progress: Progress, tell: Callable[[bytes], None]) -> None:
-        """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`.
+    def play(
+        self, job: Job, files: BundleFiles | None, progress: Progress, tell: Callable[[bytes], None]
+    ) -> None:
+        """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`. `files`: its bundle.
 
         Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
         """
         environment = self._environment(job.env)
         job = msgspec.structs.replace(job, limits=_within_share(job))
-        files = self._read_bundle(folder) if job.bundle is not None else None
+        if job.bundle is not None and files is None:
+            raise WorkerError("a job with a bundle came without the bundle")
         policies = _Policies(self, job, files, environment)
         if not job.video:
             self._videos.close()
@@ -192,13 +193,6 @@ class Player:
             environment = self._environments[env_id] = environments.make(env_id)
         self._environments.move_to_end(env_id)
         return environment
-
-    def _read_bundle(self, folder: str | None) -> BundleFiles:
-        if folder is None:
-            raise WorkerError("a job with a bundle came without the bundle's folder")
-        if self._bundle is None or self._bundle[0] != folder:
-            self._bundle = folder, _read_files(folder)
-        return self._bundle[1]
 
 
 class _Policies:
@@ -477,25 +471,6 @@ def _blob(data: bytes) -> BlobRef:
     if len(data) > MAX_BLOB_BYTES:
         raise WorkerError(f"a recording of {len(data):,} bytes; {MAX_BLOB_BYTES:,} are the limit")
     return BlobRef(digest=digest_of(data), size=len(data), inline=data)
-
-
-def _read_files(folder: str) -> BundleFiles:
-    names: list[tuple[str, bool, int]] = []
-    data: list[bytes] = []
-    for root, folders, files in os.walk(folder):
-        folders.sort()
-        for name in sorted(files):
-            path = os.path.join(root, name)
-            try:
-                # Never through a link: an unpacked bundle has none.
-                with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
-                    content = file.read()
-                    executable = bool(os.fstat(file.fileno()).st_mode & 0o100)
-            except OSError as error:
-                raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
-            names.append((os.path.relpath(path, folder), executable, len(content)))
-            data.append(content)
-    return BundleFiles(names, b"".join(data))
 
 
 def fault_of(error: BaseException) -> str:

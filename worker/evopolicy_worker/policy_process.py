@@ -152,13 +152,6 @@ class PolicyProcess:
             "action_bytes": self._action_bytes,
         }
         self._write = frames.compile_writer(env_meta["obs_space"])
-        if self._child.host_pid:
-            # If the machine runs out of memory, the policy goes first.
-            with (
-                contextlib.suppress(OSError),
-                open(f"/proc/{self._child.host_pid}/oom_score_adj", "w") as file,
-            ):
-                file.write("1000")
         self._monitor.watch(self._watch)
         self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
         frame = [frames.REQUEST_HEADER.pack(0, frames.LOAD, 0)]

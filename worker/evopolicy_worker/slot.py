@@ -11,18 +11,18 @@ import asyncio
 import contextlib
 import os
 import signal
-import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import structlog
 
 from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 from evopolicy_common.scratch import remove_tree
-from evopolicy_worker import environments
 from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.sandbox import env_jail, jail
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -34,7 +34,7 @@ MAX_ANSWER_BYTES = 1 << 31
 
 
 class Slot:
-    """An environment process and, inside a sandbox, the policies that it plays. Used by one asyncio loop."""
+    """An environment process in a jail of its own and, inside a sandbox, the policies that it plays. Used by one asyncio loop."""
 
     def __init__(
         self,
@@ -50,9 +50,17 @@ class Slot:
         `scratch` is a folder of the slot's own. `sealed=False` (tests only) leaves the policy's process unsealed.
         """
         self._start = messages.Start(
-            tier=tier, core=core, scratch=str(scratch), allowed_packages=allowed_packages, sealed=sealed
+            tier=tier,
+            core=core,
+            scratch=str(scratch),
+            allowed_packages=allowed_packages,
+            user=jail.some_user() if tier == "bwrap" and os.geteuid() == 0 else None,
+            sealed=sealed,
         )
         self._scratch = scratch
+        self._draws = False
+        self._cancelled = False
+        self._sent = ""
         self._process: asyncio.subprocess.Process | None = None
         self._said: deque[str] = deque(maxlen=40)
         self._listener: asyncio.Task[None] | None = None
@@ -66,14 +74,13 @@ class Slot:
         """
         await self.close()
         self._scratch.mkdir(parents=True, exist_ok=True)
+        self._sent = ""
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "evopolicy_worker.env_process",
+            *env_jail.command(self._start.tier, self._scratch, draws=self._draws),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
-            env={**os.environ, **environments.process_environment()},
+            env=env_jail.variables(self._scratch),
             start_new_session=True,
             limit=1 << 20,
         )
@@ -106,9 +113,17 @@ class Slot:
         if job.tier != self._start.tier:
             raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
         self._idle.clear()
+        self._cancelled = False
         outcomes: list[EpisodeOutcome] = []
         try:
-            await self._send(messages.Play(job=job, bundle=None if bundle is None else str(bundle)))
+            if job.video and not self._draws and env_jail.graphics_devices():
+                self._draws = True
+                await self.start()
+            files = None if bundle is None else await asyncio.to_thread(_files, bundle, self._sent)
+            if self._cancelled:
+                return ()
+            await self._send(messages.Play(job=job, bundle=files))
+            self._sent = files.key if files is not None else self._sent
             while True:
                 answer = await self._answer()
                 if isinstance(answer, messages.Told):
@@ -126,11 +141,22 @@ class Slot:
         finally:
             self._idle.set()
 
+    async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
+        """What these environments are: their simulators are imported in the slot's process. Raises as `play`."""
+        if self._process is None:
+            raise WorkerError("the slot is not started")
+        await self._send(messages.Describe(environments=tuple(env_ids)))
+        answer = await self._answer()
+        if isinstance(answer, messages.Described):
+            return answer.environments
+        raise _error(answer)
+
     async def cancel(self) -> None:
         """Stop the running job at once; its `play` returns and the slot can be used again. Nothing runs: no effect."""
         if self._idle.is_set():
             return
         process = self._process
+        self._cancelled = True
         with contextlib.suppress(SlotDiedError):
             await self._send(messages.Cancel())
         try:
@@ -146,6 +172,11 @@ class Slot:
         if process is not None:
             _kill(process)
             await process.wait()
+            # Open as long as anyone in the jail lives, whom the kernel ends after the jail's first process.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LAST_WORDS_S):
+                    while process.stdout is not None and await process.stdout.read(1 << 20):
+                        pass
         if self._listener is not None:
             self._listener.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -207,6 +238,29 @@ class Slot:
                 log.warning("slot notes", text=text.removeprefix(messages.NOTE))
             else:
                 log.debug("slot says", text=text)
+
+
+def _files(folder: Path, sent: str) -> messages.Files:
+    """The unpacked bundle in `folder`; without its contents when it is the one that was sent last."""
+    key = str(folder)
+    names: list[tuple[str, bool, int]] = []
+    data: list[bytes] = []
+    if key == sent:
+        return messages.Files(key=key, names=None, data=b"")
+    for root, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            path = os.path.join(root, name)
+            try:
+                # Never through a link: an unpacked bundle has none.
+                with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+                    content = file.read()
+                    executable = bool(os.fstat(file.fileno()).st_mode & 0o100)
+            except OSError as error:
+                raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
+            names.append((os.path.relpath(path, folder), executable, len(content)))
+            data.append(content)
+    return messages.Files(key=key, names=names, data=b"".join(data))
 
 
 def _error(answer: messages.Answer) -> WorkerError | SandboxError:

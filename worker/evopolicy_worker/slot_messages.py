@@ -6,6 +6,7 @@ import struct
 
 import msgspec
 
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 
 LENGTH = struct.Struct("<I")
@@ -24,14 +25,32 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
     core: int | None
     scratch: str
     allowed_packages: tuple[str, ...]
+    user: int | None
+    """As root: who policies, and the process once it is sealed, are outside the jail."""
     sealed: bool = True
+
+
+class Files(msgspec.Struct, frozen=True, kw_only=True):
+    """A bundle, which the process has no file of."""
+
+    key: str
+    names: list[tuple[str, bool, int]] | None
+    """Path, executable, size in bytes of each; None: the process was sent this bundle last."""
+    data: bytes
+    """Their contents, one after another."""
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
     """Play this job; answered by Told, again and again, Finished for each episode, then by Played or Fault."""
 
     job: Job
-    bundle: str | None
+    bundle: Files | None
+
+
+class Describe(Message, frozen=True, kw_only=True, tag="describe"):
+    """Say what these environments are; answered by Described or Fault."""
+
+    environments: tuple[str, ...]
 
 
 class Cancel(Message, frozen=True, kw_only=True, tag="cancel"):
@@ -61,6 +80,12 @@ class Played(Message, frozen=True, kw_only=True, tag="played"):
     cancelled: bool = False
 
 
+class Described(Message, frozen=True, kw_only=True, tag="described"):
+    """The environments that were asked for, in their order."""
+
+    environments: tuple[EnvironmentDescription, ...]
+
+
 class Fault(Message, frozen=True, kw_only=True, tag="fault"):
     """Our own failure, never the policy's."""
 
@@ -69,8 +94,8 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
     message: str
 
 
-Command = Start | Play | Cancel
-Answer = Ready | Told | Finished | Played | Fault
+Command = Start | Play | Describe | Cancel
+Answer = Ready | Told | Finished | Played | Described | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)

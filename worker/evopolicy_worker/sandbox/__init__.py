@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import tempfile
+import select
+import subprocess
 from functools import cache
 from pathlib import Path
 
+import msgspec
+
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
-from evopolicy_worker.sandbox import jail
-from evopolicy_worker.sandbox.zygote import Zygote
+from evopolicy_common.scratch import scratch_folder
+from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.sandbox import env_jail, jail
+from evopolicy_worker.sandbox.zygote import START_TIMEOUT_S
 
 
 def available_tiers(
@@ -25,12 +30,50 @@ def available_tiers(
 
 @cache
 def why_not(tier: Tier, allowed_packages: tuple[str, ...] = ("numpy",)) -> str | None:
-    """Why this tier does not work here, with what to do; None when it works. Starts a sandbox to see."""
-    with tempfile.TemporaryDirectory(prefix="evopolicy-tier-") as folder:
-        scratch = Path(folder)
+    """Why this tier does not work here, with what to do; None when it works.
+
+    Starts an environment process in its jail, and the policies' sandbox in that. Call it on the main thread.
+    """
+    with scratch_folder("tier") as folder:
+        # A folder of its own kind, as a slot's: the other one is locked by us.
+        scratch = folder / "slot"
+        scratch.mkdir()
         try:
-            zygote = Zygote(jail.plan(tier, scratch, allowed_packages), scratch)
+            user = jail.plan(tier, scratch, allowed_packages).user
+            return _why_not_started(tier, scratch, allowed_packages, user)
         except (SandboxError, OSError) as error:
             return str(error)
-        zygote.close()
-        return None
+
+
+def _why_not_started(
+    tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], user: int | None
+) -> str | None:
+    start = messages.Start(
+        tier=tier, core=None, scratch=str(scratch), allowed_packages=allowed_packages, user=user
+    )
+    process = subprocess.Popen(
+        env_jail.command(tier, scratch),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=env_jail.variables(scratch),
+        start_new_session=True,
+    )
+    try:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(messages.framed(start))
+        process.stdin.flush()
+        if not select.select([process.stdout], [], [], 2 * START_TIMEOUT_S)[0]:
+            return f"a slot did not start within {2 * START_TIMEOUT_S:g} s"
+        head = process.stdout.read(messages.LENGTH.size)
+        if len(head) == messages.LENGTH.size:
+            answer = messages.answers.decode(process.stdout.read(messages.LENGTH.unpack(head)[0]))
+            return answer.message if isinstance(answer, messages.Fault) else None
+    except (BrokenPipeError, msgspec.DecodeError):
+        pass
+    finally:
+        process.kill()
+        _, said = process.communicate()
+    words = said.decode("utf-8", "replace").strip()[-2000:]
+    return f"the environment process does not start: {words or 'no stderr output'}"

@@ -31,6 +31,10 @@ _NAMESPACES = {
 }
 _CLONE_NEWUSER = 0x10000000
 _PATIENCE_S = 10.0
+_UNMASK = (
+    "a slot mounts a /proc of its own, which the kernel refuses while parts of this one are covered; in a container:"
+    " --security-opt systempaths=unconfined"
+)
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
@@ -213,7 +217,8 @@ def _tiers(allowed_packages: tuple[str, ...]) -> list[Check]:
         if why is None:
             rows.append(Check(name=f"tier {tier}", verdict="ok", found="a sandbox started"))
         else:
-            rows.append(Check(name=f"tier {tier}", verdict="missing", found=why, advice="see the rows above"))
+            advice = _UNMASK if "proc" in why and "mount" in why else "see the rows above"
+            rows.append(Check(name=f"tier {tier}", verdict="missing", found=why, advice=advice))
     return [
         *rows,
         Check(name="tier none", verdict="note", found="no sandbox; used only by runs that ask for it"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from pathlib import Path
 
@@ -53,10 +54,17 @@ class Jail(msgspec.Struct, frozen=True, kw_only=True):
     """Where a policy's files are; None when each policy gets a folder in the slot's scratch."""
 
 
-def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed: bool = True) -> Jail:
+def plan(
+    tier: Tier,
+    scratch: Path,
+    allowed_packages: tuple[str, ...],
+    *,
+    sealed: bool = True,
+    user: int | None = None,
+) -> Jail:
     """The jail of that tier. SandboxError, with what to do, when this machine cannot build it.
 
-    `sealed=False` leaves off what a policy's process does to itself (limits, Landlock, the filter), for tests that
+    `user`: as root, who the sandbox's user is outside; None picks one (`some_user`). `sealed=False` leaves off what a policy's process does to itself (limits, Landlock, the filter), for tests that
     show what these defend against.
     """
     files = python_files.find(allowed_packages)
@@ -84,7 +92,7 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
         return Jail(
             command=(*_bubblewrap(files, as_root), *_python(files, "/sandbox")),
             config=config,
-            user=_FIRST_UID + os.getpid() % 0x10000 if as_root else None,
+            user=(some_user() if user is None else user) if as_root else None,
             home=POLICY_HOME,
         )
     config["packages"] = str(_package_links(files, scratch))
@@ -96,6 +104,19 @@ def plan(tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], *, sealed
         places = [*files.read, *files.packages.values(), str(config["packages"]), str(INSIDE)]
         config["landlock"] = {"read": places, "write": list(_DEVICES)}
     return Jail(command=_python(files, str(INSIDE)), config=config, user=None, home=None)
+
+
+def some_user() -> int:
+    """A user that no machine gives to anyone, most likely another one each time."""
+    return _FIRST_UID + secrets.randbelow(0x10000)
+
+
+def bubblewrap() -> str:
+    """Where it is. SandboxError, with how to install it, when it is not."""
+    found = shutil.which("bwrap")
+    if found is None:
+        raise SandboxError(f"bubblewrap is not installed: {INSTALL_BWRAP}")
+    return found
 
 
 def landlock_version() -> int:
@@ -112,10 +133,7 @@ def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
 
 
 def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
-    bwrap = shutil.which("bwrap")
-    if bwrap is None:
-        raise SandboxError(f"bubblewrap is not installed: {INSTALL_BWRAP}")
-    command = [bwrap, "--die-with-parent", "--new-session", "--hostname", "policy"]
+    command = [bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "policy"]
     command += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
     if as_root:
         # The zygote makes the user namespace itself, so that the policy's user is nobody outside either.
@@ -125,8 +143,7 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     command.append("--clearenv")
     for name, value in ENVIRONMENT.items():
         command += ["--setenv", name, value]
-    # Parents that bubblewrap makes by itself are closed to other users, which the policy's user is.
-    for path in sorted(_parents([*files.read, *map(os.path.realpath, files.read), "/dev/null", POLICY_HOME])):
+    for path in parents([*files.read, *map(os.path.realpath, files.read), "/dev/null", POLICY_HOME]):
         command += ["--perms", "0755", "--dir", path]
     for path in files.read:
         target = os.path.realpath(path)
@@ -146,8 +163,9 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     return [*command, "--dir", POLICY_HOME, "--dir", "/tmp", "--chdir", "/", "--remount-ro", "/"]
 
 
-def _parents(paths: list[str]) -> set[str]:
-    return {str(parent) for path in paths for parent in Path(path).parents} - {"/"}
+def parents(paths: list[str]) -> list[str]:
+    """The folders above these: those that bubblewrap makes by itself are closed to other users than its own."""
+    return sorted({str(parent) for path in paths for parent in Path(path).parents} - {"/"})
 
 
 def _package_links(files: python_files.PythonFiles, scratch: Path) -> Path:

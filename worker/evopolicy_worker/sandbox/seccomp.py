@@ -1,6 +1,6 @@
-"""The system calls that a policy may make, as a seccomp filter assembled by hand.
+"""The system calls that a policy may make, and those that an environment process may not: seccomp filters by hand.
 
-Rules that this module owns:
+Rules of the policy's filter, which this module owns:
 - What is not listed is refused (EPERM; ENOSYS for numbers younger than the lists, so that a C library falls back).
 - No process is ever made: `fork` and the like answer EAGAIN, as at a process limit. Threads are allowed.
 - No sockets, no signals to anyone else, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
@@ -19,7 +19,7 @@ import platform
 import struct
 
 from evopolicy_common.errors import SandboxError
-from evopolicy_worker.sandbox.syscall_numbers import NUMBERS
+from evopolicy_worker.sandbox.syscall_numbers import NUMBERS, REACHING_OUT, REFUSED, SOCKET
 
 PID_MARK = 0x7FFFABCD
 """Stands in the filter for the pid of the process that installs it; instructions are 8 bytes, this is their last word."""
@@ -90,20 +90,8 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
     older kernels cut a file off. Those calls are then refused, modes and times without a word, as `shutil.copy` sets them.
     Raises SandboxError on a processor that the lists do not cover.
     """
-    machine = platform.machine()
-    if machine not in NUMBERS:
-        raise SandboxError(
-            f"no seccomp filter for {machine}; the sandbox runs on {' and '.join(NUMBERS)} (or ask for tier none)"
-        )
+    machine = _machine()
     numbers = NUMBERS[machine]
-    program: list[Instruction] = [
-        (_LOAD, 0, 0, _ARCHITECTURE),
-        (_JUMP_EQUAL, 1, 0, _AUDIT_ARCH[machine]),
-        (_RETURN, 0, 0, _KILL_PROCESS),
-        (_LOAD, 0, 0, _NUMBER),
-    ]
-    if machine == "x86_64":
-        program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
     blocks = {
         # Its caller looks at the word again, as after any other wake, and again: the C library's join of a thread asks
         # so, and computes while it waits.
@@ -149,7 +137,62 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         blocks |= {"truncate": [_refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
         # Its flags lie in memory.
         blocks["openat2"] = [_refuse(errno.ENOSYS)]
-    program += _search(_intervals(numbers, blocks))
+    return _assembled(machine, _intervals(numbers, blocks))
+
+
+def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
+    """The program for an environment process, which lists what is refused: simulators start processes and open devices.
+
+    `namespaces`: those that it is in keep other processes and the network from it; else sockets are refused, and other
+    processes' limits. `signals`: it may send some, as they reach nobody outside. Raises SandboxError on a processor that
+    the lists do not cover.
+    """
+    machine = _machine()
+    blocks = {number: [_refuse(errno.EPERM)] for number in REFUSED[machine].values()}
+    numbers = NUMBERS[machine]
+    if not namespaces:
+        blocks[SOCKET[machine]] = [_refuse(errno.EACCES)]
+        blocks[numbers["prlimit64"]] = _one_of(0, (0, PID_MARK), errno.EPERM)
+    if not signals:
+        blocks |= {number: [_refuse(errno.EPERM)] for number in REACHING_OUT[machine].values()}
+        blocks[numbers["tgkill"]] = _one_of(0, (PID_MARK,), errno.EPERM)
+    blocks[numbers["clone"]] = [
+        (_LOAD, 0, 0, _argument(0)),
+        (_AND, 0, 0, _CLONE_NAMESPACES),
+        (_JUMP_EQUAL, 0, 1, 0),
+        _ALLOWED,
+        _refuse(errno.EPERM),
+    ]
+    # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
+    blocks[numbers["clone3"]] = [_refuse(errno.ENOSYS)]
+    intervals: list[Interval] = []
+    for number in range(max(blocks) + 2):
+        code = blocks.get(number, [_ALLOWED])
+        if not intervals or intervals[-1][1] != code:
+            intervals.append((number, code))
+    return _assembled(machine, intervals)
+
+
+def _machine() -> str:
+    machine = platform.machine()
+    if machine not in NUMBERS:
+        raise SandboxError(
+            f"no seccomp filter for {machine}; the sandbox runs on {' and '.join(NUMBERS)} (or ask for tier none)"
+        )
+    return machine
+
+
+def _assembled(machine: str, intervals: list[Interval]) -> bytes:
+    """The whole program: another architecture's calls end the process, the others are looked up."""
+    program: list[Instruction] = [
+        (_LOAD, 0, 0, _ARCHITECTURE),
+        (_JUMP_EQUAL, 1, 0, _AUDIT_ARCH[machine]),
+        (_RETURN, 0, 0, _KILL_PROCESS),
+        (_LOAD, 0, 0, _NUMBER),
+    ]
+    if machine == "x86_64":
+        program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
+    program += _search(intervals)
     return b"".join(struct.pack("<HBBI", *instruction) for instruction in program)
 
 

@@ -1,4 +1,4 @@
-"""Numbers of the system calls that the policy's filter names, by processor (from the kernel's unistd headers)."""
+"""Numbers of the system calls that the filters name, by processor (from the kernel's unistd headers)."""
 
 from __future__ import annotations
 
@@ -54,3 +54,36 @@ def _parsed(table: str) -> dict[str, int]:
 
 
 NUMBERS: dict[str, dict[str, int]] = {"x86_64": _parsed(_X86_64), "aarch64": _parsed(_AARCH64)}
+
+_X86_64_REFUSED = """
+unshare=272 setns=308 mount=165 umount2=166 pivot_root=155 chroot=161 open_tree=428 move_mount=429 fsopen=430
+fsconfig=431 fsmount=432 fspick=433 mount_setattr=442 keyctl=250 add_key=248 request_key=249 ptrace=101
+process_vm_readv=310 process_vm_writev=311 pidfd_getfd=438 kcmp=312 bpf=321 perf_event_open=298 userfaultfd=323
+io_uring_setup=425 io_uring_enter=426 io_uring_register=427 kexec_load=246 kexec_file_load=320 init_module=175
+finit_module=313 delete_module=176 reboot=169 swapon=167 swapoff=168 acct=163 quotactl=179 quotactl_fd=443
+syslog=103 settimeofday=164 clock_settime=227 adjtimex=159 clock_adjtime=305 sethostname=170 setdomainname=171
+open_by_handle_at=304 name_to_handle_at=303 fanotify_init=300 migrate_pages=256 move_pages=279
+"""
+
+_AARCH64_REFUSED = """
+unshare=97 setns=268 mount=40 umount2=39 pivot_root=41 chroot=51 open_tree=428 move_mount=429 fsopen=430
+fsconfig=431 fsmount=432 fspick=433 mount_setattr=442 keyctl=219 add_key=217 request_key=218 ptrace=117
+process_vm_readv=270 process_vm_writev=271 pidfd_getfd=438 kcmp=272 bpf=280 perf_event_open=241 userfaultfd=282
+io_uring_setup=425 io_uring_enter=426 io_uring_register=427 kexec_load=104 kexec_file_load=294 init_module=105
+finit_module=273 delete_module=106 reboot=142 swapon=224 swapoff=225 acct=89 quotactl=60 quotactl_fd=443
+syslog=116 settimeofday=170 clock_settime=112 adjtimex=171 clock_adjtime=266 sethostname=161 setdomainname=162
+open_by_handle_at=265 name_to_handle_at=264 fanotify_init=262 migrate_pages=238 move_pages=239
+"""
+
+REFUSED: dict[str, dict[str, int]] = {
+    "x86_64": _parsed(_X86_64_REFUSED),
+    "aarch64": _parsed(_AARCH64_REFUSED),
+}
+"""What no environment process needs and namespaces do not divide, or what makes namespaces."""
+REACHING_OUT: dict[str, dict[str, int]] = {
+    "x86_64": _parsed("kill=62 tkill=200 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 pidfd_open=434"),
+    "aarch64": _parsed("kill=129 tkill=130 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 pidfd_open=434"),
+}
+"""What reaches other processes of the same user."""
+SOCKET = {"x86_64": 41, "aarch64": 198}
+SECCOMP = {"x86_64": 317, "aarch64": 277}

@@ -1,0 +1,259 @@
+"""The jail of a slot's environment process: what simulators, which are other people's code, can see and do.
+
+Rules:
+- No credentials, no network, no variable beside those listed here. Installed code is read-only; the slot's scratch folder
+  is all that can be written to. Only the supervisor has a session with the coordinator.
+- Tier bwrap: namespaces of its own, so that the machine's processes, sockets and files are not there at all. Tier landlock:
+  Landlock and a filter of system calls in their place. Tier none: the listed variables, and nothing else that holds.
+- The process starts the policies' sandbox inside its jail, then seals itself, and only then imports a simulator. Policies
+  stay below it: it must be able to end them, and a process cannot signal into a namespace beside its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import platform
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import evopolicy_common
+import evopolicy_worker
+from evopolicy_common.errors import SandboxError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_worker.environments import process_environment
+from evopolicy_worker.sandbox import jail, seccomp
+from evopolicy_worker.sandbox.inside import zygote as inside
+from evopolicy_worker.sandbox.syscall_numbers import SECCOMP
+
+_SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64")
+_ETC = ("ld.so.cache", "alternatives", "fonts", "glvnd", "drirc", "localtime", "nvidia", "vulkan", "OpenCL")
+_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+_GRAPHICS = ("/dev/dri", "/dev/nvidia*", "/sys/dev/char", "/sys/devices", "/sys/bus/pci")
+"""What a driver needs to draw with a graphics card; without one Mesa draws on the CPU, and needs none of it."""
+_SCOPES_SIGNALS = 6
+"""Landlock's ABI version from which on it keeps signals from processes outside."""
+_SET_MODE_FILTER, _ALL_THREADS, _SPECULATION = 1, 1, 4
+_CHECK_S = 20.0
+
+_PASSED_ON = ("LD_LIBRARY_PATH", "LANG", "LANGUAGE")
+_PASSED_ON_PREFIXES = (
+    "EGL_",
+    "GALLIUM_",
+    "LIBGL_",
+    "LP_",
+    "MESA_",
+    "MUJOCO_",
+    "PYOPENGL_",
+    "__EGL_",
+    "__GLX_",
+)
+_PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH")
+"""Variables whose folders the jail shows."""
+_LATER_PATH = "EVOPOLICY_SIMULATORS_PATH"
+"""The operator's PYTHONPATH on its way into the jail: what is there may come before a standard module of that name."""
+
+
+def variables(scratch: Path) -> dict[str, str]:
+    """The whole environment of the process."""
+    passed_on = {
+        name: value
+        for name, value in os.environ.items()
+        if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
+    }
+    path = os.environ.get("PYTHONPATH", "")
+    ours = [entry for entry in path.split(os.pathsep) if os.path.realpath(entry) in _our_folders()]
+    own = {
+        **({"PYTHONPATH": os.pathsep.join(ours)} if ours else {}),
+        _LATER_PATH: path,
+        "PATH": "/usr/bin:/bin",
+        "HOME": f"{scratch}/home",
+        "TMPDIR": f"{scratch}/tmp",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    return {**passed_on, **own, **process_environment()}
+
+
+def command(tier: Tier, scratch: Path, *, draws: bool = False, shown: Sequence[Path] = ()) -> tuple[str, ...]:
+    """The arguments that start an environment process of that tier.
+
+    `draws`: with the graphics devices of this machine. `shown`: further folders of code, which stay read-only.
+    SandboxError when bubblewrap is not installed.
+    """
+    python = (sys.executable, "-P", "-m", "evopolicy_worker.env_process")
+    return (*_bubblewrap(scratch, draws, shown), *python) if tier == "bwrap" else python
+
+
+def graphics_devices() -> tuple[str, ...]:
+    """What this machine has to draw with; empty where Mesa draws on the CPU."""
+    if not any(Path("/").glob(pattern.lstrip("/")) for pattern in _GRAPHICS[:2]):
+        return ()
+    return tuple(str(path) for pattern in _GRAPHICS for path in sorted(Path("/").glob(pattern.lstrip("/"))))
+
+
+# In the process itself, before anything of a simulator's is imported.
+
+
+def enclose(tier: Tier, scratch: Path) -> None:
+    """The first half of the seal, before the policies' sandbox is started: tier landlock sees few files from here on.
+
+    SandboxError when it cannot be done.
+    """
+    for name in ("home", "tmp"):
+        (scratch / name).mkdir(exist_ok=True)
+    os.chdir(scratch / "home")
+    if tier == "landlock":
+        shown = [
+            *_code(),
+            *_etc(),
+            *_SYSTEM,
+            "/proc",
+            *(path for path in graphics_devices() if path[:4] == "/sys"),
+        ]
+        devices = [path for path in graphics_devices() if path[:4] == "/dev"]
+        with _told("be closed in by Landlock"):
+            inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
+            inside.landlock({"read": shown, "write": [*_DEVICES, *devices]}, str(scratch))
+
+
+def seal(tier: Tier, scratch: Path, user: int | None) -> None:
+    """The second half, once the policies' sandbox runs: no capability, no namespace, few system calls. Only from here on
+    modules are found in the folders of the operator's PYTHONPATH.
+
+    `user` (as root, tier bwrap): whom it goes on as; the policies' user, whose processes it may end so.
+    SandboxError when it cannot be done.
+    """
+    if tier != "none":
+        _seal(tier, scratch, user)
+    path = os.environ["PYTHONPATH"] = os.environ.get(_LATER_PATH, "")
+    sys.path[:0] = [entry for entry in path.split(os.pathsep) if entry]
+
+
+def _seal(tier: Tier, scratch: Path, user: int | None) -> None:
+    with _told("seal itself"):
+        if user is not None:
+            groups = sorted({os.stat(path).st_gid for path in graphics_devices()})
+            for path in (scratch, *scratch.iterdir()):
+                os.chown(path, user, user)
+            os.setgroups(groups)
+            os.setresgid(user, user, user)
+            os.setresuid(user, user, user)
+            # Changing the user closed /proc/self to this process.
+            inside.check(inside.libc.prctl(4, 1, 0, 0, 0), "dumpable")
+        inside.drop_capabilities()
+        inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
+        namespaces = tier == "bwrap"
+        signals = namespaces or jail.landlock_version() >= _SCOPES_SIGNALS
+        _install(seccomp.environment_filter(namespaces=namespaces, signals=signals))
+
+
+@contextlib.contextmanager
+def expendable() -> Iterator[None]:
+    """What is started inside goes first when the machine runs out of memory."""
+    path = Path("/proc/self/oom_score_adj")
+    before = path.read_text()
+    with contextlib.suppress(OSError):
+        path.write_text("1000")
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.write_text(before)
+
+
+def _install(program: bytes) -> None:
+    """For all threads; without slowing down code that speculates, as older kernels do for filtered processes."""
+    program = program.replace(struct.pack("<I", seccomp.PID_MARK), struct.pack("<I", os.getpid()))
+    buffer = ctypes.create_string_buffer(program, len(program))
+    arguments = struct.pack("<HxxxxxxQ", len(program) // 8, ctypes.addressof(buffer))
+    number = SECCOMP[platform.machine()]
+    inside.check(
+        inside.libc.syscall(number, _SET_MODE_FILTER, _ALL_THREADS | _SPECULATION, arguments), "seccomp"
+    )
+
+
+@contextlib.contextmanager
+def _told(what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SandboxError(f"the environment process cannot {what}: {error}") from error
+
+
+# What it is shown.
+
+
+def _bubblewrap(scratch: Path, draws: bool, shown: Sequence[Path]) -> list[str]:
+    arguments = [jail.bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "slot"]
+    arguments += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
+    if os.geteuid() == 0:
+        # For the policies' sandbox, which it starts; it gives them up with its user.
+        arguments += ["--cap-add", "ALL"]
+    else:
+        arguments += ["--unshare-user", "--uid", "65534", "--gid", "65534"]
+    for path in _SYSTEM:
+        if os.path.islink(path):
+            arguments += ["--symlink", os.readlink(path), path]
+        elif os.path.isdir(path):
+            arguments += ["--ro-bind", path, path]
+    arguments += ["--proc", "/proc"]
+    for path in ("/tmp", "/dev/shm"):
+        arguments += ["--perms", "1777", "--tmpfs", path]
+    for path in _DEVICES:
+        if os.path.exists(path):
+            arguments += ["--dev-bind", path, path]
+    read = (*_etc(), *_code(), *map(str, shown))
+    drawn_with = graphics_devices() if draws else ()
+    for path in jail.parents([*read, *drawn_with, *_DEVICES, str(scratch)]):
+        arguments += ["--perms", "0755", "--dir", path]
+    for path in read:
+        arguments += ["--ro-bind", path, path]
+    for path in drawn_with:
+        arguments += ["--dev-bind" if path.startswith("/dev/") else "--ro-bind", path, path]
+    return [*arguments, "--bind", str(scratch), str(scratch), "--remount-ro", "/", "--chdir", str(scratch)]
+
+
+def _etc() -> list[str]:
+    return [path for name in _ETC if os.path.exists(path := f"/etc/{name}")]
+
+
+def _code() -> list[str]:
+    """Python, what is installed for it, and what the operator's path variables name; a folder in another is left out."""
+    named = [entry for name in _PATHS for entry in os.environ.get(name, "").split(os.pathsep) if entry]
+    wanted = [sys.prefix, sys.exec_prefix, sys.base_prefix, *_python_path(), *_our_folders(), *named]
+    home = os.path.realpath(os.path.expanduser("~"))
+    found: list[str] = []
+    both = {*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}
+    for path in sorted(both):
+        holds_home = home == path or home.startswith(path.rstrip("/") + "/")
+        if (
+            os.path.exists(path)
+            and not holds_home
+            and not any(_below(path, other) for other in ("/usr", *found))
+        ):
+            found.append(path)
+    return found
+
+
+def _our_folders() -> list[str]:
+    packages = (evopolicy_common, evopolicy_worker)
+    return [os.path.realpath(os.path.dirname(package.__path__[0])) for package in packages]
+
+
+def _below(path: str, folder: str) -> bool:
+    return path == folder or path.startswith(folder + "/")
+
+
+@cache
+def _python_path() -> tuple[str, ...]:
+    """Where a fresh interpreter looks for modules: what .pth files add is known to nobody else."""
+    asked = "import sys; print('\\0'.join(sys.path), end='')"
+    said = subprocess.run(
+        [sys.executable, "-P", "-c", asked], capture_output=True, text=True, check=True, timeout=_CHECK_S
+    )
+    return tuple(filter(None, said.stdout.split("\0")))
