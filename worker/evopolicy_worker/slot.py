@@ -119,7 +119,7 @@ class Slot:
             if job.video and not self._draws and env_jail.graphics_devices():
                 self._draws = True
                 await self.start()
-            files = None if bundle is None else await asyncio.to_thread(_files, bundle, self._sent)
+            files = None if bundle is None else await asyncio.to_thread(bundle_files, bundle, self._sent)
             if self._cancelled:
                 return ()
             await self._send(messages.Play(job=job, bundle=files))
@@ -240,7 +240,7 @@ class Slot:
                 log.debug("slot says", text=text)
 
 
-def _files(folder: Path, sent: str) -> messages.Files:
+def bundle_files(folder: Path, sent: str = "") -> messages.Files:
     """The unpacked bundle in `folder`; without its contents when it is the one that was sent last."""
     key = str(folder)
     names: list[tuple[str, bool, int]] = []

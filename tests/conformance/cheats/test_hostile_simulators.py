@@ -158,7 +158,7 @@ def test_what_a_simulator_prints_or_sends_out_of_turn_ends_its_slot_alone(
     async def play() -> None:
         slot: Slot = slots.new(tier)
         await slot.start()
-        with pytest.raises(WorkerError, match="no message"):
+        with pytest.raises(WorkerError, match="cannot be read"):
             await asyncio.wait_for(
                 slot.play(make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None), 60
             )

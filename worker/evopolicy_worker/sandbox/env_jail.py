@@ -53,10 +53,10 @@ _PASSED_ON_PREFIXES = (
     "__EGL_",
     "__GLX_",
 )
-_PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH")
-"""Variables whose folders the jail shows."""
 _LATER_PATH = "EVOPOLICY_SIMULATORS_PATH"
 """The operator's PYTHONPATH on its way into the jail: what is there may come before a standard module of that name."""
+_PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH", _LATER_PATH)
+"""Variables whose folders the jail shows."""
 
 
 def variables(scratch: Path) -> dict[str, str]:
@@ -66,11 +66,11 @@ def variables(scratch: Path) -> dict[str, str]:
         for name, value in os.environ.items()
         if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
     }
-    path = os.environ.get("PYTHONPATH", "")
-    ours = [entry for entry in path.split(os.pathsep) if os.path.realpath(entry) in _our_folders()]
+    path = [entry for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
+    ours = [entry for entry in path if os.path.realpath(entry) in _our_folders()]
     own = {
         **({"PYTHONPATH": os.pathsep.join(ours)} if ours else {}),
-        _LATER_PATH: path,
+        _LATER_PATH: os.pathsep.join(entry for entry in path if not _holds_home(os.path.realpath(entry))),
         "PATH": "/usr/bin:/bin",
         "HOME": f"{scratch}/home",
         "TMPDIR": f"{scratch}/tmp",
@@ -225,19 +225,17 @@ def _etc() -> list[str]:
 def _code() -> list[str]:
     """Python, what is installed for it, and what the operator's path variables name; a folder in another is left out."""
     named = [entry for name in _PATHS for entry in os.environ.get(name, "").split(os.pathsep) if entry]
-    wanted = [sys.prefix, sys.exec_prefix, sys.base_prefix, *_python_path(), *_our_folders(), *named]
-    home = os.path.realpath(os.path.expanduser("~"))
+    listed = [path for path in (*_python_path(), *named) if not _holds_home(os.path.realpath(path))]
+    wanted = [sys.prefix, sys.exec_prefix, sys.base_prefix, *_our_folders(), *listed]
     found: list[str] = []
-    both = {*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}
-    for path in sorted(both):
-        holds_home = home == path or home.startswith(path.rstrip("/") + "/")
-        if (
-            os.path.exists(path)
-            and not holds_home
-            and not any(_below(path, other) for other in ("/usr", *found))
-        ):
+    for path in sorted({*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}):
+        if os.path.exists(path) and not any(_below(path, other) for other in ("/usr", *found)):
             found.append(path)
     return found
+
+
+def _holds_home(path: str) -> bool:
+    return _below(os.path.realpath(os.path.expanduser("~")), path.rstrip("/"))
 
 
 def _our_folders() -> list[str]:

@@ -27,9 +27,10 @@ from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.toy import Line
 from evopolicy_worker.episodes import Player, Progress
 from evopolicy_worker.monitor import Monitor
-from evopolicy_worker.policy_process import PolicyProcess
+from evopolicy_worker.policy_process import BundleFiles, PolicyProcess
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
+from evopolicy_worker.slot import bundle_files
 
 SPACES: list[dict[str, Any]] = [
     {"type": "Discrete", "n": 5},
@@ -288,7 +289,10 @@ def _like(cls: Any, toy: Any) -> Any:
 def play(player: Player, slots: Slots, source: str, n: int = 1, **options: Any) -> list[EpisodeOutcome]:
     job = make_job(tier="none", n=n, **options)
     outcomes: list[EpisodeOutcome] = []
-    player.play(job, str(slots.bundle(source)), Progress(), lambda frame: outcomes.append(told(frame)))
+    files = bundle_files(slots.bundle(source))
+    assert files.names is not None
+    bundle = BundleFiles(files.names, files.data)
+    player.play(job, bundle, Progress(), lambda frame: outcomes.append(told(frame)))
     return outcomes
 
 
