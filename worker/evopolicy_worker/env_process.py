@@ -142,6 +142,7 @@ class EnvProcess:
             self._jobs.put(command)
         elif isinstance(command, messages.Play):
             # From now on it can be cancelled, also before it is taken up.
+            self._told = 0.0, 0
             self._progress = Progress()
             self._jobs.put((command, self._progress))
         elif isinstance(command, messages.Cancel):

@@ -220,7 +220,11 @@ def test_only_the_container_with_a_sandbox_inside_is_let_out_of_dockers_filters(
         assert service["cap_drop"] == ["ALL"]
         assert service["read_only"] is True
         outer = {option for option in service["security_opt"] if option != "no-new-privileges:true"}
-        assert outer == ({"seccomp=unconfined", "apparmor=unconfined"} if name == "worker" else set())
+        assert outer == (
+            {"seccomp=unconfined", "apparmor=unconfined", "systempaths=unconfined"}
+            if name == "worker"
+            else set()
+        )
         assert "privileged" not in service
 
 
