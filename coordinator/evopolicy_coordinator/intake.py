@@ -33,6 +33,7 @@ from evopolicy_coordinator.request_checks import (
     check_inline,
     check_key,
     check_limits,
+    check_place,
     check_registration,
     check_token,
     finite_cursor,
@@ -51,6 +52,7 @@ _VERBS: dict[type[Message], str] = {
     BlobPut: "blob",
     BlobGet: "blob",
     gateway.OpenRun: "open",
+    gateway.RequestPermit: "permit",
     gateway.StateRequest: "state",
     gateway.Submit: "submit",
     gateway.ResultsRequest: "results",
@@ -191,6 +193,8 @@ class Intake:
             fingerprint=m.fingerprint,
             host=m.host,
             machine="" if holder is None else holder.name,
+            boot_id=m.boot_id,
+            machine_id=m.machine_id,
         )
 
     def lease_requested(self, m: worker.LeaseRequest, request: int, stimulus: str) -> AnyEvent:
@@ -203,6 +207,7 @@ class Intake:
             wait_s=finite_wait(m.wait_s),
             warm_bundles=m.warm_bundles,
             warm_environments=m.warm_environments,
+            serial=m.serial,
         )
 
     def heartbeat_received(self, m: worker.Heartbeat, request: int, stimulus: str) -> AnyEvent:
@@ -213,6 +218,7 @@ class Intake:
             session=m.session,
             held=m.held,
             wait_s=finite_wait(m.wait_s),
+            settled=m.settled,
         )
 
     def results_handed_in(self, m: worker.HandIn, request: int, stimulus: str) -> AnyEvent:
@@ -245,7 +251,21 @@ class Intake:
     # Gateways.
 
     def run_opened(self, m: gateway.OpenRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunOpened(stimulus_id=stimulus, request=request, run=m.run)
+        return events.RunOpened(
+            stimulus_id=stimulus, request=request, run=m.run, asks_permit=m.asks_permit
+        )
+
+    def permit_requested(self, m: gateway.RequestPermit, request: int, stimulus: str) -> AnyEvent:
+        check_place(m.boot_id, m.machine_id, m.host)
+        return events.PermitRequested(
+            stimulus_id=stimulus,
+            request=request,
+            run=m.run,
+            boot_id=m.boot_id,
+            machine_id=m.machine_id,
+            host=m.host,
+            wait_s=finite_wait(m.wait_s),
+        )
 
     def state_requested(self, m: gateway.StateRequest, request: int, stimulus: str) -> AnyEvent:
         return events.StateRequested(stimulus_id=stimulus, request=request, run=m.run)
@@ -387,6 +407,9 @@ class Intake:
     def run_cancelled(self, m: operator.CancelRun, request: int, stimulus: str) -> AnyEvent:
         return events.RunCancelled(stimulus_id=stimulus, request=request, run=m.run)
 
+    def agent_gone(self, m: operator.AgentGone, request: int, stimulus: str) -> AnyEvent:
+        return events.AgentGone(stimulus_id=stimulus, request=request, run=m.run)
+
     def run_repinned(self, m: operator.RepinRun, request: int, stimulus: str) -> AnyEvent:
         if not m.reason.strip():
             raise RefusedError(Refusal.BAD_MESSAGE, "an override of a run's fingerprint class needs a reason")
@@ -457,6 +480,7 @@ _EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
     worker.Heartbeat: Intake.heartbeat_received,
     worker.HandIn: Intake.results_handed_in,
     gateway.OpenRun: Intake.run_opened,
+    gateway.RequestPermit: Intake.permit_requested,
     gateway.StateRequest: Intake.state_requested,
     gateway.Submit: Intake.submit_requested,
     gateway.ResultsRequest: Intake.results_requested,
@@ -466,6 +490,7 @@ _EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
     operator.WaitRun: Intake.run_waited,
     operator.EvaluationPoll: Intake.evaluation_polled,
     operator.CancelRun: Intake.run_cancelled,
+    operator.AgentGone: Intake.agent_gone,
     operator.RepinRun: Intake.run_repinned,
     operator.SetWorker: Intake.worker_state_set,
 }

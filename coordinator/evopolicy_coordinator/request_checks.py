@@ -74,6 +74,14 @@ def check_registration(message: worker.Register) -> None:
         )
     if not 1 <= message.slots <= 4096:
         raise RefusedError(Refusal.BAD_MESSAGE, f"{message.slots} slots: a worker has 1 to 4096")
+    check_place(message.boot_id, message.machine_id, message.host)
+
+
+def check_place(boot_id: str, machine_id: str, host: str) -> None:
+    """Names of a kernel, a machine and a host have a bounded length."""
+    for name, value in (("boot id", boot_id), ("machine id", machine_id), ("host name", host)):
+        if len(value) > _MAX_NAME or not value.isprintable():
+            raise RefusedError(Refusal.BAD_MESSAGE, f"{name} {value[:64]!r}: at most {_MAX_NAME} printable characters")
 
 
 def check_inline(ref: BlobRef | None) -> None:

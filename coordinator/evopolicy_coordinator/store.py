@@ -27,8 +27,10 @@ from evopolicy_coordinator.core.records import (
     AuditRow,
     EvaluationRow,
     FinishedRow,
+    KernelRow,
     OutcomeHead,
     OutcomeRow,
+    PermitRow,
     Row,
     RunRow,
     RunStateRow,
@@ -74,6 +76,13 @@ _MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE audits (audit TEXT PRIMARY KEY, run TEXT NOT NULL, data BLOB NOT NULL);
     CREATE INDEX audits_by_run ON audits (run);
+    """,
+    """
+    CREATE TABLE permits (
+        run TEXT NOT NULL, boot_id TEXT NOT NULL, ended INTEGER NOT NULL, data BLOB NOT NULL,
+        PRIMARY KEY (run, boot_id)
+    );
+    CREATE TABLE kernels (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
     """,
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
@@ -189,6 +198,8 @@ class Store:
             evaluations=evaluations,
             workers=_rows(db, WorkerRow, "SELECT data FROM workers"),
             audits=_rows(db, AuditRow, f"SELECT data FROM audits WHERE run IN ({live_runs})"),
+            permits=_rows(db, PermitRow, "SELECT data FROM permits WHERE NOT ended"),
+            kernels=_rows(db, KernelRow, "SELECT data FROM kernels"),
         )
 
     def close(self) -> None:
@@ -328,6 +339,8 @@ _EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluat
 _FINISHED = _upsert("finished", "run, data", "run")
 _WORKER = _upsert("workers", "worker, data", "worker")
 _AUDIT = _upsert("audits", "audit, run, data", "audit")
+_PERMIT = _upsert("permits", "run, boot_id, ended, data", "run, boot_id")
+_KERNEL = _upsert("kernels", "worker, data", "worker")
 _CLAIM = _upsert("claims", "suite, name, data", "suite, name")
 
 
@@ -371,6 +384,14 @@ def _write_audit(db: sqlite3.Connection, row: AuditRow) -> None:
     db.execute(_AUDIT, (row.audit, row.run, _encode(row)))
 
 
+def _write_permit(db: sqlite3.Connection, row: PermitRow) -> None:
+    db.execute(_PERMIT, (row.run, row.boot_id, int(row.ended_at is not None), _encode(row)))
+
+
+def _write_kernel(db: sqlite3.Connection, row: KernelRow) -> None:
+    db.execute(_KERNEL, (row.worker, _encode(row)))
+
+
 _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     RunRow: _write_run,
     RunStateRow: _write_run_state,
@@ -381,6 +402,8 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     FinishedRow: _write_finished,
     WorkerRow: _write_worker,
     AuditRow: _write_audit,
+    PermitRow: _write_permit,
+    KernelRow: _write_kernel,
 }
 
 

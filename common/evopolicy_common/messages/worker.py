@@ -64,6 +64,8 @@ class Registered(Message, frozen=True, kw_only=True, tag="registered"):
     heartbeat_s: float
     refused: dict[str, str] = {}
     """Run id to why this worker gets no work of it, such as other versions than the run began with."""
+    hidden_bar: str = ""
+    """Why this worker gets no hidden work of any run; empty when it may."""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
@@ -76,6 +78,8 @@ class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
     wait_s: float
     warm_bundles: tuple[str, ...] = ()
     warm_environments: tuple[str, ...] = ()
+    serial: int = 0
+    """The worker's own number of this sending; grows, over its starts too. 0: it does not count."""
 
 
 class Lease(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,6 +91,8 @@ class Lease(msgspec.Struct, frozen=True, kw_only=True):
     stimulus_id: str
     """Runs from the event that made the job through every log line about it."""
     job: Job
+    stop_in_silence: bool = False
+    """Stop it, and give it back, when no heartbeat was answered for `lease_ttl_s`: an agent may be let onto this kernel."""
 
 
 class Leases(Message, frozen=True, kw_only=True, tag="leases"):
@@ -118,6 +124,9 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
     held: tuple[HeldLease, ...]
     wait_s: float = 0.0
     """The answer may be held back for so long, and then comes at once when there is a lease to stop."""
+    settled: int = 0
+    """All polls up to this number were over when `held` was put down: what they brought is in it, or was let go of. 0: the
+    worker does not count its polls."""
 
 
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):

@@ -28,7 +28,8 @@ from evopolicy_common.messages.episode import EpisodeOutcome
 
 from . import events
 from .effects import CompareAudit, PrepareAudit
-from .jobs import AUDIT, JobGroup, Template
+from .isolation import HIDDEN_SPLITS
+from .jobs import AUDIT, HIDDEN_AUDIT, JobGroup, Template
 from .records import AuditRow, WorkerRow
 from .runs import Run
 from .turn import Turn
@@ -235,7 +236,7 @@ def _play(core: Core, run: Run, row: AuditRow, turn: Turn) -> None:
         flow=run.flow,
         template=template,
         stimulus_id=turn.stimulus_id,
-        priority=AUDIT,
+        priority=HIDDEN_AUDIT if row.kind in HIDDEN_SPLITS else AUDIT,
         created_at=turn.now,
         not_on=frozenset((row.player, *row.replayed_by)),
         not_of=frozenset(row.machines),

@@ -17,7 +17,8 @@ from evopolicy_common.refusals import Refusal
 
 from . import events
 from .effects import ReadEvaluation
-from .jobs import HELDOUT, JobGroup, Template
+from .isolation import hidden_evaluation
+from .jobs import HELDOUT, REFERENCE, JobGroup, Template
 from .polls import Poll
 from .queue import Flow
 from .records import EvaluationRow, evaluation_group
@@ -79,10 +80,15 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
 
 def enter(core: Core, row: EvaluationRow) -> Evaluation:
     """Take an evaluation into the core, with nothing of it queued yet."""
-    evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier))
+    family = core.isolation.families.join(row.env, row.cases) if _hidden(row) else None
+    evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier, family))
     core.evaluations[row.evaluation] = evaluation
     core.evaluation_keys[row.key] = row.evaluation
     return evaluation
+
+
+def _hidden(row: EvaluationRow) -> bool:
+    return hidden_evaluation(row.split, row.bundle, replays=bool(row.replays))
 
 
 def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
@@ -134,7 +140,7 @@ def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
         flow=evaluation.flow,
         template=template,
         stimulus_id=row.stimulus_id,
-        priority=HELDOUT,
+        priority=HELDOUT if _hidden(row) else REFERENCE,
         created_at=row.created_at,
     )
     core.open_group(group, turn)

@@ -71,6 +71,13 @@ class RunCancelled(Event, frozen=True, kw_only=True):
     run: str
 
 
+class AgentGone(Event, frozen=True, kw_only=True):
+    """An operator vouches that a run's agent is not alive any more."""
+
+    request: RequestId
+    run: str
+
+
 class RunRepinned(Event, frozen=True, kw_only=True):
     """An operator lets a run go on with the workers of another fingerprint class, for the reason given."""
 
@@ -126,6 +133,19 @@ class RunOpened(Event, frozen=True, kw_only=True):
 
     request: RequestId
     run: str
+    asks_permit: bool = False
+    """It asks for a permit before its agent starts; else its agent may be anywhere already."""
+
+
+class PermitRequested(Event, frozen=True, kw_only=True):
+    """A gateway asked that its agent may be alive on a kernel (long poll)."""
+
+    request: RequestId
+    run: str
+    boot_id: str
+    machine_id: str = ""
+    host: str = ""
+    wait_s: float = 0.0
 
 
 class StateRequested(Event, frozen=True, kw_only=True):
@@ -182,6 +202,8 @@ class WorkerRegistered(Event, frozen=True, kw_only=True):
     host: str = ""
     machine: str = ""
     """Whose credentials it joined with; empty for those that the state folder hands out."""
+    boot_id: str = ""
+    machine_id: str = ""
 
 
 class LeaseRequested(Event, frozen=True, kw_only=True):
@@ -196,6 +218,8 @@ class LeaseRequested(Event, frozen=True, kw_only=True):
     """How long it lay unread: the loop stood still."""
     warm_bundles: tuple[str, ...] = ()
     warm_environments: tuple[str, ...] = ()
+    serial: int = 0
+    """See `messages.worker.LeaseRequest`."""
 
 
 class HeartbeatReceived(Event, frozen=True, kw_only=True):
@@ -207,6 +231,8 @@ class HeartbeatReceived(Event, frozen=True, kw_only=True):
     held: tuple[HeldLease, ...]
     wait_s: float = 0.0
     """How long the answer may be held back; it comes at once when there is a lease to stop."""
+    settled: int = 0
+    """See `messages.worker.Heartbeat`."""
 
 
 class ResultsHandedIn(Event, frozen=True, kw_only=True):
@@ -272,10 +298,12 @@ AnyEvent = (
     | RunWaited
     | RunCancelled
     | RunRepinned
+    | AgentGone
     | EvaluationRequested
     | EvaluationPolled
     | WorkerStateSet
     | RunOpened
+    | PermitRequested
     | StateRequested
     | SubmitRequested
     | ResultsRequested

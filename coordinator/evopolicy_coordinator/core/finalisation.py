@@ -21,7 +21,7 @@ from evopolicy_common.messages.environment import PolicyScope
 from evopolicy_common.refusals import Refusal
 
 from . import audit, events
-from .jobs import EARLY_VALIDATION, HELDOUT, JobGroup, Template
+from .jobs import EARLY_VALIDATION, HELDOUT, REFERENCE, JobGroup, Template
 from .polls import Poll
 from .records import (
     FinishedRow,
@@ -140,6 +140,8 @@ def close(core: Core, event: events.RunClosed, turn: Turn) -> None:
     if run is None and event.run not in core.capabilities:
         turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
+    core.isolation.end(event.run, turn, "its run was closed")
+    core.isolation.drop_asks(event.run, Refusal.RUN_CLOSED, f"run {event.run!r} is closed", turn)
     if run is not None and run.state.phase == "open":
         run.change(turn, phase="closed", closed_at=turn.now, close_reason=event.reason, agent=event.agent)
         turn.log("info", "run_closed", run=run.id, reason=event.reason, submits=len(run.submits))
@@ -152,7 +154,7 @@ def advance(core: Core, run: Run, turn: Turn) -> None:
     if run.state.phase != "closed" or run.open is not None:
         return
     if random_group(run.id) not in run.hidden_returns:
-        _open(core, run, "random", None, HELDOUT, turn)
+        _open(core, run, "random", None, REFERENCE, turn)
     waiting = [row for row in _ok(run) if row.val_mean is None and row.ineligible is None]
     for row in waiting:
         validate_early(core, run, row, turn)
@@ -203,6 +205,8 @@ def cancel(core: Core, event: events.RunCancelled, turn: Turn) -> None:
         answer_polls(core, group, turn)
     if run.state.phase == "open":
         run.change(turn, phase="closed", closed_at=turn.now, close_reason=gateway.CANCELLED)
+        core.isolation.cancelled(run.id, turn)
+    core.isolation.drop_asks(run.id, Refusal.RUN_CANCELLED, f"run {run.id!r} was cancelled", turn)
     _finish(core, run, None, turn, cancelled=True)
     turn.reply(event.request, operator.Done())
 
@@ -279,6 +283,7 @@ def _result(
         infrastructure_retries=state.infrastructure_retries,
         nondeterministic_results=state.nondeterministic_results,
         audit=audit.record(core, run),
+        hidden_isolation=state.isolation,
         fingerprint_overrides=state.overrides,
     )
 

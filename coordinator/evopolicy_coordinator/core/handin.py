@@ -47,7 +47,7 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
     live = lease is not None and lease.live and job.lease is lease
     silent = lease is None or _silent(core, lease, turn.now)
     if lease is not None:
-        core.book.release(worker, lease, turn, f"handed in: {result.kind}")
+        core.book.release(worker, lease, turn, f"handed in: {result.kind}", sure=True)
     if result.kind == "done":
         _done(core, worker, job, result, turn, live=live, silent=silent)
     elif result.kind == "slot_died" and job.group.template.bundle is not None:
@@ -62,7 +62,7 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
 def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, turn: Turn) -> None:
     """A result of a job that is done, or was cancelled."""
     if lease is not None and lease.id == result.lease_id:
-        core.book.release(worker, lease, turn, f"handed in late: {result.kind}")
+        core.book.release(worker, lease, turn, f"handed in late: {result.kind}", sure=True)
     group = core.groups.get(result.job_id.rpartition("/")[0])
     if group is None or result.kind != "done":
         return

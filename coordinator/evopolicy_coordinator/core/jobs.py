@@ -35,9 +35,14 @@ if TYPE_CHECKING:
     from .queue import Flow
     from .workers import Worker
 
-TRAIN, HELDOUT, EARLY_VALIDATION, AUDIT = 0, 1, 2, 3
-"""Priorities, first served first. Validation of a closed run, the random reference and evaluations are `HELDOUT`'s."""
-N_PRIORITIES = 4
+TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION, AUDIT, HIDDEN_AUDIT = range(6)
+"""Priorities. Validation of a closed run and evaluations on hidden cases are `HELDOUT`'s, the random reference and other
+evaluations `REFERENCE`'s, audits of what `HIDDEN` has `HIDDEN_AUDIT`'s."""
+N_PRIORITIES = 6
+RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUDIT))
+"""Priorities that get fair shares of what those before them leave."""
+HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
+"""What a policy does, or did, on hidden cases: never on a kernel with an agent who could learn of it (`isolation`)."""
 
 GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
@@ -161,6 +166,11 @@ class JobGroup:
     """Machines whose workers never get it."""
     numerics: str | None = None
     """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it is hidden work."""
+        return self.priority in HIDDEN
 
     def bars(self, worker: Worker) -> bool:
         """Whether a worker must not play it."""

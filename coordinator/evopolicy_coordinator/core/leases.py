@@ -22,6 +22,7 @@ from .jobs import TRAIN, JobState, build
 from .retry import Mishap, decide
 
 if TYPE_CHECKING:
+    from .isolation import Stay
     from .machine import Core
     from .queue import Lane
     from .turn import Turn
@@ -66,6 +67,8 @@ class Lease:
     """Where it is listed as one that may be preempted."""
     stopped_for: Lane | None = None
     """Whose train jobs it was preempted for."""
+    stay: Stay | None = None
+    """Where it is, if it is hidden or train: as long as it is its worker's."""
 
 
 def lease_id(job_id: str, attempt: int) -> str:
@@ -85,7 +88,8 @@ class LeaseBook:
     def grant(self, job: JobState, worker: Worker, turn: Turn) -> wire.Lease:
         """Lease a job that has just left the queue."""
         job.attempts += 1
-        lease = self._enter(job, worker, job.attempts, turn)
+        serial = 0 if worker.poll is None else worker.poll.serial
+        lease = self._enter(job, worker, job.attempts, turn, serial=serial)
         job.holders[lease.attempt] = worker.name
         group = job.group
         description = group.flow.description or worker.profile.descriptions[group.template.env]
@@ -95,9 +99,10 @@ class LeaseBook:
             attempt=lease.attempt,
             stimulus_id=group.stimulus_id,
             job=build(job, description),
+            stop_in_silence=group.hidden and self._core.isolation.on,
         )
 
-    def _enter(self, job: JobState, worker: Worker, attempt: int, turn: Turn) -> Lease:
+    def _enter(self, job: JobState, worker: Worker, attempt: int, turn: Turn, *, serial: int) -> Lease:
         now = turn.now
         name = lease_id(job.job_id, attempt)
         lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
@@ -109,6 +114,7 @@ class LeaseBook:
         group.n_leased += 1
         group.flow.n_leased += 1
         self.n_live += 1
+        self._core.isolation.leased(lease, worker, serial)
         self.list_hidden(lease, worker, turn)
         if group.first_leased_at is None:
             group.first_leased_at = now
@@ -130,7 +136,9 @@ class LeaseBook:
 
     # ---- hearing ----
 
-    def hear(self, worker: Worker, held: Iterable[wire.HeldLease], turn: Turn) -> tuple[str, ...]:
+    def hear(
+        self, worker: Worker, held: Iterable[wire.HeldLease], turn: Turn, *, settled: int
+    ) -> tuple[str, ...]:
         """A heartbeat: renew what it names, adopt what is unknown and waits; gives what the worker is to stop."""
         now = turn.now
         stop: list[str] = []
@@ -140,6 +148,8 @@ class LeaseBook:
             lease = worker.leases.get(item.lease_id) or self._adopt(worker, item, turn)
             if lease is None or not lease.live:
                 stop.append(item.lease_id)
+                if lease is None:
+                    self._core.isolation.unknown(worker, item, turn)
                 continue
             lease.doubtful = lease.doubtful or now - lease.renewed > self._core.settings.silence_s
             lease.renewed = now
@@ -153,10 +163,13 @@ class LeaseBook:
         missing_since = now - MISSING_BEATS * self._core.settings.heartbeat_s
         for lease in [each for each in worker.leases.values() if each.id not in named]:
             if not lease.live:
-                self._leave(worker, lease)
+                sure = self._core.isolation.surely(worker, lease.stay, settled)
+                self._leave(worker, lease, turn, sure=sure)
             elif not lease.named and lease.granted_at < missing_since and now >= self._core.hold_until:
-                self.release(worker, lease, turn, "it never arrived")
+                sure = self._core.isolation.surely(worker, lease.stay, settled)
+                self.release(worker, lease, turn, "it never arrived", sure=sure)
                 self.give_back(lease.job, "unlisted", worker, turn, ran=False)
+        self._core.isolation.heard(worker, named, settled, turn)
         return tuple(stop)
 
     def _adopt(self, worker: Worker, item: wire.HeldLease, turn: Turn) -> Lease | None:
@@ -170,6 +183,7 @@ class LeaseBook:
             or not 0 < item.attempt <= core.first_attempt
             or item.attempt in job.holders
             or job.group.bars(worker)
+            or not core.isolation.adoptable(job, worker)
         ):
             return None
         core.scheduler.unreserve(job)
@@ -178,7 +192,7 @@ class LeaseBook:
         core.adopting.pop(job, None)
         job.holders[item.attempt] = worker.name
         core.chronicle.tell(turn.now, turn.stimulus_id, item.lease_id, f"adopted from {worker.name}")
-        lease = self._enter(job, worker, item.attempt, turn)
+        lease = self._enter(job, worker, item.attempt, turn, serial=0)
         lease.doubtful = True
         return lease
 
@@ -206,13 +220,14 @@ class LeaseBook:
         self.end(lease, turn, why)
         turn.stops.setdefault(lease.worker, []).append(lease.id)
 
-    def release(self, worker: Worker, lease: Lease, turn: Turn, why: str) -> None:
-        """End a lease that its worker has let go of."""
+    def release(self, worker: Worker, lease: Lease, turn: Turn, why: str, *, sure: bool = False) -> None:
+        """End a lease that its worker has let go of: surely, as it said, or as far as we know."""
         self.end(lease, turn, why)
-        self._leave(worker, lease)
+        self._leave(worker, lease, turn, sure=sure)
 
-    def _leave(self, worker: Worker, lease: Lease) -> None:
+    def _leave(self, worker: Worker, lease: Lease, turn: Turn, *, sure: bool) -> None:
         worker.leases.pop(lease.id, None)
+        self._core.isolation.left(lease, worker, turn, sure=sure)
         if lease.stopped_for is not None:
             lease.stopped_for.stopping -= 1
             lease.stopped_for = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from . import audit, evaluations, finalisation, runs
+from . import audit, evaluations, finalisation, permits, runs
 from .evaluations import Ended
 from .jobs import JobGroup
 from .records import AuditRow, RunStateRow, Snapshot, SubmitRow, validation_group
@@ -35,6 +35,9 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
     for worker in snapshot.workers:
         core.fleet.set_state(worker.worker, worker.state, worker.reason, worker.machine)
     states = {state.run: state for state in snapshot.states}
+    core.isolation.load(
+        snapshot.permits, snapshot.kernels, {row.run: row for row in snapshot.runs}, states, turn
+    )
     submits: dict[str, list[SubmitRow]] = {}
     for submit in snapshot.submits:
         submits.setdefault(submit.run, []).append(submit)
@@ -51,6 +54,7 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
             run = runs.enter(core, row, state)
             run.played = played.get(row.run, {})
             run.audits.update((each.audit, each) for each in audits.get(row.run, ()))
+            permits.resume(core, run, turn)
             _run(core, run, submits.get(row.run, []), turn)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
         if each.finished:

@@ -14,9 +14,10 @@ from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
 from evopolicy_common.refusals import Refusal
 
-from . import audit, evaluations, events, finalisation, invariants, membership, runs, status
+from . import audit, evaluations, events, finalisation, invariants, membership, permits, runs, status
 from .effects import Effect
 from .evaluations import Ended, Evaluation
+from .isolation import Family, Isolation
 from .jobs import JobGroup, JobState, open_jobs
 from .leases import ATTEMPTS_PER_INCARNATION, LeaseBook
 from .loading import load
@@ -50,7 +51,8 @@ class Core:
         """Attempts up to this number were granted by earlier incarnations."""
         self.timers = Timers()
         self.chronicle = Story()
-        self.queue = Queue(settings.warm_bonus_s)
+        self.isolation = Isolation(self)
+        self.queue = Queue(settings.warm_bonus_s, self.isolation.bar)
         self.fleet = Fleet(settings, self.queue, self.timers)
         self.book = LeaseBook(self)
         self.scheduler = Scheduler(self)
@@ -203,6 +205,13 @@ class Core:
             worker = self.fleet.workers.get(str(what))
             if worker is not None and worker.state == "lost":
                 self.fleet.forget(worker)
+                self.isolation.forgotten(worker)
+        elif kind == "linger":
+            self.isolation.expire(str(what), turn)
+        elif kind == "ask":
+            self.isolation.forget_ask(*cast(tuple[str, str], what), turn)
+        elif kind == "cancelled":
+            self.isolation.end(str(what), turn, "its run was cancelled")
 
     def _submit_limit(self, key: TimerKey, turn: Turn) -> None:
         group = self.groups.get(str(key[1]))
@@ -221,15 +230,17 @@ class Core:
             runs.answer(self, self.runs[poll.target.split("/")[0]], poll, turn)
         elif poll.kind == "evaluation":
             evaluations.answer(self, poll, turn)
+        elif poll.kind == "permit":
+            permits.answer(self, poll, turn)
         else:
             turn.reply(poll.request, finalisation.progress(self, self.runs[poll.target]))
 
     # ---- flows and groups ----
 
-    def add_flow(self, name: str, env: str, tier: Tier) -> Flow:
+    def add_flow(self, name: str, env: str, tier: Tier, family: Family | None) -> Flow:
         """A new flow for a run or an evaluation, not pinned to workers yet."""
         self._flows += 1
-        flow = Flow(name, env, tier, self._flows)
+        flow = Flow(name, env, tier, self._flows, family)
         self.unpinned[name] = flow
         return flow
 
@@ -237,6 +248,7 @@ class Core:
         """A run or evaluation is over: nothing of it waits any more."""
         self.unpinned.pop(flow.id, None)
         self.queue.drop(flow)
+        self.isolation.families.leave(flow.family)
 
     def pin(self, flow: Flow, turn: Turn) -> None:
         """Pin a flow to the fingerprint class that serves it best now, if there is one."""
@@ -397,6 +409,8 @@ _HANDLERS: dict[type, Callable[[Core, Any, Turn], None]] = {
     events.EvaluationPolled: evaluations.polled,
     events.WorkerStateSet: membership.worker_state,
     events.RunOpened: runs.opened,
+    events.PermitRequested: permits.requested,
+    events.AgentGone: permits.agent_gone,
     events.StateRequested: runs.state_requested,
     events.SubmitRequested: runs.submit,
     events.ResultsRequested: runs.results,

@@ -19,6 +19,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.refusals import Refusal
 
 from . import events, handin, status
+from .isolation import NO_BOOT_ID
 from .records import WorkerRow
 from .turn import Turn
 from .workers import Worker
@@ -42,12 +43,16 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
         if old.beat is not None:
             core.fleet.answer_beat(old, (), turn)
     core.timers.disarm(("forget", event.worker))
-    worker = core.fleet.register(event, turn)
+    worker = core.fleet.register(event, core.isolation.kernel(event.boot_id), turn)
+    core.isolation.joined(worker, turn)
+    if old is not None and old.kernel is not worker.kernel:
+        core.isolation.forgotten(old)
     reply = wire.Registered(
         session=event.session,
         lease_ttl_s=core.settings.lease_ttl_s,
         heartbeat_s=core.settings.heartbeat_s,
         refused=status.refused_runs(core, worker),
+        hidden_bar="" if event.boot_id or not core.isolation.on else NO_BOOT_ID,
     )
     turn.reply(event.request, reply)
     name = worker.profile.fingerprint_class
@@ -104,7 +109,7 @@ def heartbeat(core: Core, event: events.HeartbeatReceived, turn: Turn) -> None:
         return
     if worker.beat is not None:
         core.fleet.answer_beat(worker, (), turn)
-    stop = core.book.hear(worker, event.held, turn)
+    stop = core.book.hear(worker, event.held, turn, settled=event.settled)
     worker.beat = event.request
     if stop or not event.wait_s > 0.0:
         core.fleet.answer_beat(worker, stop, turn)

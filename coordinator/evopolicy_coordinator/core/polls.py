@@ -11,7 +11,7 @@ from typing import Literal
 from .events import RequestId
 from .timers import Timers
 
-PollKind = Literal["results", "evaluation", "run"]
+PollKind = Literal["results", "evaluation", "run", "permit"]
 
 
 @dataclass(slots=True, frozen=True)
@@ -21,7 +21,7 @@ class Poll:
     request: RequestId
     kind: PollKind
     target: str
-    """Group id, or run."""
+    """Group id, run, or `isolation.poll_target`."""
     cursor: int = 0
 
 

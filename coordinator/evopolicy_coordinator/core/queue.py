@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -24,9 +24,10 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.worker import Fingerprint
 
-from .jobs import N_PRIORITIES, JobState
+from .jobs import HIDDEN, N_PRIORITIES, RANKS, TRAIN, JobState
 
 if TYPE_CHECKING:
+    from .isolation import Family
     from .leases import Lease
     from .workers import Worker
 
@@ -39,6 +40,12 @@ SKIPS_MAX = 16
 PASSES_MAX = 4
 """So many flows with nothing but such jobs are looked past."""
 
+BARRED_MAX = 64
+"""So many flows, or families of a lane, that the asking worker's kernel is barred to are looked past."""
+
+
+_RANK = tuple(next(n for n, rank in enumerate(RANKS) if each in rank) for each in range(N_PRIORITIES))
+
 
 @dataclass(slots=True, eq=False)
 class Flow:
@@ -49,6 +56,8 @@ class Flow:
     tier: Tier
     seq: int
     """Order of creation: breaks ties."""
+    family: Family | None = None
+    """Those that share its hidden cases; None where it has none."""
     pin: str | None = None
     """Fingerprint class; None until there is a worker for it."""
     description: EnvironmentDescription | None = None
@@ -82,9 +91,30 @@ class Lane:
         default_factory=lambda: tuple([] for _ in range(N_PRIORITIES))
     )
     n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    waiting: tuple[dict[Family | None, int], ...] = field(
+        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
+    )
+    """Jobs that wait, suspects too, by priority and family."""
     profiles: dict[Profile, None] = field(default_factory=dict)
     stopping: int = 0
     """Hidden jobs that were stopped for this lane's sake and whose workers have not let go of them yet."""
+
+    def count(self, priority: int, family: Family | None, n: int) -> None:
+        """So many more jobs of a family wait."""
+        there = self.waiting[priority]
+        left = there.get(family, 0) + n
+        if left:
+            there[family] = left
+        else:
+            there.pop(family, None)
+
+    def waits_of(self, family: Family | None) -> bool:
+        """Whether jobs wait of the family's relatives, or of any for None."""
+        for priority in (TRAIN, *HIDDEN):
+            there = self.waiting[priority]
+            if there and (family is None or not family.relatives.keys().isdisjoint(there)):
+                return True
+        return False
 
     def slots(self) -> int:
         """Slots of the workers that may serve it."""
@@ -147,12 +177,16 @@ class Profile:
 class Queue:
     """All lanes, the flows in them and the profiles that serve them."""
 
-    def __init__(self, warm_bonus_s: float) -> None:
+    def __init__(
+        self, warm_bonus_s: float, bar: Callable[[int, Family | None, Worker], bool]
+    ) -> None:
+        """`bar` tells whether jobs of a priority and family must not be leased to a worker now."""
+        self._bar = bar
         self.lanes: dict[LaneKey, Lane] = {}
         self.profiles: dict[tuple[frozenset[str], frozenset[Tier], str], Profile] = {}
         self.suspects: dict[JobState, None] = {}
         """Waiting jobs that are to run alone; few."""
-        self._clock = [0.0] * N_PRIORITIES
+        self._clock = [0.0] * len(RANKS)
         self._warm_bonus_s = warm_bonus_s
 
     # ---- shape ----
@@ -166,9 +200,11 @@ class Queue:
     def place(self, flow: Flow, pin: str) -> Lane:
         """Put a flow into the lane of class `pin`, with whatever of it waits."""
         old = flow.lane
+        suspects = [job.priority for job in self.suspects if job.group.flow is flow]
         if old is not None:
             for priority in range(N_PRIORITIES):
                 old.n_ready[priority] -= flow.n_ready[priority]
+                old.count(priority, flow.family, -flow.n_ready[priority] - suspects.count(priority))
             self._settle(old)
         key = (flow.env, flow.tier, pin)
         lane = self.lanes.get(key)
@@ -179,6 +215,7 @@ class Queue:
         flow.pin, flow.lane = pin, lane
         for priority in range(N_PRIORITIES):
             flow.in_heap[priority] = False
+            lane.count(priority, flow.family, flow.n_ready[priority] + suspects.count(priority))
             if flow.n_ready[priority]:
                 lane.n_ready[priority] += flow.n_ready[priority]
                 self._enter(flow, lane, priority)
@@ -217,13 +254,15 @@ class Queue:
         flow, priority = job.group.flow, job.priority
         job.ticket += 1
         job.queued = True
+        if flow.lane is not None:
+            flow.lane.count(priority, flow.family, 1)
         if job.alone:
             self.suspects[job] = None
             return flow.lane
         ready = flow.ready[priority]
         (ready.appendleft if front else ready.append)((job.ticket, job))
         if flow.n_ready[priority] == 0:
-            flow.served[priority] = max(flow.served[priority], self._clock[priority])
+            flow.served[priority] = max(flow.served[priority], self._clock[_RANK[priority]])
         flow.n_ready[priority] += 1
         lane = flow.lane
         if lane is not None:
@@ -237,12 +276,14 @@ class Queue:
         """Take a waiting job out, wherever it stands."""
         if not job.queued:
             return
+        flow, priority = job.group.flow, job.priority
         job.queued = False
         job.ticket += 1
+        if flow.lane is not None:
+            flow.lane.count(priority, flow.family, -1)
         if job.alone:
             self.suspects.pop(job, None)
             return
-        flow, priority = job.group.flow, job.priority
         flow.n_ready[priority] -= 1
         if flow.n_ready[priority] == 0:
             flow.ready[priority].clear()
@@ -254,20 +295,25 @@ class Queue:
 
     def take(self, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
         """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
-        for priority in range(N_PRIORITIES):
-            passed: list[Flow] = []
+        for rank in RANKS:
+            passed: list[tuple[Flow, int]] = []
+            barred = 0
             job: JobState | None = None
-            while job is None and len(passed) < PASSES_MAX:
-                flow = self._best(worker.profile, priority, warm)
-                if flow is None or flow.lane is None:
+            while job is None and len(passed) - barred < PASSES_MAX and barred < BARRED_MAX:
+                found = self._best(worker, rank, warm)
+                if found is None or found[0].lane is None:
                     break
-                lane = flow.lane
-                job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
+                flow, priority = found
+                lane = found[0].lane
+                if self._bar(priority, flow.family, worker):
+                    barred += 1
+                else:
+                    job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
                 if job is None:
                     heapq.heappop(lane.heaps[priority])
                     flow.in_heap[priority] = False
-                    passed.append(flow)
-            for flow in passed:
+                    passed.append(found)
+            for flow, priority in passed:
                 if flow.lane is not None:
                     self._enter(flow, flow.lane, priority)
             if job is not None:
@@ -275,37 +321,59 @@ class Queue:
                 return job
         return None
 
-    def leading(self, profile: Profile) -> Flow | None:
-        """The flow that goes first among what the profile can serve, warmth aside; None when nothing waits."""
-        for priority in range(N_PRIORITIES):
-            flow = self._best(profile, priority, ())
-            if flow is not None:
-                return flow
+    def leading(self, worker: Worker) -> tuple[Flow, int] | None:
+        """The flow that goes first of what the worker may be leased, and at which priority; None when nothing waits."""
+        for rank in RANKS:
+            found = self._best(worker, rank, ())
+            if found is not None:
+                return found
         return None
+
+    def may_serve(self, lane: Lane, worker: Worker) -> bool:
+        """Whether anything that waits in the lane may be leased on the worker's kernel."""
+        return any(
+            lane.n_ready[priority] and self._open(lane, priority, worker) for priority in range(N_PRIORITIES)
+        )
+
+    def may_train(self, lane: Lane, worker: Worker) -> bool:
+        """Whether train jobs that wait in the lane may be leased to the worker."""
+        return self._open(lane, TRAIN, worker)
+
+    def _open(self, lane: Lane, priority: int, worker: Worker) -> bool:
+        """Whether some family that waits in the lane may be leased on the worker's kernel."""
+        there = lane.waiting[priority]
+        if len(there) > BARRED_MAX:
+            return True
+        return any(not self._bar(priority, family, worker) for family in there)
 
     def _serve(self, job: JobState) -> None:
         flow, priority = job.group.flow, job.priority
         self.withdraw(job)
-        self._clock[priority] = max(self._clock[priority], flow.served[priority])
+        self._clock[_RANK[priority]] = max(self._clock[_RANK[priority]], flow.served[priority])
         flow.served[priority] += flow.cost_s(job)
 
-    def _best(self, profile: Profile, priority: int, warm: Collection[str]) -> Flow | None:
-        best: Flow | None = None
+    def _best(
+        self, worker: Worker, rank: tuple[int, ...], warm: Collection[str]
+    ) -> tuple[Flow, int] | None:
+        best: tuple[Flow, int] | None = None
         best_score = 0.0
-        for lane in profile.busy:
-            heap = lane.heaps[priority]
-            if not heap or not lane.n_ready[priority]:
-                continue
-            score, _, flow = heap[0]
-            if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
-                found = lane.top(priority)
-                if found is None:
+        for lane in worker.profile.busy:
+            for priority in rank:
+                heap = lane.heaps[priority]
+                if not heap or not lane.n_ready[priority] or not self._open(lane, priority, worker):
                     continue
-                flow, score = found, found.served[priority]
-            if warm and (flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm):
-                score -= self._warm_bonus_s
-            if best is None or score < best_score or (score == best_score and flow.seq < best.seq):
-                best, best_score = flow, score
+                score, _, flow = heap[0]
+                if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
+                    found = lane.top(priority)
+                    if found is None:
+                        continue
+                    flow, score = found, found.served[priority]
+                if warm and (
+                    flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm
+                ):
+                    score -= self._warm_bonus_s
+                if best is None or score < best_score or (score == best_score and flow.seq < best[0].seq):
+                    best, best_score = (flow, priority), score
         return best
 
     @staticmethod

@@ -24,7 +24,7 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
-from evopolicy_common.messages.operator import PlayedAs, RunFinished, RunSettings
+from evopolicy_common.messages.operator import HiddenIsolation, PlayedAs, RunFinished, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
 Phase = Literal["open", "closed", "finished"]
@@ -79,6 +79,8 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     agent: dict[str, Any] = {}
     infrastructure_retries: int = 0
     nondeterministic_results: int = 0
+    isolation: HiddenIsolation = "unknown"
+    """What has held so far; `unknown` in rows of older versions."""
     remaining_budget: int = 0
     """Once finished: train episodes that were not spent."""
     n_submits: int = 0
@@ -218,6 +220,27 @@ class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
     """The player, where it was refuted."""
 
 
+class PermitRow(msgspec.Struct, frozen=True, kw_only=True, tag="permit"):
+    """A run's agent may be alive on a kernel. Key: `run`, `boot_id`."""
+
+    run: str
+    boot_id: str
+    """Of the kernel; empty: any may be it."""
+    machine_id: str = ""
+    host: str = ""
+    """Its name, for people."""
+    granted_at: float = 0.0
+    ended_at: float | None = None
+
+
+class KernelRow(msgspec.Struct, frozen=True, kw_only=True, tag="kernel"):
+    """Where a worker was when it last registered: after a start it may still play there. Key: `worker`."""
+
+    worker: str
+    boot_id: str
+    machine_id: str
+
+
 Row = (
     RunRow
     | RunStateRow
@@ -228,6 +251,8 @@ Row = (
     | FinishedRow
     | WorkerRow
     | AuditRow
+    | PermitRow
+    | KernelRow
 )
 
 
@@ -279,6 +304,9 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     evaluations: tuple[EvaluationRow, ...] = ()
     workers: tuple[WorkerRow, ...] = ()
     audits: tuple[AuditRow, ...] = ()
+    permits: tuple[PermitRow, ...] = ()
+    """Those that have not ended, of finished runs too."""
+    kernels: tuple[KernelRow, ...] = ()
 
 
 def latest_time(snapshot: Snapshot) -> float:

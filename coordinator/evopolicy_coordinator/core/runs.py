@@ -23,6 +23,7 @@ from evopolicy_common.refusals import Refusal
 from . import events
 from .effects import ReadFinished, ReadResults
 from .jobs import TRAIN, JobGroup, Template
+from .isolation import Family, implied, stamp
 from .ledger import Ledger, refusal
 from .polls import Poll
 from .queue import Flow
@@ -63,6 +64,12 @@ class Run:
     @property
     def id(self) -> str:
         return self.row.run
+
+    @property
+    def family(self) -> Family:
+        """The runs that share its hidden cases."""
+        assert self.flow.family is not None
+        return self.flow.family
 
     def change(self, turn: Turn, **fields: object) -> None:
         """Change the durable state."""
@@ -109,7 +116,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )
-    state = RunStateRow(run=event.run)
+    state = RunStateRow(run=event.run, isolation=stamp(core, row))
     turn.persist(row)
     run = enter(core, row, state)
     turn.persist(state)
@@ -120,7 +127,8 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
 
 def enter(core: Core, row: RunRow, state: RunStateRow) -> Run:
     """Take a run into the core, with its whole budget available."""
-    flow = core.add_flow(row.run, row.settings.env, row.settings.sandbox_tier)
+    family = core.isolation.families.join(row.settings.env, (*row.validation, *row.heldout))
+    flow = core.add_flow(row.run, row.settings.env, row.settings.sandbox_tier, family)
     run = Run(row, state, Ledger(row.budget), flow)
     core.runs[row.run] = run
     core.run_keys[row.key] = row.run
@@ -160,6 +168,8 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
         )
         turn.refuse(event.request, Refusal.NO_WORKER, text)
         return
+    if not event.asks_permit and _without_permit(core, event.request, run, turn):
+        return
     turn.reply(
         event.request,
         gateway.RunOpened(
@@ -179,6 +189,14 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
             state=run_state(core, run),
         ),
     )
+
+
+def _without_permit(core: Core, request: events.RequestId, run: Run, turn: Turn) -> bool:
+    """Refuse, for now, what an agent asks that may be on any machine, until it may."""
+    waits_for = implied(core, run, turn) if run.state.phase == "open" else ""
+    if waits_for:
+        turn.refuse(request, Refusal.UNAVAILABLE, f"the run's agent may not start yet; it waits for {waits_for}")
+    return bool(waits_for)
 
 
 def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> None:
@@ -267,6 +285,8 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
         return
     if event.bundle is None and event.bundle_error is None:
         turn.refuse(event.request, Refusal.BAD_REQUEST, "a submit names a bundle, or says why there is none")
+        return
+    if _without_permit(core, event.request, run, turn):
         return
     _accept(core, run, event, turn)
 

@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING
 from evopolicy_common.messages import worker as wire
 
 from .events import LeaseRequested
-from .jobs import AUDIT, EARLY_VALIDATION, HELDOUT, N_PRIORITIES, TRAIN, JobState
+from .jobs import AUDIT, EARLY_VALIDATION, HELDOUT, HIDDEN_AUDIT, REFERENCE, TRAIN, JobState
 from .queue import Lane
 from .turn import Turn
 from .workers import LeasePoll, Worker
 
 if TYPE_CHECKING:
+    from .isolation import Family
     from .leases import Lease
     from .machine import Core
 
@@ -39,11 +40,17 @@ TRIES_MAX = 4
 LOOK_AGAIN_S = 1.0
 """What waits although someone waits for it (they avoid each other) is looked at again after so long."""
 
+LOOKS_MAX = 64
+"""Parked workers whose kernels may be barred to a lane that are looked past in one step."""
+
 VICTIMS_MAX = 256
 """Hidden leases looked at for a lane in one step."""
 
 SUSPECTS_MAX = 16
 """Suspects looked at in one step."""
+
+FAMILIES_MAX = 8
+"""Families of waiting train jobs that hidden jobs are stopped for in one step."""
 
 
 class Scheduler:
@@ -82,7 +89,9 @@ class Scheduler:
         wait_s = min(max(event.wait_s - event.waited_s, 0.0), core.settings.max_wait_s)
         warm = frozenset(event.warm_bundles) | frozenset(event.warm_environments)
         n = max(1, min(event.n, 2 * worker.slots))
-        worker.poll = LeasePoll(event.request, n, warm, until=turn.now + wait_s)
+        worker.poll = LeasePoll(event.request, n, warm, until=turn.now + wait_s, serial=event.serial)
+        if worker.first_serial is None:
+            worker.first_serial = event.serial
         if not self._serve(worker, turn):
             core.timers.arm(("lease", worker.name), turn.now + wait_s)
             self._park(worker, turn)
@@ -146,12 +155,12 @@ class Scheduler:
         More than the free slots can take only of short episodes, not ahead of what has less right to the slot, and no
         more than the worker's part of what waits.
         """
-        settings, profile = self._core.settings, worker.profile
-        flow = self._core.queue.leading(profile)
-        if flow is None or flow.lane is None:
+        settings, found = self._core.settings, self._core.queue.leading(worker)
+        if found is None or found[0].lane is None:
             return 0
         at_least = min(n, max(0, free))
-        priority = next(each for each in range(N_PRIORITIES) if flow.n_ready[each])
+        flow, priority = found
+        assert flow.lane is not None
         episode_s = flow.episode_s
         behind_hidden = any(worker.held[priority + 1 :])
         if episode_s is None or episode_s >= PREFETCH_BELOW_S or behind_hidden:
@@ -167,7 +176,7 @@ class Scheduler:
         core, idle = self._core, not worker.leases
         if worker.reserved is not None:
             job = worker.reserved
-            if not job.queued:
+            if not job.queued or self._barred(job, worker):
                 worker.reserved = job.reserved = None
             elif not idle:
                 return None
@@ -183,13 +192,16 @@ class Scheduler:
                 continue
             if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
                 continue
-            if job.group.bars(worker):
+            if job.group.bars(worker) or self._barred(job, worker):
                 continue
             if idle:
                 return self._alone(job, worker, turn)
             self._reserve(job, worker, turn)
             return None
         return None
+
+    def _barred(self, job: JobState, worker: Worker) -> bool:
+        return self._core.isolation.bar(job.priority, job.group.flow.family, worker)
 
     def _reserve(self, job: JobState, worker: Worker, turn: Turn) -> None:
         """Begin to empty a busy worker for a suspect; a train job does not wait for what is hidden there to end."""
@@ -219,6 +231,7 @@ class Scheduler:
     def dispatch(self, turn: Turn) -> None:
         """Hand out what this step made available."""
         core = self._core
+        core.isolation.settle(turn)
         while self._emptied:
             name = next(iter(self._emptied))
             del self._emptied[name]
@@ -228,6 +241,9 @@ class Scheduler:
         for job in list(islice(core.queue.suspects, SUSPECTS_MAX)):
             lane = job.group.flow.lane
             if lane is not None and job.queued:
+                if job.priority == TRAIN:
+                    avoided = job.avoid if turn.now < job.avoid_until and lane.workers() > 1 else None
+                    self._clear(lane, job.group.flow.family, avoided, turn)
                 self._try_parked(lane, turn, TRIES_MAX)
         fed = list(turn.dirty)
         turn.dirty.clear()
@@ -293,14 +309,16 @@ class Scheduler:
         following = self._core.queue.next_bundle(lane)
         if following is None:
             return None
+        workers, queue = self._core.fleet.workers, self._core.queue
         for item in following:
             for profile in lane.profiles if item is not None else ():
-                names = profile.warm.get(item or "")
-                if names:
-                    return self._core.fleet.workers[next(iter(names))]
+                for name in islice(profile.warm.get(item or "", ()), LOOKS_MAX):
+                    if queue.may_serve(lane, workers[name]):
+                        return workers[name]
         for profile in lane.profiles:
-            if profile.parked:
-                return self._core.fleet.workers[next(iter(profile.parked))]
+            for name in islice(profile.parked, LOOKS_MAX):
+                if queue.may_serve(lane, workers[name]):
+                    return workers[name]
         return None
 
     def _preempt(self, lane: Lane, turn: Turn) -> None:
@@ -315,19 +333,21 @@ class Scheduler:
             core.timers.arm_once(("lane", lane.key), turn.now + LOOK_AGAIN_S)
         wanted = lane.n_ready[TRAIN] - lane.stopping
         avoided = core.queue.avoided(lane, TRAIN, turn.now)
-        for priority in (AUDIT, EARLY_VALIDATION, HELDOUT):
+        for family in list(islice(lane.waiting[TRAIN], FAMILIES_MAX)):
+            wanted -= self._clear(lane, family, avoided, turn)
+        for priority in (HIDDEN_AUDIT, AUDIT, EARLY_VALIDATION, HELDOUT, REFERENCE):
             for profile in lane.profiles:
                 hidden = profile.hidden[priority]
                 for lease in list(islice(reversed(hidden), VICTIMS_MAX)):
                     job = lease.job
                     if wanted <= 0:
                         return
-                    if lease.worker == avoided:
+                    worker = core.fleet.workers[lease.worker]
+                    if lease.worker == avoided or not core.queue.may_train(lane, worker):
                         continue
                     if not self._may_stop(job):
                         del hidden[lease]
                         continue
-                    worker = core.fleet.workers[lease.worker]
                     self._stop_hidden(lease, worker, f"preempted for {lane.key[0]}", turn)
                     if worker.n_live < worker.slots:
                         # Only now a slot comes free by it: what was stopped before had still to wait for one.
@@ -335,9 +355,38 @@ class Scheduler:
                         lane.stopping += 1
                         lease.stopped_for = lane
 
+    def _clear(self, lane: Lane, family: Family | None, avoided: str | None, turn: Turn) -> int:
+        """Stop the related hidden jobs that keep a family's train jobs from kernels, on as many kernels as have slots for
+        them: one that stays bars its whole kernel. Gives the slots that come free."""
+        core, slots = self._core, 0
+        wanted = lane.waiting[TRAIN].get(family, 0)
+        for kernel, leases in core.isolation.to_clear(lane, family):
+            if slots >= wanted:
+                break
+            there = [core.fleet.workers[name] for name in kernel.workers if name != avoided]
+            room = sum(worker.slots for worker in there if worker.profile in lane.profiles)
+            if not room:
+                continue
+            # What may be stopped no more plays to its end; nothing hidden begins there meanwhile.
+            lasting = any(not self._may_stop(lease.job) for lease in leases)
+            for lease in leases:
+                if not lasting or lease.job.priority != HELDOUT:
+                    worker = core.fleet.workers[lease.worker]
+                    self._stop_hidden(lease, worker, f"preempted for {lane.key[0]}", turn)
+            if not lasting:
+                slots += room
+        return slots
+
     def _may_stop(self, job: JobState) -> bool:
         """Whether train jobs may stop a hidden job (once more)."""
-        return job.priority != HELDOUT or job.preemptions < self._core.settings.preemptions_max
+        bounded = job.priority in (HELDOUT, REFERENCE)
+        return not bounded or job.preemptions < self._core.settings.preemptions_max
+
+    def put_off(self, lease: Lease, why: str, turn: Turn) -> None:
+        """Stop a hidden job, through nobody's fault; it goes back into the queue."""
+        worker = self._core.fleet.workers[lease.worker]
+        self._core.book.stop(lease, turn, why)
+        self._core.book.give_back(lease.job, "returned", worker, turn, ran=False)
 
     def _stop_hidden(self, lease: Lease, worker: Worker, why: str, turn: Turn) -> None:
         """Stop a hidden job for the sake of train jobs; it goes back into the queue."""

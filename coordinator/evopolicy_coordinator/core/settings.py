@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
 
@@ -50,5 +52,11 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the episodes of new runs, 0 to 1, whose recorded actions are played again on another worker."""
     audit_wait_s: float = 300.0
     """A run that is done otherwise waits for its audits at most so long."""
+    hidden_isolation: Literal["related", "strict", "off"] = "related"
+    """Which agents and train jobs keep hidden jobs from a kernel: those of runs that share a hidden case, all, or none."""
+    hidden_wait_s: float = 60.0
+    """When hidden jobs of closed runs have been kept waiting for so long, they go first on one kernel."""
+    silent_bar_s: float = 60.0
+    """A silent worker has stopped whatever hidden it played after so long: well above `lease_ttl_s`, after which it does."""
     max_wait_s: float = 60.0
     """Upper bound on any long poll."""

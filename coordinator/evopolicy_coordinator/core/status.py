@@ -70,6 +70,8 @@ def waits_for(core: Core, group: JobGroup) -> str:
     flow = group.flow
     if flow.lane is None or not flow.lane.profiles:
         return _a_worker(flow)
+    if (obstacle := core.isolation.obstacle(group)) and flow.lane.slots():
+        return obstacle
     if flow.lane.slots() == 0:
         return f"{_a_worker(flow)}, of the same versions as the run began with"
     if any(job.lease is None and not job.queued for job in group.jobs.values()):
@@ -120,6 +122,8 @@ def _worker(core: Core, worker: Worker, now: float) -> WorkerStatus:
         running=sum(lease.running for lease in live),
         last_seen_s=max(0.0, now - worker.last_seen),
         refused=refused_runs(core, worker),
+        boot_id=worker.kernel.boot_id,
+        hidden_bar=core.isolation.bar_of_worker(worker),
     )
 
 
@@ -175,6 +179,7 @@ def _run(core: Core, run: Run) -> RunStatus:
         running=run.flow.n_leased,
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=waiting[0] if waiting else "",
+        agent_host=core.isolation.agents(run.id),
     )
 
 

@@ -22,6 +22,7 @@ from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.worker import Fingerprint
 
 from .events import RequestId, WorkerRegistered
+from .isolation import Kernel
 from .jobs import N_PRIORITIES, JobState
 from .leases import Lease
 from .queue import Flow, Profile, Queue
@@ -55,6 +56,8 @@ class LeasePoll:
     warm: frozenset[str]
     until: float
     """When it is answered with what there is."""
+    serial: int = 0
+    """The worker's own number of it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -67,6 +70,10 @@ class Worker:
     host: str
     profile: Profile
     last_seen: float
+    kernel: Kernel
+    machine_id: str = ""
+    first_serial: int | None = None
+    """Number of the session's first poll."""
     machine: str = ""
     """Whose credentials it joined with; empty for those that the state folder hands out."""
     numerics: str = ""
@@ -125,7 +132,7 @@ class Fleet:
             self._count_in(worker)
         return worker
 
-    def register(self, event: WorkerRegistered, turn: Turn) -> Worker:
+    def register(self, event: WorkerRegistered, kernel: Kernel, turn: Turn) -> Worker:
         """Take a worker in, or take it in again under a new session."""
         profile = self._profile(event)
         old = self.workers.get(event.worker)
@@ -136,6 +143,8 @@ class Fleet:
             host=event.host,
             profile=profile,
             last_seen=turn.now,
+            kernel=kernel,
+            machine_id=event.machine_id,
             machine=event.machine,
             numerics=fingerprint_class(event.fingerprint, cpu=True),
             state="lost",

@@ -51,11 +51,13 @@ class Fleet:
                 environments=(msgspec.structs.replace(describe(ENV), deterministic=deterministic),),
                 fingerprint=msgspec.structs.replace(fingerprint(), cpu=cpu),
                 machine=machine,
+                boot_id=f"kernel-of-{name}",
             )
         )
         if not isinstance(reply, wire.Registered):
             raise RefusedError(reply.status, reply.message)
         self.sessions[name] = session
+        self.rig.beat(session)
 
     def hand_in(self, name: str, lease: wire.Lease) -> Any:
         return self.rig.hand_in(self.sessions[name], self.done(name, lease))

@@ -32,7 +32,9 @@ from evopolicy_coordinator.core.records import (
     AuditRow,
     EvaluationRow,
     FinishedRow,
+    KernelRow,
     OutcomeRow,
+    PermitRow,
     Row,
     RunRow,
     RunStateRow,
@@ -88,6 +90,10 @@ def key_of(row: Row) -> tuple[Any, ...]:
             return (WorkerRow, row.worker)
         case AuditRow():
             return (AuditRow, row.audit)
+        case PermitRow():
+            return (PermitRow, row.run, row.boot_id)
+        case KernelRow():
+            return (KernelRow, row.worker)
         case _:
             return (type(row), row.run)
 
@@ -128,6 +134,8 @@ class Rig:
             evaluations=of(EvaluationRow),
             workers=of(WorkerRow),
             audits=of(AuditRow),
+            permits=tuple(row for row in of(PermitRow) if row.ended_at is None),
+            kernels=of(KernelRow),
         )
 
     # ---- driving ----
@@ -174,8 +182,10 @@ class Rig:
     # ---- words ----
 
     def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
-               budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, **settings: Any) -> Any:  # fmt: skip
-        return self.tell(
+               budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
+               hidden_from: int = 1000, **settings: Any) -> Any:  # fmt: skip
+        """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
+        reply = self.tell(
             events.RunCreated(
                 request=self.request(),
                 stimulus_id=f"create-{run}",
@@ -188,11 +198,20 @@ class Rig:
                 min_episodes_per_submit=least,
                 max_episodes_per_submit=most,
                 train=tuple(Case(seed=seed) for seed in range(train)),
-                validation=tuple(Case(seed=1000 + seed) for seed in range(n_valid)),
-                heldout=tuple(Case(seed=2000 + seed) for seed in range(n_held)),
+                validation=tuple(Case(seed=hidden_from + seed) for seed in range(n_valid)),
+                heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
                 split_hashes={},
                 split_secret=True,
             )
+        )
+        if agent is not None and run in self.core.runs:
+            self.permit(run, agent)
+        return reply
+
+    def permit(self, run: str = "r1", boot_id: str = "agents", wait_s: float = 0.0, **more: Any) -> Any:
+        """Ask for a permit; None while it waits."""
+        return self.tell(
+            events.PermitRequested(request=self.request(), run=run, boot_id=boot_id, wait_s=wait_s, **more)
         )
 
     def register(
@@ -214,9 +233,13 @@ class Rig:
                 tiers=more.get("tiers", ("bwrap",)),
                 environments=tuple(describe(env) for env in envs),
                 fingerprint=fingerprint(version),
+                boot_id=more.get("boot_id", f"kernel-of-{worker}"),
+                machine_id=more.get("machine_id", ""),
             )
         )
         assert isinstance(reply, wire.Registered)
+        if self.incarnation > 1:
+            self.beat(session)  # else it may be playing anything from before
         return session
 
     def submit(

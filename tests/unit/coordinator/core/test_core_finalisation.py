@@ -309,14 +309,15 @@ def test_an_unknown_evaluation_is_refused() -> None:
 
 def test_a_run_that_cannot_be_is_refused() -> None:
     rig = Rig()
-    for wrong in (
+    wrongs: tuple[dict[str, Any], ...] = (
         {"budget": 0},
         {"least": 0},
         {"least": 5, "most": 4},
         {"n_valid": 0},
         {"n_held": 0},
         {"least": 17, "most": 20},
-    ):
+    )
+    for wrong in wrongs:
         answer = rig.create("r9", **wrong)
         assert answer.status == "bad_settings", wrong
     assert not rig.rows
