@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,15 @@ from evopolicy_coordinator import certs_cli, process, router_config
 from evopolicy_coordinator.backup import back_up
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.process import Options
+
+
+class Isolation(StrEnum):
+    """`CoreSettings.hidden_isolation`, as an option."""
+
+    RELATED = "related"
+    STRICT = "strict"
+    OFF = "off"
+
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.add_typer(certs_cli.app, name="certs")
@@ -78,6 +88,22 @@ def serve(
             "bit for bit. A third decides where two disagree; a forger gets no more work.",
         ),
     ] = 0.0,
+    hidden_isolation: Annotated[
+        Isolation,
+        typer.Option(
+            help="On kernels with which agents, and beside which train episodes, no hidden episode is played: those of"
+            " `related` runs, which share a hidden case; `strict`: all; `off`: none, and runs are stamped `shared`.",
+        ),
+    ] = Isolation.RELATED,
+    hidden_wait: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="When hidden episodes of closed runs have been kept waiting for so long, no related agent starts on one"
+            " of the machines until they are played.",
+        ),
+    ] = CoreSettings().hidden_wait_s,
     ready_file: Annotated[
         Path | None,
         typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
@@ -101,7 +127,9 @@ def serve(
             insecure_tcp=insecure_tcp,
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
-            core=CoreSettings(audit_share=audit),
+            core=CoreSettings(
+                audit_share=audit, hidden_isolation=hidden_isolation.value, hidden_wait_s=hidden_wait
+            ),
         )
         try:
             asyncio.run(_run(options, ready_file))

@@ -251,9 +251,7 @@ class Intake:
     # Gateways.
 
     def run_opened(self, m: gateway.OpenRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunOpened(
-            stimulus_id=stimulus, request=request, run=m.run, asks_permit=m.asks_permit
-        )
+        return events.RunOpened(stimulus_id=stimulus, request=request, run=m.run, asks_permit=m.asks_permit)
 
     def permit_requested(self, m: gateway.RequestPermit, request: int, stimulus: str) -> AnyEvent:
         check_place(m.boot_id, m.machine_id, m.host)

@@ -81,7 +81,9 @@ def check_place(boot_id: str, machine_id: str, host: str) -> None:
     """Names of a kernel, a machine and a host have a bounded length."""
     for name, value in (("boot id", boot_id), ("machine id", machine_id), ("host name", host)):
         if len(value) > _MAX_NAME or not value.isprintable():
-            raise RefusedError(Refusal.BAD_MESSAGE, f"{name} {value[:64]!r}: at most {_MAX_NAME} printable characters")
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, f"{name} {value[:64]!r}: at most {_MAX_NAME} printable characters"
+            )
 
 
 def check_inline(ref: BlobRef | None) -> None:

@@ -21,6 +21,7 @@ from rich.text import Text
 from evopolicy_common import credentials, transport
 from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.messages.operator import (
+    AgentGone,
     CancelRun,
     Done,
     RepinRun,
@@ -73,6 +74,11 @@ class Operator:
         """End a run without a score."""
         message = CancelRun(token=self.token, run=run)
         await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
+
+    async def agent_gone(self, run: str) -> None:
+        """Vouch that a run's agent is not alive any more."""
+        message = AgentGone(token=self.token, run=run)
+        await self._ask.until_answered("agent-gone", message, Done, patience_s=10.0)
 
     async def repin_run(self, run: str, fingerprint_class: str, reason: str) -> None:
         """Let a run go on with workers of another fingerprint class."""
@@ -178,6 +184,21 @@ def cancel(
     say(f"{run} is cancelled")
 
 
+@runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")
+def agent_gone(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Vouch that a run's agent is not alive any more, when its machine is lost for good.
+
+    Hidden cases may be played on that machine from now on. If the agent is alive after all, it can learn them: when in
+    doubt resume the run, or start the machine anew.
+    """
+    _asking(connect, file, lambda operator: operator.agent_gone(run))
+    typer.echo(f"{run} has no agent any more")
+
+
 @runs_app.command(
     epilog="Example: evopolicy runs repin r-0f2e9a7c11d04b35 b23d564d30c1 --reason 'the old workers are gone'"
 )
@@ -241,7 +262,16 @@ def _classes(reply: StatusReply) -> Iterator[Text]:
 
 def _runs(reply: StatusReply) -> Table:
     table = _table(
-        "run", "entry", "environment", "phase", "budget left", "submits", "queued", "running", "done"
+        "run",
+        "entry",
+        "environment",
+        "phase",
+        "budget left",
+        "submits",
+        "queued",
+        "running",
+        "done",
+        "agent on",
     )
     for run in reply.runs:
         table.add_row(
@@ -254,6 +284,7 @@ def _runs(reply: StatusReply) -> Table:
             str(run.queued),
             str(run.running),
             str(run.done),
+            run.agent_host,
         )
     return table
 
@@ -271,6 +302,8 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
     for worker in reply.workers:
         for run_id, why in worker.refused.items():
             yield f"{worker.worker} gets no work of {run_id}: {why}"
+        if worker.hidden_bar:
+            yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
     yield from reply.stalls
 
 

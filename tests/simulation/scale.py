@@ -123,6 +123,7 @@ class Load:
                     tiers=("bwrap",),
                     environments=descriptions,
                     fingerprint=fingerprint,
+                    boot_id=f"kernel-of-{name}",
                 )
             )
         for _ in range(self._runs):

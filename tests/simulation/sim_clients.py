@@ -12,6 +12,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.refusals import NOT_NOW
 from evopolicy_coordinator.core import events
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ class SimGateway(Asker):
 
     def _opened(self, message: Any) -> None:
         if isinstance(message, wire.Refused):
-            if message.status == "no_worker":
+            if message.status in NOT_NOW:
                 self.later(1.0, self._open)
                 return
             self.closed = True  # finished, or cancelled
@@ -140,6 +141,9 @@ class SimGateway(Asker):
             self.ask(events.SubmitRequested, late, self.simulation.checkers.refused)
 
     def _submitted(self, message: Any) -> None:
+        if isinstance(message, wire.Refused) and message.status in NOT_NOW:
+            self.later(1.0, self._next)
+            return
         if isinstance(message, wire.Refused):
             self.simulation.checkers.submit_refused(self.plan, self.position, message)
             self._after_submit()

@@ -8,8 +8,10 @@ from evopolicy_coordinator.core.records import (
     AuditRow,
     EvaluationRow,
     FinishedRow,
+    KernelRow,
     OutcomeHead,
     OutcomeRow,
+    PermitRow,
     Row,
     RunRow,
     RunStateRow,
@@ -36,6 +38,8 @@ class Disk:
         self.finished: dict[str, FinishedRow] = {}
         self.workers: dict[str, WorkerRow] = {}
         self.audits: dict[str, AuditRow] = {}
+        self.permits: dict[tuple[str, str], PermitRow] = {}
+        self.kernels: dict[str, KernelRow] = {}
 
     def write(self, rows: Iterable[Row]) -> None:
         for row in rows:
@@ -58,6 +62,10 @@ class Disk:
                     self.workers[row.worker] = row
                 case AuditRow():
                     self.audits[row.audit] = row
+                case PermitRow():
+                    self.permits[row.run, row.boot_id] = row
+                case KernelRow():
+                    self.kernels[row.worker] = row
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         return self.outcomes.get(group, {}).get(index)
@@ -89,4 +97,6 @@ class Disk:
             evaluations=tuple(self.evaluations.values()),
             workers=tuple(self.workers.values()),
             audits=tuple(row for row in self.audits.values() if row.run in live),
+            permits=tuple(row for row in self.permits.values() if row.ended_at is None),
+            kernels=tuple(self.kernels.values()),
         )

@@ -142,6 +142,7 @@ class SimWorker(Asker):
             "tiers": ("bwrap",),
             "environments": descriptions,
             "fingerprint": print_of,
+            "boot_id": f"kernel-of-{self.name}",
         }
 
         def registered(message: Any) -> None:

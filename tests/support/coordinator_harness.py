@@ -141,8 +141,11 @@ class InstantWorker:
             tiers=("bwrap",),
             environments=(LINE,),
             fingerprint=self.fingerprint,
+            boot_id=f"kernel-of-{self.name}",
         )
         self.session = (await self.ask.until_answered("register", message, worker.Registered)).session
+        beat = worker.Heartbeat(worker=self.name, session=self.session, held=())
+        await self.ask.until_answered("beat", beat, worker.HeartbeatReply)
 
     def declare_alive(self) -> None:
         self.link.declare_alive(keys.liveliness_key(self.link.credentials.cluster, self.name))

@@ -279,9 +279,8 @@ class Isolation:
             return any(
                 related(each.hidden, family) or self._reversed(each, family) for each in self.kernels.values()
             )
-        if kernel.hidden or self.everywhere.hidden:
-            if related(kernel.hidden, family) or related(self.everywhere.hidden, family):
-                return True
+        if related(kernel.hidden, family) or related(self.everywhere.hidden, family):
+            return True
         return bool(kernel.reversals) and self._reversed(kernel, family)
 
     def _reversed(self, kernel: Kernel, family: Family | None) -> bool:
@@ -413,7 +412,9 @@ class Isolation:
 
     def unknown(self, worker: Worker, item: HeldLease, turn: Turn) -> None:
         """A worker holds a lease that is not its any more: it may play it until it has stopped."""
-        known = item.attempt > self._core.first_attempt or item.lease_id in self.lingering.get(worker.name, {})
+        known = item.attempt > self._core.first_attempt or item.lease_id in self.lingering.get(
+            worker.name, {}
+        )
         if known or not self.on:
             return
         job = self._core.jobs.get(item.job_id)
@@ -549,7 +550,8 @@ class Isolation:
         kernel = self.kernels.get(boot_id)
         families = [] if kernel is None else [each for each, there in kernel.asks.items() if run in there]
         for family in families:
-            assert kernel is not None and family is not None
+            assert kernel is not None
+            assert family is not None
             self._withdraw(run, kernel, family)
             self.freed(family, turn)
             self._tidy(kernel)
@@ -639,7 +641,10 @@ class Isolation:
         if kernel is self.everywhere:
             return NO_BOOT_ID
         rows = [
-            row for each in (kernel, self.everywhere) for there in each.permits.values() for row in there.values()
+            row
+            for each in (kernel, self.everywhere)
+            for there in each.permits.values()
+            for row in there.values()
         ]
         return f"the agent of {rows[0].run} may be alive there" if rows else ""
 
@@ -679,7 +684,9 @@ class Isolation:
         for kernel in self.serving(lane):
             stays = all_related(kernel.hidden, family)
             if stays and not self._reversed(kernel, family):
-                found.append((kernel, [stay.lease for stay in stays if stay.lease is not None and stay.lease.live]))
+                found.append(
+                    (kernel, [stay.lease for stay in stays if stay.lease is not None and stay.lease.live])
+                )
         return sorted(found, key=lambda each: len(each[1]))
 
     def serving(self, lane: Lane) -> dict[Kernel, None]:

@@ -177,9 +177,7 @@ class Profile:
 class Queue:
     """All lanes, the flows in them and the profiles that serve them."""
 
-    def __init__(
-        self, warm_bonus_s: float, bar: Callable[[int, Family | None, Worker], bool]
-    ) -> None:
+    def __init__(self, warm_bonus_s: float, bar: Callable[[int, Family | None, Worker], bool]) -> None:
         """`bar` tells whether jobs of a priority and family must not be leased to a worker now."""
         self._bar = bar
         self.lanes: dict[LaneKey, Lane] = {}
@@ -352,9 +350,7 @@ class Queue:
         self._clock[_RANK[priority]] = max(self._clock[_RANK[priority]], flow.served[priority])
         flow.served[priority] += flow.cost_s(job)
 
-    def _best(
-        self, worker: Worker, rank: tuple[int, ...], warm: Collection[str]
-    ) -> tuple[Flow, int] | None:
+    def _best(self, worker: Worker, rank: tuple[int, ...], warm: Collection[str]) -> tuple[Flow, int] | None:
         best: tuple[Flow, int] | None = None
         best_score = 0.0
         for lane in worker.profile.busy:
@@ -368,9 +364,7 @@ class Queue:
                     if found is None:
                         continue
                     flow, score = found, found.served[priority]
-                if warm and (
-                    flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm
-                ):
+                if warm and (flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm):
                     score -= self._warm_bonus_s
                 if best is None or score < best_score or (score == best_score and flow.seq < best[0].seq):
                     best, best_score = (flow, priority), score

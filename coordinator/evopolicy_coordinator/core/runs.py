@@ -22,8 +22,8 @@ from evopolicy_common.refusals import Refusal
 
 from . import events
 from .effects import ReadFinished, ReadResults
-from .jobs import TRAIN, JobGroup, Template
 from .isolation import Family, implied, stamp
+from .jobs import TRAIN, JobGroup, Template
 from .ledger import Ledger, refusal
 from .polls import Poll
 from .queue import Flow
@@ -195,7 +195,9 @@ def _without_permit(core: Core, request: events.RequestId, run: Run, turn: Turn)
     """Refuse, for now, what an agent asks that may be on any machine, until it may."""
     waits_for = implied(core, run, turn) if run.state.phase == "open" else ""
     if waits_for:
-        turn.refuse(request, Refusal.UNAVAILABLE, f"the run's agent may not start yet; it waits for {waits_for}")
+        turn.refuse(
+            request, Refusal.UNAVAILABLE, f"the run's agent may not start yet; it waits for {waits_for}"
+        )
     return bool(waits_for)
 
 

@@ -238,7 +238,7 @@ class Rig:
             )
         )
         assert isinstance(reply, wire.Registered)
-        if self.incarnation > 1:
+        if self.incarnation > 1 and more.get("beats", True):
             self.beat(session)  # else it may be playing anything from before
         return session
 

@@ -1,0 +1,426 @@
+"""An agent starts once no related hidden episode is played on its kernel, and none starts there while it may be alive."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from core_rig import Rig, result, split_of
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.operator import ELSEWHERE
+from evopolicy_common.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.records import PermitRow
+
+HERE = "kernel-of-w1"
+
+
+def scored(rig: Rig, session: str, run: str = "r0") -> None:
+    """A run that is closed and has hidden cases to play."""
+    rig.create(run, agent=None)
+    rig.permit(run, "agents")
+    rig.submit(0, run=run)
+    rig.play(session, *rig.poll(session))
+    rig.close(run)
+
+
+def gone(rig: Rig, run: str = "r1") -> Any:
+    return rig.tell(events.AgentGone(request=rig.request(), run=run))
+
+
+def reboot(rig: Rig, name: str = "w1", boot_id: str = "another", machine_id: str = "m") -> str:
+    return rig.register(name, boot_id=boot_id, machine_id=machine_id)
+
+
+def splits(leases: list[wire.Lease]) -> set[str]:
+    return {split_of(lease.job) for lease in leases}
+
+
+def test_a_permit_is_durable_and_asked_for_again_at_no_cost() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create(agent=None)
+    for _ in range(2):
+        assert rig.permit("r1", HERE, machine_id="m", host="lab") == gateway.Permit(granted=True)
+    row = rig.row(PermitRow, "r1", HERE)
+    assert (row.host, row.machine_id, row.ended_at) == ("lab", "m", None)
+    rig.load()
+    assert rig.core.status(rig.now).runs[0].agent_host == "lab"
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(restart: bool) -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE)
+    if restart:
+        rig.load()
+        session = rig.register(slots=8)
+        rig.pass_time(rig.settings.adoption_s)
+    assert splits(rig.poll(session, 8)) == {"random"}
+    assert "alive" in rig.core.status(rig.now).workers[0].hidden_bar
+    other = rig.register("w2", slots=8)
+    assert splits(rig.poll(other, 8)) == {"validation"}
+
+
+def test_an_agent_of_a_run_with_other_hidden_cases_is_no_obstacle_unless_all_are() -> None:
+    for rule, wanted in (("related", {"random", "validation"}), ("strict", {"random"})):
+        rig = Rig(hidden_isolation=rule)
+        session = rig.register(slots=8)
+        scored(rig, session)
+        rig.create("r1", agent=HERE, hidden_from=5000)
+        assert splits(rig.poll(session, 8)) == wanted
+
+
+def test_one_shared_case_makes_runs_related() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE, hidden_from=1001)
+    assert splits(rig.poll(session, 8)) == {"random"}
+
+
+def test_an_agent_whose_kernel_is_not_known_keeps_hidden_cases_from_all() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent="")
+    assert splits(rig.poll(session, 8)) == {"random"}
+    assert [run.agent_host for run in rig.core.status(rig.now).runs] == ["", "everywhere"]
+
+
+def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why() -> None:
+    rig = Rig()
+    session = rig.register(slots=8, boot_id="")
+    scored(rig, session)
+    assert splits(rig.poll(session, 8)) == {"random"}
+    told = next(reply for reply in rig.replies.values() if isinstance(reply, wire.Registered))
+    assert "boot id" in told.hidden_bar
+    assert told.hidden_bar == rig.core.status(rig.now).workers[0].hidden_bar
+
+
+def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_let_go() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
+    rig.create("r1", agent=None)
+    assert rig.permit("r1", HERE, wait_s=20.0) is None
+    request = rig._requests
+    assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
+    assert request not in rig.replies
+    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    assert rig.replies[request] == gateway.Permit(granted=True)
+    jobs = [rig.core.jobs[lease.job.job_id] for lease in hidden]
+    assert [(job.preemptions, job.failures) for job in jobs] == [(0, 0)] * len(jobs)
+    assert rig.core.runs["r0"].state.infrastructure_retries == 0
+
+
+def test_a_permit_that_is_not_granted_in_time_says_what_it_waits_for_and_bars_hidden_jobs_until_it_is_asked_again() -> (
+    None
+):
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    assert rig.permit("r1", HERE, wait_s=3.0) is None
+    request = rig._requests
+    rig.beat(session, *leases)
+    rig.pass_time(3.0)
+    rig.beat(session, *leases)
+    assert rig.replies[request].granted is False
+    assert "hidden" in rig.replies[request].waits_for
+    rig.hand_in(session, *(result(lease, "returned") for lease in leases))
+    assert rig.permit("r1", HERE).granted
+
+
+def test_a_request_that_is_never_sent_again_is_forgotten() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    assert not rig.permit("r1", HERE).granted
+    rig.hand_in(session, *(result(lease, "returned") for lease in leases[:0]))
+    rig.pass_time(11.0)
+    rig.beat(session)
+    assert splits(rig.poll(session, 8)) >= {"validation"}
+    assert rig.core.isolation.kernel(HERE).asks == {}
+
+
+def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    rig.pass_time(20.0)  # the worker is lost, its leases are given up
+    assert rig.core.fleet.workers["w1"].state == "lost"
+    assert not rig.permit("r1", HERE).granted
+    assert rig.permit("r1", HERE, wait_s=60.0) is None
+    request = rig._requests
+    rig.pass_time(rig.settings.silent_bar_s - 20.5)
+    assert request not in rig.replies
+    rig.pass_time(1.0)
+    assert rig.replies[request].granted
+
+
+def test_a_silent_worker_that_is_heard_again_without_its_leases_frees_its_kernel_at_once() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    rig.pass_time(20.0)
+    rig.beat(session, *leases)
+    assert not rig.permit("r1", HERE).granted
+    rig.beat(session)
+    assert rig.permit("r1", HERE).granted
+
+
+def test_a_lease_that_is_on_its_way_is_not_taken_for_one_that_was_let_go_of() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.poll(session, 8, serial=7)
+    rig.create("r1", agent=None)
+    assert not rig.permit("r1", HERE).granted
+    before = events.HeartbeatReceived(request=rig.request(), worker="w1", session=session, held=(), settled=6)
+    rig.tell(before)
+    assert not rig.permit("r1", HERE).granted
+    after = events.HeartbeatReceived(request=rig.request(), worker="w1", session=session, held=(), settled=7)
+    rig.tell(after)
+    assert rig.permit("r1", HERE).granted
+
+
+def test_after_a_restart_workers_that_were_known_count_as_playing_until_they_are_heard() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    rig.load()
+    assert not rig.permit("r1", HERE).granted
+    assert rig.permit("r1", "another-machine").granted
+    session = rig.register(slots=8, beats=False)
+    rig.beat(session, *leases)
+    assert not rig.permit("r1", HERE).granted  # told to stop, but not yet known to have
+    rig.beat(session)
+    assert rig.permit("r1", HERE).granted
+
+
+def test_a_hidden_lease_is_not_adopted_where_an_agent_may_be_alive() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    hidden = {lease.lease_id for lease in leases if split_of(lease.job) == "validation"}
+    rig.load()
+    rig.rows[PermitRow, "r0", HERE] = PermitRow(run="r0", boot_id=HERE)
+    rig.load()
+    session = rig.register(slots=8)
+    assert set(rig.beat(session, *leases).cancelled) == hidden
+
+
+def test_a_permit_ends_with_its_run() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create("r1", agent=HERE)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session))
+    assert rig.poll(session, 8) == []
+    rig.close()
+    assert rig.row(PermitRow, "r1", HERE).ended_at == rig.now
+    assert splits(rig.poll(session, 8)) == {"validation", "random"}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_a_cancelled_runs_permit_ends_when_its_gateway_says_so_or_after_a_while(
+    restart: bool, confirmed: bool
+) -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE)
+    rig.tell(events.RunCancelled(request=rig.request(), run="r1"))
+    if restart:
+        rig.load()
+        session = rig.register(slots=8)
+        rig.pass_time(rig.settings.adoption_s)
+    assert "validation" not in splits(rig.poll(session, 2))
+    if confirmed:
+        rig.close("r1")
+    else:
+        rig.pass_time(10.0)
+        rig.beat(session)
+        rig.pass_time(10.0)
+        rig.beat(session)
+        assert "validation" not in splits(rig.poll(session, 2))
+        rig.pass_time(10.0)
+        rig.beat(session)
+    assert "validation" in splits(rig.poll(session, 8))
+    rig.load()
+    assert rig.core.isolation.held("r1") == []
+
+
+def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE)
+    rig.play(session, *rig.poll(session, 8))
+    for _ in range(100):
+        rig.pass_time(5.0)
+        rig.beat(session)
+    assert rig.poll(session, 8) == []
+    (waits_for,) = [run.waits_for for run in rig.core.status(rig.now).runs if run.run == "r0"]
+    assert "evopolicy runs agent-gone r1" in waits_for
+    assert any("agent-gone r1" in line for line in rig.core.status(rig.now).stalls)
+    assert gone(rig) == operator.Done()
+    assert splits(rig.poll(session, 8)) == {"validation"}
+    assert gone(rig, "nobody").status == Refusal.UNKNOWN_RUN
+
+
+@pytest.mark.parametrize("by", ["worker", "gateway"])
+def test_another_boot_id_of_its_machine_ends_a_permit(by: str) -> None:
+    rig = Rig()
+    rig.register()
+    rig.create("r1", agent=None)
+    rig.permit("r1", HERE, machine_id="m")
+    if by == "worker":
+        reboot(rig)
+    else:
+        rig.create("r2", agent=None)
+        rig.permit("r2", "another", machine_id="m")
+    assert rig.row(PermitRow, "r1", HERE).ended_at == rig.now
+
+
+@pytest.mark.parametrize(
+    ("boot_id", "machine_id"), [("another", "other"), ("another", ""), ("", "m"), (HERE, "m")]
+)
+def test_nothing_else_of_a_worker_ends_a_permit(boot_id: str, machine_id: str) -> None:
+    rig = Rig()
+    rig.create("r1", agent=None)
+    rig.permit("r1", HERE, machine_id="m")
+    reboot(rig, boot_id=boot_id, machine_id=machine_id)
+    assert rig.row(PermitRow, "r1", HERE).ended_at is None
+
+
+def test_a_takeover_by_another_host_keeps_the_first_permit() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create("r1", agent=None)
+    rig.permit("r1", HERE, host="first")
+    rig.permit("r1", "elsewhere", host="second")
+    assert rig.core.status(rig.now).runs[0].agent_host == "first, second"
+    gone(rig)
+    assert rig.core.status(rig.now).runs[0].agent_host == ""
+
+
+@pytest.mark.parametrize("by", ["open", "submit"])
+def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    hidden = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+
+    def speak() -> Any:
+        if by == "submit":
+            return rig.submit(0, run="r1")
+        return rig.tell(events.RunOpened(request=rig.request(), run="r1"))
+
+    assert speak().status == Refusal.UNAVAILABLE
+    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    assert not hasattr(speak(), "status")
+    assert rig.core.status(rig.now).runs[1].agent_host == "everywhere"
+
+
+def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create("r1", agent=None)
+    opened = rig.tell(events.RunOpened(request=rig.request(), run="r1", asks_permit=True))
+    assert isinstance(opened, gateway.RunOpened)
+    assert rig.core.isolation.held("r1") == []
+
+
+def test_where_a_remote_agent_is_said_to_be_counts_in_place_of_its_gateways_host() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create("r1", agent="gateway", agent_host="remote")
+    assert [row.boot_id for _, row in rig.core.isolation.held("r1")] == ["remote"]
+
+
+def test_an_agent_that_the_operator_vouches_for_needs_no_permit_and_the_run_says_so() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create("r1", agent="", agent_host=ELSEWHERE)
+    assert rig.core.isolation.held("r1") == []
+    rig.submit(0)
+    rig.work_off(session)
+    rig.close()
+    rig.work_off(session)
+    assert rig.finished().hidden_isolation == "waived"
+
+
+@pytest.mark.parametrize(
+    ("rules", "stamp"),
+    [("rr", "exclusive"), ("oo", "shared"), ("ro", "shared"), ("or", "shared"), ("ror", "shared")],
+)
+def test_a_run_is_stamped_with_what_held_all_its_life(rules: str, stamp: str) -> None:
+    names = {"r": "related", "o": "off"}
+    rig = Rig(hidden_isolation=names[rules[0]])
+    rig.create()
+    for rule in rules[1:]:
+        rig.settings = type(rig.settings)(hidden_isolation=names[rule])  # type: ignore[arg-type]
+        rig.load()
+    session = rig.register()
+    rig.submit(0)
+    rig.work_off(session)
+    rig.close()
+    rig.work_off(session)
+    assert rig.finished().hidden_isolation == stamp
+
+
+def test_with_the_rule_off_nothing_waits() -> None:
+    rig = Rig(hidden_isolation="off")
+    session = rig.register(slots=8, boot_id="")
+    scored(rig, session)
+    rig.create("r1", agent="")
+    assert splits(rig.poll(session, 8)) == {"random", "validation"}
+
+
+def test_closed_runs_and_cancelled_ones_get_no_permit() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    assert rig.permit("r0").status == Refusal.RUN_CLOSED
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    assert rig.permit("r1", HERE, wait_s=9.0) is None
+    request = rig._requests
+    rig.tell(events.RunCancelled(request=rig.request(), run="r1"))
+    assert rig.replies[request].status == Refusal.RUN_CANCELLED
+    rig.hand_in(session, *(result(lease, "returned") for lease in leases))
+    assert splits(rig.poll(session, 8)) == {"random", "validation"}
+
+
+def test_families_are_forgotten_with_the_last_that_is_of_them() -> None:
+    rig = Rig()
+    session = rig.register()
+    for name in ("r1", "r2"):
+        rig.create(name, agent=HERE)
+        rig.submit(0, run=name)
+    rig.work_off(session)
+    for name in ("r1", "r2"):
+        rig.close(name)
+    rig.work_off(session)
+    families = rig.core.isolation.families
+    assert (families._known, families._of_case) == ({}, {})
