@@ -124,7 +124,7 @@ class Player:
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
                     for other in job.episodes[k + 1 :]:
-                        tell(_framed(_unplayed(other.index, failure)))
+                        tell(_framed(_brief(_unplayed(other.index, failure), _share(job))))
                     break
         finally:
             policies.close(progress)
@@ -136,7 +136,7 @@ class Player:
         episode = _Episode(job, spec, self._environment(job.env), policies, progress, self._videos)
         try:
             outcome = episode.play(k)
-            return outcome.failure, _framed(outcome)
+            return outcome.failure, _framed(_brief(outcome, _share(job)))
         except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
             raise
         except Exception as error:
@@ -153,7 +153,7 @@ class Player:
             )
         environment = self._environment(job.env)
         episode = _Episode(job, spec, environment, policies, progress, self._videos, failure)
-        return failure, _framed(episode.play(k))
+        return failure, _framed(_brief(episode.play(k), _share(job)))
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""

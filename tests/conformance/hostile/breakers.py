@@ -217,7 +217,7 @@ BREAKERS = (
     ),
     Breaker(
         name="an array of four billion empty lists",
-        act="return np.empty((2**32 - 1, 0))",
+        act="return np.empty((2**31, 2**31, 0))",
         verdict="act_error",
     ),
     Breaker(

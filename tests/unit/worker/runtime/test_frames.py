@@ -144,6 +144,7 @@ def test_both_ends_agree_on_the_numbers() -> None:
         "FAULT",
         "VALUE_BYTES",
         "MAX_AXES",
+        "MAX_USED",
     ):
         assert getattr(frames, name) == getattr(player, name), name
     assert frames.REQUEST_HEADER.format == player.REQUEST_HEADER.format

@@ -31,8 +31,8 @@ MAX_ACTION_DEPTH = 16
 MAX_AXES = 16
 VALUE_BYTES = 16
 """As many bytes as an action may have, so many values may it hold at this size each."""
-MOST_VALUES = 1 << 53
-"""So many are told of an action that holds more."""
+MAX_USED = 1 << 53
+"""So many bytes are told of an action that takes more."""
 MAX_TEXT = 16_000
 
 libc = ctypes.CDLL(None, use_errno=True)
@@ -249,7 +249,7 @@ def encoded(action: Any) -> bytes:
 def check_values(n: int) -> None:
     if n > action_bytes // VALUE_BYTES:
         how = f"the action holds {n:,} values; {action_bytes // VALUE_BYTES:,} are the limit"
-        raise TooLargeError(how, min(n, MOST_VALUES) * VALUE_BYTES)
+        raise TooLargeError(how, min(n * VALUE_BYTES, MAX_USED))
 
 
 def numbers_of(array: Any) -> int:
