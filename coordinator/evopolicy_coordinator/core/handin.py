@@ -5,8 +5,8 @@ Rules that this module owns:
   counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
   stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
-- An attempt that another worker was given, or that was never given, is ignored and logged; so is one of a worker that
-  the job's group bars.
+- An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
+  name proves its grant. So is one of a worker that the job's group bars.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
 - A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
   that.
@@ -22,7 +22,7 @@ from evopolicy_common.messages.worker import JobResult
 
 from . import audit
 from .jobs import JobState, mark_of
-from .leases import Lease, lease_id
+from .leases import Lease
 from .records import OutcomeRow, StrikeRow
 from .retry import Mishap
 from .turn import Turn
@@ -36,12 +36,11 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
     """Take in one result of a hand-in."""
     job = core.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
-    if job is None or result.lease_id != lease_id(result.job_id, result.attempt):
-        _closed(core, worker, lease, result, turn)
+    granted = core.book.granted(result.lease_id, result.job_id, result.attempt, worker)
+    if job is None or not granted:
+        _closed(core, worker, lease, result, turn, granted=granted)
         return
-    known = core.first_attempt >= result.attempt > 0
-    barred = job.group.bars(worker)
-    if barred or job.holders.get(result.attempt, worker.name if known else None) != worker.name:
+    if job.group.bars(worker):
         turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
@@ -59,12 +58,24 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         core.book.give_back(job, mishap, worker, turn, ran=True, error=result.error)
 
 
-def _closed(core: Core, worker: Worker, lease: Lease | None, result: JobResult, turn: Turn) -> None:
-    """A result of a job that is done, or was cancelled."""
-    if lease is not None and lease.id == result.lease_id:
+def _closed(
+    core: Core, worker: Worker, lease: Lease | None, result: JobResult, turn: Turn, *, granted: bool
+) -> None:
+    """A result of a job that is done or was cancelled, or of a lease that this worker was not given."""
+    if lease is not None:
+        live = lease.live
         core.book.release(worker, lease, turn, f"handed in late: {result.kind}", sure=True)
+        if live:
+            error = f"its result is said to be of {result.job_id[:80]!r}, attempt {result.attempt}"
+            core.fleet.failed(worker, turn)
+            core.book.give_back(lease.job, "failed", worker, turn, ran=True, error=error)
     group = core.groups.get(result.job_id.rpartition("/")[0])
-    if group is None or result.kind != "done":
+    if group is None:
+        return
+    if not granted:
+        turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id[:200])
+        return
+    if result.kind != "done":
         return
     for outcome in result.episodes:
         mark = group.marks.get(outcome.index)

@@ -91,7 +91,7 @@ def _jobs(core: Core) -> None:
                 worker = core.fleet.workers.get(lease.worker)
                 held = worker is not None and worker.leases.get(lease.id) is lease
                 want(core, key, held and lease.live, "its lease is its worker's, and live")
-                want(core, key, job.holders.get(lease.attempt) == lease.worker, "its holder is noted")
+                want(core, key, lease.attempt in job.held_attempts, "its attempt is noted")
     want(
         core,
         "",

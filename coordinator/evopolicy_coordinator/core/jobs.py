@@ -128,8 +128,8 @@ class JobState:
     preemptions: int = 0
     since: float = 0.0
     """When it last began to wait."""
-    holders: dict[int, str] = field(default_factory=dict)
-    """Attempts of this incarnation and who got them."""
+    held_attempts: set[int] = field(default_factory=set)
+    """Attempts that this incarnation granted or adopted: none is adopted twice."""
 
     def names_blob(self, digest: str) -> bool:
         """Whether its worker needs the blob: the bundle, or a recording that it plays."""

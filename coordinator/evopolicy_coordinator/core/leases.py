@@ -12,6 +12,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -71,9 +73,14 @@ class Lease:
     """Where it is, if it is hidden or train: as long as it is its worker's."""
 
 
-def lease_id(job_id: str, attempt: int) -> str:
-    """Names a lease by what it is of: equal in every incarnation."""
-    return f"{job_id}#{attempt}"
+def lease_id(secret: bytes, job_id: str, attempt: int, worker: str) -> str:
+    """Names a lease by what it is of: equal in every incarnation.
+
+    Only who knows the run's secret can make it: it proves to a later incarnation, which has no list of what earlier ones
+    granted, that this worker was given this attempt.
+    """
+    proof = hmac.digest(secret, f"lease|{job_id}|{attempt}|{worker}".encode(), hashlib.sha256)
+    return f"{job_id}#{attempt}#{proof[:12].hex()}"
 
 
 class LeaseBook:
@@ -83,6 +90,15 @@ class LeaseBook:
         self._core = core
         self.n_live = 0
 
+    def granted(self, name: str, job_id: str, attempt: int, worker: Worker) -> bool:
+        """Whether a lease of that name was granted to the worker, by this incarnation or an earlier one."""
+        group = self._core.groups.get(job_id.rpartition("/")[0])
+        if group is None:
+            return False
+        return hmac.compare_digest(
+            name.encode(), lease_id(self._core.secret_of(group), job_id, attempt, worker.name).encode()
+        )
+
     # ---- getting ----
 
     def grant(self, job: JobState, worker: Worker, turn: Turn) -> wire.Lease:
@@ -90,7 +106,7 @@ class LeaseBook:
         job.attempts += 1
         serial = 0 if worker.poll is None else worker.poll.serial
         lease = self._enter(job, worker, job.attempts, turn, serial=serial)
-        job.holders[lease.attempt] = worker.name
+        job.held_attempts.add(lease.attempt)
         group = job.group
         description = group.flow.description or worker.profile.descriptions[group.template.env]
         self._core.chronicle.tell(turn.now, turn.stimulus_id, lease.id, f"granted to {worker.name}")
@@ -104,7 +120,7 @@ class LeaseBook:
 
     def _enter(self, job: JobState, worker: Worker, attempt: int, turn: Turn, *, serial: int) -> Lease:
         now = turn.now
-        name = lease_id(job.job_id, attempt)
+        name = lease_id(self._core.secret_of(job.group), job.job_id, attempt, worker.name)
         lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
         job.lease = lease
         worker.leases[name] = lease
@@ -179,9 +195,8 @@ class LeaseBook:
         if (
             job is None
             or job.lease is not None
-            or item.lease_id != lease_id(item.job_id, item.attempt)
-            or not 0 < item.attempt <= core.first_attempt
-            or item.attempt in job.holders
+            or item.attempt in job.held_attempts
+            or not self.granted(item.lease_id, item.job_id, item.attempt, worker)
             or job.group.bars(worker)
             or not core.isolation.adoptable(job, worker)
         ):
@@ -190,7 +205,7 @@ class LeaseBook:
         core.queue.withdraw(job)
         core.timers.disarm(("job", job.job_id))
         core.adopting.pop(job, None)
-        job.holders[item.attempt] = worker.name
+        job.held_attempts.add(item.attempt)
         core.chronicle.tell(turn.now, turn.stimulus_id, item.lease_id, f"adopted from {worker.name}")
         lease = self._enter(job, worker, item.attempt, turn, serial=0)
         lease.doubtful = True

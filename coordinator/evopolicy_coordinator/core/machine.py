@@ -237,6 +237,11 @@ class Core:
 
     # ---- flows and groups ----
 
+    def secret_of(self, group: JobGroup) -> bytes:
+        """The secret of the run or evaluation that the group is part of."""
+        run = self.runs.get(group.run)
+        return self.evaluations[group.run].row.secret if run is None else run.row.secret
+
     def add_flow(self, name: str, env: str, tier: Tier, family: Family | None) -> Flow:
         """A new flow for a run or an evaluation, not pinned to workers yet."""
         self._flows += 1

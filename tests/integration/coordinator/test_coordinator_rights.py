@@ -286,7 +286,7 @@ def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> None:
             bundle = bundle_of("# too late")
             with pytest.raises(RefusedError) as refused:
                 await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
-            assert refused.value.status == "closed"
+            assert refused.value.status == "run_closed"
 
     run(scenario)
 

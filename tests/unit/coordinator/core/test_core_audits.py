@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core import audit, events
+from evopolicy_coordinator.core.leases import lease_id
 
 # ---- who plays what again ----
 
@@ -178,7 +179,8 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
     (job,) = [job for job in fleet.rig.core.jobs.values() if job.group.kind == "audit"]
     fleet.rig.load()
     fleet.join("w1")
-    claimed = wire.HeldLease(lease_id=f"{job.job_id}#1", job_id=job.job_id, attempt=1, running=True)
+    name = lease_id(fleet.rig.core.secret_of(job.group), job.job_id, 1, "w1")
+    claimed = wire.HeldLease(lease_id=name, job_id=job.job_id, attempt=1, running=True)
     reply = fleet.rig.tell(
         events.HeartbeatReceived(
             request="beat", worker="w1", session=fleet.sessions["w1"], held=(claimed,), wait_s=0.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 from core_rig import Rig, done, outcome_of, result
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.leases import FORGET_S
+from evopolicy_coordinator.core.leases import FORGET_S, lease_id
 from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
 
 GROUP = "r1/s0/train"
@@ -325,6 +326,47 @@ def test_a_result_that_outlives_the_coordinator_is_taken() -> None:
     session = rig.register("w1")
     rig.play(session, lease, value=6.0)
     assert rig.row(OutcomeRow, GROUP, 0).outcome.episode_return == 6.0
+
+
+def test_what_was_never_granted_is_neither_taken_nor_adopted_after_a_restart() -> None:
+    rig, _, lease = one_job("w1")
+    rig.load()
+    thief = rig.register("w2")
+    made_up = [
+        msgspec.structs.replace(lease, attempt=attempt, lease_id=name)
+        for attempt in (1, 2, 999_999, 1_000_000)
+        for name in (
+            lease.lease_id,
+            f"{lease.job.job_id}#{attempt}",
+            f"{lease.job.job_id}#{attempt}#{lease.lease_id.rpartition('#')[2]}",
+            lease_id(b"another secret", lease.job.job_id, attempt, "w2"),
+        )
+    ]
+    for forged in made_up:
+        rig.hand_in(thief, done(forged, value=99.0))
+        assert rig.beat(thief, forged).cancelled == (forged.lease_id,)
+    assert (OutcomeRow, GROUP, 0) not in rig.rows
+    session = rig.register("w1")
+    assert rig.beat(session, lease).cancelled == ()
+    rig.play(session, lease, value=6.0)
+    assert rig.row(OutcomeRow, GROUP, 0).outcome.episode_return == 6.0
+
+
+def test_a_result_of_a_lease_that_was_never_granted_accuses_no_run_of_nondeterminism() -> None:
+    rig, (first,), lease = one_job("w1")
+    other = rig.register("w2")
+    rig.play(first, lease, value=6.0)
+    rig.hand_in(other, done(lease, value=7.0))
+    assert rig.core.runs["r1"].state.nondeterministic_results == 0
+
+
+def test_a_result_of_another_job_under_ones_own_lease_gives_the_leased_job_back() -> None:
+    rig, (first,), lease = one_job("w1")
+    wrong = msgspec.structs.replace(result(lease, "done"), job_id=f"{GROUP}/7")
+    rig.hand_in(first, wrong)
+    rig.pass_time(10.0)
+    (again,) = rig.poll(first)
+    assert again.job == lease.job
 
 
 def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest() -> None:
