@@ -39,7 +39,7 @@ def urls_below(base: str, token: str, *, bearer: bool = False) -> Urls:
     return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit", bearer=bearer)
 
 
-_ASK = 'SUBMIT_URL + "/" + answer["submit_id"]'
+_ASK = 'SUBMIT_URL + "/" + str(answer["submit_id"])'
 _WITHOUT_BEARER = {
     "auth": "",
     "addresses": "service's addresses are also in `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.",
@@ -56,6 +56,9 @@ _WITH_BEARER = {
     "more_headers": ", **AUTH",
     "question": f"urllib.request.Request({_ASK}, headers=AUTH)",
 }
+
+LAST_WORDS_S = 10.0
+"""What an agent gets to end by itself once its budget is spent."""
 
 NO_URLS = Urls(info="INFO_URL", task="TASK_URL", submit="SUBMIT_URL")
 """What stands for the URLs where only the rules count: for the hash in `run.json`."""
@@ -108,7 +111,7 @@ curl -sS ${auth}-X POST -H 'Content-Type: application/json' -d '{"env_instances"
 ```
 
 It answers when all episodes are played. If your tools give up on slow commands, do not wait: `?wait=false` answers at once
-with a `submit_id`, which you can ask about until its `status` is no longer `running`. From Python:
+with a `submit_id`, a number, which you can ask about until its `status` is no longer `running`. From Python:
 
 ```python
 import json, ${os}time, urllib.request, uuid
@@ -129,7 +132,7 @@ def submit(env_instances):
     return answer
 
 answer = submit($example)
-print(answer["submit_id"], answer["status"], answer["summary"]["mean_return"])
+print(answer["feedback"], answer["status"], answer["summary"]["mean_return"])
 ```
 
 | answer | meaning |
@@ -139,7 +142,11 @@ print(answer["submit_id"], answer["status"], answer["summary"]["mean_return"])
 | 200, `rollout_timeout`, `quarantined` | it took too long, or it kept bringing its sandbox down: charged |
 | 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
 | 200 or 400, `cancelled` | the operator has ended the run: nothing charged, nothing more is taken |
+| 409, `run_closed` | the budget is spent: no more submits are taken |
 | 409 | another submit is running, or an `Idempotency-Key` was used twice for different requests |
+
+The answer to the submit that spends the budget has `"is_finalized": true`, and so has `/info`. You then have $last_words s to end by
+yourself before you are ended.
 
 ## The policy
 
@@ -242,6 +249,7 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         task_url=urls.task,
         info_url=urls.info,
         submit_url=urls.submit,
+        last_words=f"{LAST_WORDS_S:g}",
     )
 
 

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from evopolicy_common.errors import RequestError
 from evopolicy_gateway.info import info_document, progress_document
 from evopolicy_gateway.submit_request import MAX_BODY_BYTES, refuse_size
-from evopolicy_gateway.submits import Desk
+from evopolicy_gateway.submits import RUN_CLOSED, Desk
 from evopolicy_gateway.task import task_markdown
 from evopolicy_gateway.tickets import ConflictError, Ticket
 
@@ -47,7 +47,7 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
 
     async def info(request: Request) -> Response:
         state = await desk.refresh()
-        return _json(200, info_document(desk.run, state, desk.closed, desk.in_flight))
+        return _json(200, info_document(desk.run, state, desk.spent, desk.in_flight))
 
     async def task_text(request: Request) -> Response:
         return Response(task, media_type="text/markdown; charset=utf-8")
@@ -71,13 +71,16 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
             await ticket.done.wait()
         else:
             await _within(ticket.decided, DECIDED_WAIT_S)
-        return _of_ticket(ticket)
+        return _of_ticket(ticket, desk)
 
     async def ask_submit(request: Request) -> Response:
         ticket = desk.find(request.path_params["submit_id"])
         if ticket is None:
             raise HTTPException(404)
-        return _of_ticket(ticket)
+        return _of_ticket(ticket, desk)
+
+    async def finalize(request: Request) -> Response:
+        raise HTTPException(405)
 
     app = Starlette(
         routes=[
@@ -85,6 +88,8 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
             Route("/task", task_text, methods=["GET"]),
             Route("/submit", submit, methods=["POST"]),
             Route("/submit/{submit_id}", ask_submit, methods=["GET"]),
+            # The published service ends a run by itself and says so of this path.
+            Route("/finalize", finalize, methods=["GET", "POST"]),
         ],
         exception_handlers={
             HTTPException: _http_error,
@@ -97,13 +102,21 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
     return _TokenGate(app, token, bearer)
 
 
-def _of_ticket(ticket: Ticket) -> Response:
+def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
     """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
     if ticket.error is not None:
         raise ticket.error
     if ticket.summary is None:
         return _json(202, progress_document(ticket))
-    head = orjson.dumps({"submit_id": ticket.submit_id, "status": ticket.status})
+    last = desk.spent and ticket is desk.tickets[-1]
+    head = orjson.dumps(
+        {
+            "submit_id": ticket.index,
+            "status": ticket.status,
+            "is_finalized": last,
+            "feedback": f"feedback/{ticket.submit_id}",
+        }
+    )
     body = head[:-1] + b',"summary":' + ticket.summary + b"}"
     return Response(body, media_type="application/json")
 
@@ -149,8 +162,8 @@ async def _request_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
     if isinstance(error, ConflictError):
-        return _json(409, document | {"submit_id": error.submit_id})
-    return _json({"closed": 503, "gateway_failed": 500}.get(error.status, 400), document)
+        return _json(409, document | {"submit_id": error.index})
+    return _json({RUN_CLOSED: 409, "closed": 503, "gateway_failed": 500}.get(error.status, 400), document)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

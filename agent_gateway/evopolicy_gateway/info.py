@@ -11,7 +11,9 @@ from evopolicy_common.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.tickets import Ticket
 
 
-def info_document(run: RunOpened, state: RunState, closed: bool, in_flight: Ticket | None) -> dict[str, Any]:
+def info_document(
+    run: RunOpened, state: RunState, finalized: bool, in_flight: Ticket | None
+) -> dict[str, Any]:
     """What an agent may know of the run, as plain values."""
     env = run.env
     env_meta: dict[str, Any] = {
@@ -33,7 +35,7 @@ def info_document(run: RunOpened, state: RunState, closed: bool, in_flight: Tick
         "state": {
             "remaining_budget": state.remaining_budget,
             "n_submits": state.n_submits,
-            "is_finalized": closed or state.is_finalized,
+            "is_finalized": finalized or state.is_finalized,
         },
         "env_meta": env_meta,
         "episode_budget": run.episode_budget,
@@ -58,7 +60,7 @@ def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str
     if seen is not None and ticket.accepted is not None and seen.submit_index == ticket.accepted.submit_index:
         n_done, waits_for = max(n_done, seen.n_done), waits_for or seen.waits_for
     return {
-        "submit_id": ticket.submit_id,
+        "submit_id": ticket.index,
         "status": "running",
         "n_episodes": len(ticket.request.env_instances),
         "n_done": n_done,

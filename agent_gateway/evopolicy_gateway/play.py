@@ -26,6 +26,7 @@ from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import children, control, harnesses, record
+from evopolicy_gateway.agents_md import LAST_WORDS_S
 from evopolicy_gateway.alone import alone, check_free
 from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
@@ -48,8 +49,6 @@ from evopolicy_gateway.operations import Operations
 from evopolicy_gateway.times import Stopwatch
 from evopolicy_gateway.watch import Watch
 
-LAST_WORDS_S = 10.0
-"""What an agent gets to end by itself once its budget is spent."""
 END_GRACE_S = 15.0
 GIVE_UP_PATIENCE_S = 10.0
 """For telling the coordinator that a run is given up, which may be why it is."""

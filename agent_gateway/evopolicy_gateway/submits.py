@@ -60,6 +60,8 @@ DISK_PAUSE_S = 2.0
 """Between tries to write feedback while the disk refuses."""
 MAX_REJECTED_KEPT = 1000
 FETCHES_AT_ONCE = 4
+RUN_CLOSED = "run_closed"
+"""What the published protocol calls a submit's refusal after the last one."""
 MAX_DEATHS = 2
 """So often a gateway may end over one submit, or over the files of one episode, before that is put aside."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
@@ -135,17 +137,17 @@ class Desk:
                 if ticket.request.client_key == client_key:
                     if ticket.request.body_digest != body_digest:
                         raise ConflictError(
-                            ticket.submit_id,
+                            ticket.index,
                             f"this Idempotency-Key was used for {ticket.submit_id} with another body; use a new key",
                         )
                     return ticket
         try:
             if self.in_flight is not None:
                 raise ConflictError(
-                    self.in_flight.submit_id,
-                    f"{self.in_flight.submit_id} is running; wait for it, or ask GET /submit/{self.in_flight.submit_id}",
+                    self.in_flight.index,
+                    f"{self.in_flight.submit_id} is running; wait for it, or ask GET /submit/{self.in_flight.index}",
                 )
-            if self.closed:
+            if self.spent:
                 raise self._refusal()
             env_instances = parse(body, self.bounds())
         except RequestError as error:
@@ -167,9 +169,11 @@ class Desk:
         self._start(ticket, fresh=True)
         return ticket
 
-    def find(self, submit_id: str) -> Ticket | None:
-        """The submit of that name."""
-        return next((ticket for ticket in self.tickets if ticket.submit_id == submit_id), None)
+    def find(self, name: str) -> Ticket | None:
+        """The submit of that index or folder name."""
+        return next(
+            (ticket for ticket in self.tickets if name in (str(ticket.index), ticket.submit_id)), None
+        )
 
     async def note_rejected(self, error: RequestError) -> None:
         """Keeps a refused request for `run.json`."""
@@ -265,7 +269,7 @@ class Desk:
         except RefusedError as error:
             if error.status in RUN_OVER:
                 self._refused(error)
-                ticket.fail(self._refusal("budget_invalid" if ticket.accepted is None else "closed"))
+                ticket.fail(self._refusal(RUN_CLOSED if ticket.accepted is None else "closed"))
             elif not await self._goes_on_without(ticket, error):
                 return
         except Exception as error:
@@ -471,11 +475,12 @@ class Desk:
             self.closed, self.cancelled = True, self.cancelled or cancelled
             self._on_change()
 
-    def _refusal(self, status: str = "budget_invalid") -> RequestError:
-        """What a submit is answered once the run is closed."""
+    def _refusal(self, status: str = RUN_CLOSED) -> RequestError:
+        """What a submit is answered once no more are taken."""
         if self.cancelled:
             return RequestError(CANCELLED, "the operator cancelled the run: no more submits are taken")
-        return RequestError(status, "the run is closed: no more submits are taken")
+        why = "the run is closed" if self.closed else "the episode budget is spent"
+        return RequestError(status, f"{why}: no more submits are taken")
 
     async def _note(self, entry: AnyEntry) -> None:
         """Appends to the journal off the event loop, in order; waits while the disk refuses."""

@@ -15,9 +15,10 @@ from evopolicy_gateway.snapshots import Snapshot
 class ConflictError(RequestError):
     """The request contradicts one that was taken before: another submit runs, or the key has another body."""
 
-    def __init__(self, submit_id: str, message: str) -> None:
+    def __init__(self, index: int, message: str) -> None:
         super().__init__("conflict", message)
-        self.submit_id = submit_id
+        self.index = index
+        """Of the submit that it contradicts."""
 
 
 class Ticket:
@@ -26,7 +27,9 @@ class Ticket:
     def __init__(self, request: Requested, index: int, episode_budget: int) -> None:
         """`index` is the number it will have: this gateway is the only one that submits for its run."""
         self.request = request
+        self.index = index
         self.submit_id = submit_id(index, episode_budget)
+        """Its folder's name."""
         self.n_done = 0
         """Episodes whose feedback is written."""
         self.waits_for = ""
@@ -49,6 +52,7 @@ class Ticket:
     def accept(self, accepted: Accepted) -> None:
         """The coordinator has taken it: from now on it has its name."""
         self.accepted = accepted
+        self.index = accepted.submit_index
         self.submit_id = submit_id(accepted.submit_index, self._episode_budget)
         self.decided.set()
 

@@ -22,7 +22,7 @@ from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
 SCHEMA_VERSION = 1
 """Raised only when an older reader would misunderstand a file; fields may be added without it."""
 
-PROTOCOL_VERSION = "v2.0-draft"
+PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
 
 RunStatus = Literal["completed", "no_ok_submit", "error", "cancelled"]

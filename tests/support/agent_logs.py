@@ -58,7 +58,7 @@ def codex_log(versions: Sequence[Version]) -> list[dict[str, Any]]:
         lines.append(
             _item({"type": "file_change", "changes": [{"path": "system/policy.py", "kind": "update"}]})
         )
-        reply = json.dumps({"submit_id": f"submit_{index:03d}", "status": version.status})
+        reply = json.dumps({"submit_id": index, "status": version.status})
         submit = "curl -X POST $EVOPOLICYGYM_SUBMIT_URL -d @request.json"
         lines.append(_item({"type": "command_execution", "command": submit, "aggregated_output": reply}))
     return lines

@@ -28,7 +28,7 @@ class Refusal:
     """A submit that was refused and cost nothing."""
 
     status: str
-    """`budget_invalid` or `invalid_env_instance`."""
+    """`budget_invalid`, `invalid_env_instance`, `run_closed`."""
     message: str
 
 
@@ -36,8 +36,8 @@ class Refusal:
 class Verdict:
     """A submit that was charged."""
 
-    submit_id: str
-    """Also the name of its folder under `feedback/`."""
+    name: str
+    """Of its folder under `feedback/`."""
     status: str
     summary: dict[str, Any]
     """What `summary.json` says; its arrays are null unless the status is `ok`."""
@@ -101,12 +101,13 @@ class Client:
 
     def _await(self, reply: dict[str, Any]) -> Verdict:
         wait_s = self.poll_s
-        submit_id = str(reply["submit_id"])
+        index = int(reply["submit_id"])
         while reply.get("summary") is None:
             self.sleep(wait_s)
             wait_s = min(wait_s * 1.2, 8 * self.poll_s)
-            reply = self._expect_json(*self._request(_extended(self.submit_url, path=submit_id)))
-        return Verdict(submit_id=submit_id, status=str(reply["status"]), summary=reply["summary"])
+            reply = self._expect_json(*self._request(_extended(self.submit_url, path=str(index))))
+        name = str(reply["feedback"]).rpartition("/")[2]
+        return Verdict(name=name, status=str(reply["status"]), summary=reply["summary"])
 
     def _expect_json(self, status: int, body: bytes) -> dict[str, Any]:
         if status not in (200, 202):

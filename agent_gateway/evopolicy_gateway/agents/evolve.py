@@ -126,12 +126,12 @@ class Agent:
         if tells_apart and not self._lessons.wanted:
             return []
         first = int(verdict.summary["first_global_episode"])
-        folders = episode_folders(self._workspace, verdict.submit_id, n_episodes, first)
+        folders = episode_folders(self._workspace, verdict.name, n_episodes, first)
         return [read_steps(folder, MAX_ROWS_READ) for folder in folders]
 
     def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
         """One line: what was played, how it went, what leads, what is left."""
-        line = f"{verdict.submit_id} {title}: {verdict.status}, {len(candidates)} candidates"
+        line = f"{verdict.name} {title}: {verdict.status}, {len(candidates)} candidates"
         returns = verdict.summary.get("returns")
         if verdict.status == "ok" and returns:
             line += f", mean {np.mean(returns):.2f}, best {np.max(returns):.2f}"

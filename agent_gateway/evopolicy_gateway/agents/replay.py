@@ -82,9 +82,7 @@ def play(client: Client, folder: Path, workspace: Path) -> int:
             print(f"{policy}: refused, {verdict.status}: {verdict.message}", flush=True)
             continue
         n_taken += 1
-        print(
-            f"{policy}: {verdict.submit_id} {verdict.status} {verdict.summary.get('mean_return')}", flush=True
-        )
+        print(f"{policy}: {verdict.name} {verdict.status} {verdict.summary.get('mean_return')}", flush=True)
     return n_taken
 
 

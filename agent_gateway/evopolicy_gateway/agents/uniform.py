@@ -85,7 +85,7 @@ def play(client: Client, workspace: Path) -> bool:
     if isinstance(verdict, Refusal):
         print(f"refused, {verdict.status}: {verdict.message}", flush=True)
         return False
-    print(f"{verdict.submit_id}: {verdict.status} {verdict.summary.get('mean_return')}", flush=True)
+    print(f"{verdict.name}: {verdict.status} {verdict.summary.get('mean_return')}", flush=True)
     return True
 
 

@@ -1,8 +1,8 @@
 """Any program as an agent: started in the workspace with the three URLs.
 
-It may also speak the turn protocol, JSON lines: it is sent `{"type": "prompt", "turn": N, "message": …}` on stdin and
-answers `{"turn": N, "text": …, "stop": bool}` on stdout, until it says stop or exits. A program that never reads its
-stdin and prints what it likes is as good: it plays until it exits.
+It may also speak the published turn protocol, JSON lines: it is sent `{"type": "prompt", "turn": N, "message": …}` on stdin
+and answers each with one object on stdout, until it says stop or exits. `turn`, `text` and `stop` are optional in an answer; an
+answer to an earlier turn is passed over. A program that never reads its stdin plays until it exits, whatever it prints.
 """
 
 from __future__ import annotations
@@ -62,22 +62,31 @@ class CommandHarness(Harness):
 async def _talk(process: AgentProcess, stage: Stage) -> tuple[int, bool]:
     """Turns answered, and whether the program said stop. Ends with the program's stdout."""
     turn = 0
-    saying = asyncio.create_task(_prompt(process, stage, turn))
+    answered = asyncio.Event()
+    answered.set()
+
+    async def prompt() -> None:
+        # Apart from reading: a program that prints objects and never reads fills its stdin, and must still be read.
+        while True:
+            await answered.wait()
+            answered.clear()
+            await _prompt(process, stage, turn)
+
+    prompting = asyncio.create_task(prompt())
     try:
         async for line in process.lines():
             answer = _answer(line)
-            if answer is None or answer["turn"] != turn:
+            if answer is None or answer.get("turn", turn) != turn:
                 continue
             turn += 1
             stage.on_turn(turn, str(answer.get("text", "")))
-            if answer["stop"]:
+            if answer.get("stop") is True:
                 process.hang_up()
                 return turn, True
-            await saying
-            saying = asyncio.create_task(_prompt(process, stage, turn))
+            answered.set()
     finally:
-        saying.cancel()
-        await asyncio.gather(saying, return_exceptions=True)
+        prompting.cancel()
+        await asyncio.gather(prompting, return_exceptions=True)
     return turn, False
 
 
@@ -99,12 +108,10 @@ async def _message(stage: Stage, turn: int) -> str:
 
 
 def _answer(line: bytes) -> dict[str, Any] | None:
-    """The line as a turn's answer; None for anything else that a program prints."""
+    """The line as a turn's answer; None for what is no JSON object."""
     if not line.lstrip().startswith(b"{"):
         return None
     try:
-        document = orjson.loads(line)
+        return dict(orjson.loads(line))
     except orjson.JSONDecodeError:
         return None
-    known = isinstance(document.get("turn"), int) and isinstance(document.get("stop"), bool)
-    return document if known else None

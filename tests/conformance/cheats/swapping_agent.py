@@ -26,7 +26,7 @@ def submit(ids):
     with urllib.request.urlopen(request) as reply:
         told = json.load(reply)
     try:
-        with open(os.path.join("feedback", told["submit_id"], "errors.txt")) as errors:
+        with open(os.path.join(told["feedback"], "errors.txt")) as errors:
             return told["status"], errors.read()
     except FileNotFoundError:
         return told["status"], ""

@@ -48,7 +48,9 @@ def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
         assert json.loads(summary + "\n}") == answer["summary"]
         assert [json.loads(row)["t"] for row in rows.splitlines()] == [0, 1]
         program, interface = blocks(text, "python")
-        assert (await output([sys.executable, "-c", program], workspace)).startswith("submit_001 ok -3.5")
+        assert (await output([sys.executable, "-c", program], workspace)).startswith(
+            "feedback/submit_001 ok -3.5"
+        )
         scope: dict[str, type] = {}
         exec(interface, scope)
         assert {"__init__", "reset", "act"} <= set(vars(scope["Policy"]))

@@ -46,7 +46,9 @@ def check_submit(folder: Path, answer: dict[str, Any]) -> None:
     """What an artifact checker asks of one submit's folder."""
     summary = json.loads((folder / "summary.json").read_bytes())
     assert summary == answer["summary"]
-    assert folder.name == answer["submit_id"] == f"submit_{summary['submit_index']:03d}"
+    assert answer["submit_id"] == summary["submit_index"]
+    assert folder.name == f"submit_{answer['submit_id']:03d}"
+    assert answer["feedback"] == f"feedback/{folder.name}"
     assert list(summary)[: len(SUMMARY_FIELDS)] == SUMMARY_FIELDS
     assert (folder / "errors.txt").exists() == (summary["status"] != "ok")
     if summary["status"] != "ok":
@@ -76,7 +78,7 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
     def client(environment: dict[str, str], workspace: Path) -> None:
         with urllib.request.urlopen(environment["EVOPOLICYGYM_INFO_URL"]) as answer:
             info = json.load(answer)
-        assert info["protocol_version"] == "v2.0-draft"
+        assert info["protocol_version"] == "protocol/v2.0-draft"
         assert info["state"]["remaining_budget"] == info["episode_budget"] == 12
         with urllib.request.urlopen(environment["EVOPOLICYGYM_TASK_URL"]) as answer:
             assert answer.read().decode().startswith("#")
@@ -84,8 +86,9 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
         for body in ({"env_instances": [5, 1, 1]}, {"env_instances": "0-1,7"}):
             status, document = post(submit, body)
             assert status == 200
-            assert set(document) == {"submit_id", "status", "summary"}
-            check_submit(workspace / "feedback" / document["submit_id"], document)
+            assert {"submit_id", "status", "summary"} <= set(document)
+            assert document["is_finalized"] is False
+            check_submit(workspace / document["feedback"], document)
         for body, wanted in (
             ({"env_instances": []}, "budget_invalid"),
             ({"env_instances": [99]}, "invalid_env_instance"),
@@ -100,7 +103,17 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
         )
         status, document = post(submit, {"env_instances": [0]})
         assert (status, document["status"]) == (200, "init_error")
-        check_submit(workspace / "feedback" / document["submit_id"], document)
+        check_submit(workspace / document["feedback"], document)
+        left = document["summary"]["remaining_budget"]
+        status, document = post(
+            submit, {"env_instances": [0] * left, "comment": "an unknown field is ignored"}
+        )
+        assert (status, document["is_finalized"]) == (200, True)
+        with urllib.request.urlopen(environment["EVOPOLICYGYM_INFO_URL"]) as answer:
+            assert json.load(answer)["state"]["is_finalized"] is True
+        status, document = post(submit, {"env_instances": [0]})
+        assert (status, document["status"]) == (409, "run_closed")
+        assert post(submit.removesuffix("submit") + "finalize", {})[0] == 405
 
     async def main() -> None:
         async with served(tmp_path, double) as s:

@@ -43,7 +43,7 @@ def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(t
         folder = s.folder.feedback / "submit_000"
         on_disk = (folder / "summary.json").read_bytes()
         assert on_disk in answer.content
-        assert document["submit_id"] == "submit_000"
+        assert document["submit_id"] == 0
         assert document["status"] == "ok"
         assert document["summary"] == json.loads(on_disk)
         summary = decode_summary(on_disk)
@@ -91,7 +91,7 @@ def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
         during = (await s.http.get(s.urls.info)).json()
         assert during["state"]["remaining_budget"] == 10
         assert during["submit_in_flight"] == {
-            "submit_id": "submit_000",
+            "submit_id": 0,
             "status": "running",
             "n_episodes": 2,
             "n_done": 0,
@@ -139,13 +139,11 @@ def test_a_second_submit_while_one_runs_is_a_conflict_that_names_the_first(tmp_p
         await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
         second = await s.http.post(s.urls.submit, json={"env_instances": [1]})
         assert second.status_code == 409
-        assert second.json()["submit_id"] == "submit_000"
+        assert second.json()["submit_id"] == 0
         assert "submit_000" in second.json()["error"]["message"]
         s.double.go.set()
         await s.desk.idle()
-        assert (await s.http.post(s.urls.submit, json={"env_instances": [1]})).json()[
-            "submit_id"
-        ] == "submit_001"
+        assert (await s.http.post(s.urls.submit, json={"env_instances": [1]})).json()["submit_id"] == 1
 
     assert len(play(tmp_path, script).submits) == 2
 
@@ -356,7 +354,8 @@ def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path
             assert (await s.http.post(s.urls.submit, json={"env_instances": "0-5"})).status_code == 200
         assert s.desk.spent
         answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
-        assert answer.json()["status"] == "budget_invalid"
+        assert answer.status_code == 409
+        assert answer.json()["status"] == "run_closed"
         assert "spent" in answer.json()["error"]["message"]
         assert sorted(path.name for path in s.folder.feedback.iterdir()) == ["submit_000", "submit_001"]
         names = sorted(path.name for path in (s.folder.feedback / "submit_001/episodes").iterdir())

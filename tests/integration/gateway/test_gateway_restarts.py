@@ -45,7 +45,7 @@ def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_pa
                 again = await s.http.post(s.urls.submit, json=BODY, headers=header)
                 assert again.status_code == 200
                 assert (folder.feedback / "submit_000" / "summary.json").read_bytes() in again.content
-                assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == "submit_001"
+                assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == 1
         assert [submit.env_instances for submit in double.submits] == [(1, 2, 3), (1, 2, 3)]
         assert double.submits[0].bundle != double.submits[1].bundle
 
@@ -189,7 +189,7 @@ def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path)
         async with served(tmp_path, double) as s:
             for _ in range(2):
                 answer = await s.http.post(s.urls.submit, json=BODY)
-                assert answer.status_code == 400
+                assert answer.status_code == 409
                 assert "closed" in answer.json()["error"]["message"]
                 assert "run-1" not in answer.text
             assert s.desk.spent

@@ -92,7 +92,7 @@ log = []
 def case(name, env_instances=(0,)):
     answer = submit(env_instances if isinstance(env_instances, str) else list(env_instances))
     info = json.load(urllib.request.urlopen(os.environ["EVOPOLICYGYM_INFO_URL"]))
-    errors = Path("feedback", answer.get("submit_id", "-"), "errors.txt")
+    errors = Path(answer.get("feedback", "-"), "errors.txt")
     log.append([name, answer.get("status"), info["state"]["remaining_budget"],
                 json.loads(errors.read_text())["message"] if errors.exists() else answer.get("error", {}).get("message")])
 

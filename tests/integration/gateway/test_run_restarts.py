@@ -153,7 +153,7 @@ def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: P
         assert set(known) == {urls["EVOPOLICYGYM_SUBMIT_URL"]}
         body = json.dumps({"env_instances": "0-3"}).encode()
         with urllib.request.urlopen(urllib.request.Request(known[0], data=body)) as answer:
-            assert json.load(answer)["submit_id"] == "submit_001"
+            assert json.load(answer)["submit_id"] == 1
         assert by_hand.wait(timeout=PATIENCE_S) == 0
     finally:
         by_hand.kill()

@@ -48,6 +48,23 @@ for line in sys.stdin:
     assert "AGENTS.md" in prompts[0]["message"]
 
 
+def test_every_field_of_an_answer_is_optional(tmp_path: Path) -> None:
+    code = """
+import sys
+for number, line in enumerate(sys.stdin):
+    print(['{}', '{"text": "two"}', '{"turn": 2}', '{"stop": false, "other": 1}', '{"stop": true}'][number], flush=True)
+"""
+    ending, _, turns = play(tmp_path, code)
+    assert (ending.reason, ending.turns) == ("agent_stopped", 5)
+    assert turns == [(1, ""), (2, "two"), (3, ""), (4, ""), (5, "")]
+
+
+def test_program_that_prints_objects_and_never_reads_plays_until_it_exits(tmp_path: Path) -> None:
+    # Prompts for all of them would fill its stdin many times over.
+    ending, _, turns = play(tmp_path, "for k in range(3000): print('{}', flush=True)")
+    assert (ending.reason, ending.turns, len(turns)) == ("agent_stopped", 3000, 3000)
+
+
 def test_answers_in_pieces_and_lines_without_end_are_read(tmp_path: Path) -> None:
     code = f"""
 import json, sys, time

@@ -36,9 +36,7 @@ class FakeClient:
         self.asked.append(env_instances)
         if not env_instances:
             return Refusal(status="budget_invalid", message="none")
-        return Verdict(
-            submit_id=f"submit_{len(self.asked) - 1:03d}", status="ok", summary={"mean_return": 0.0}
-        )
+        return Verdict(name=f"submit_{len(self.asked) - 1:03d}", status="ok", summary={"mean_return": 0.0})
 
 
 def policy(folder: Path, text: str = "x") -> Path:

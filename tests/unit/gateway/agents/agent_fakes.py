@@ -74,14 +74,20 @@ class FakeGateway:
                     "error": {"message": f"{n} episodes, {self.left} left"},
                 }
             self.keys[key] = self._evaluate(env_instances)
-        return 202, {"submit_id": self.keys[key], "status": "running"}
+        return 202, {"submit_id": int(self.keys[key][-3:]), "status": "running"}
 
     def get_submit(self, submit_id: str) -> tuple[int, dict[str, Any]]:
         self.n_asked += 1
         if self.n_asked % 2:  # the first question after a submit always comes too early
-            return 202, {"submit_id": submit_id, "status": "running"}
-        summary = self.submits[int(submit_id.removeprefix("submit_"))]
-        return 200, {"submit_id": submit_id, "status": summary["status"], "summary": summary}
+            return 202, {"submit_id": int(submit_id), "status": "running"}
+        summary = self.submits[int(submit_id)]
+        folder = f"feedback/submit_{int(submit_id):03d}"
+        return 200, {
+            "submit_id": int(submit_id),
+            "status": summary["status"],
+            "summary": summary,
+            "feedback": folder,
+        }
 
     def _evaluate(self, env_instances: list[int]) -> str:
         index = len(self.submits)

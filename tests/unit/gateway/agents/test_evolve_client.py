@@ -64,7 +64,7 @@ def test_submit_is_asked_for_until_its_summary_is_there(tmp_path: Path) -> None:
         zero_policy(tmp_path)
         verdict = a_client(gateway.url).submit([3, 4])
         assert isinstance(verdict, Verdict)
-        assert verdict.submit_id == "submit_000"
+        assert verdict.name == "submit_000"
         assert verdict.summary["returns"] == [3.0, 4.0]
         assert gateway.n_asked == 2
 
