@@ -199,8 +199,13 @@ class GatewayClient:
 
     async def open(self) -> gateway.RunOpened:
         return await self.ask.until_answered(
-            "open", gateway.OpenRun(run=self.run, token=self.token), gateway.RunOpened
+            "open", gateway.OpenRun(run=self.run, token=self.token, asks_permit=True), gateway.RunOpened
         )
+
+    async def permit(self, boot_id: str, wait_s: float = 0.0) -> gateway.Permit:
+        """The right that the agent may be alive on a kernel; `gateway_of` has one for a machine without workers."""
+        message = gateway.RequestPermit(run=self.run, token=self.token, boot_id=boot_id, wait_s=wait_s)
+        return await self.ask.until_answered("permit", message, gateway.Permit, wait_s=wait_s)
 
     async def state(self) -> gateway.RunState:
         message = gateway.StateRequest(run=self.run, token=self.token)
@@ -295,7 +300,10 @@ async def operator_of(coordinator: Coordinator) -> AsyncIterator[OperatorClient]
 @contextlib.asynccontextmanager
 async def gateway_of(coordinator: Coordinator, created: operator.RunCreated) -> AsyncIterator[GatewayClient]:
     async with connect(coordinator.credentials("gateway")) as link:
-        yield GatewayClient(link, created.run, created.capability)
+        client = GatewayClient(link, created.run, created.capability)
+        with contextlib.suppress(RefusedError):  # of a run that is over
+            await client.permit("agents")
+        yield client
 
 
 @contextlib.asynccontextmanager

@@ -27,6 +27,7 @@ class HeldLeases:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._held: dict[str, HeldLease] = {}
+        self._settled = time.time_ns() // 1_000_000
 
     def put(self, lease: HeldLease) -> None:
         """Tell of a lease from the next beat on, or tell how it stands now."""
@@ -38,10 +39,26 @@ class HeldLeases:
         with self._lock:
             self._held.pop(lease_id, None)
 
-    def snapshot(self) -> tuple[HeldLease, ...]:
-        """What the next beat tells."""
+    def settle(self, serial: int) -> None:
+        """The poll of that number, and all before it, are over: what they brought was put here."""
         with self._lock:
-            return tuple(self._held.values())
+            self._settled = serial
+
+    @property
+    def settled(self) -> int:
+        """Number of the last poll that is over; larger than any of an earlier process of this worker."""
+        with self._lock:
+            return self._settled
+
+    def snapshot(self) -> tuple[tuple[HeldLease, ...], int]:
+        """What the next beat tells: the leases, and which polls' leases are among them."""
+        with self._lock:
+            return tuple(self._held.values()), self._settled
+
+
+def clock() -> float:
+    """Seconds that go on while the machine sleeps, where the system has such a clock."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class HeartbeatThread:
@@ -67,6 +84,7 @@ class HeartbeatThread:
         self._loop = asyncio.get_running_loop()
         self._session = ""
         self._every_s = 1.0
+        self._answered_at = clock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
@@ -75,6 +93,11 @@ class HeartbeatThread:
         self._session, self._every_s = session, every_s
         if not self._thread.is_alive():
             self._thread.start()
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the last beat that was answered was sent."""
+        return clock() - self._answered_at
 
     def stop(self) -> None:
         """Send no more; the beat that waits is not waited for."""
@@ -89,9 +112,10 @@ class HeartbeatThread:
                 log.warning(
                     "this worker was frozen; its leases may have been given to others", frozen_s=round(gap, 1)
                 )
-            last_sent = time.monotonic()
+            last_sent, sent_at = time.monotonic(), clock()
             reply = self._beat()
             if isinstance(reply, HeartbeatReply):
+                self._answered_at = sent_at
                 # The answer was held back for as long as there was nothing to stop: the next beat goes at once.
                 pause = ANSWERED_PAUSE_S if reply.cancelled else 0.0
             else:
@@ -107,8 +131,10 @@ class HeartbeatThread:
     def _beat(self) -> HeartbeatReply | Refused | None:
         """One beat; None when it was not answered."""
         wait_s = self._every_s
-        held = self._held.snapshot()
-        message = Heartbeat(worker=self._worker, session=self._session, held=held, wait_s=wait_s)
+        held, settled = self._held.snapshot()
+        message = Heartbeat(
+            worker=self._worker, session=self._session, held=held, wait_s=wait_s, settled=settled
+        )
         try:
             answer = self._link.ask_blocking(
                 self._key, codec.encode(message), wait_s + max(1.0, self._every_s)

@@ -4,6 +4,8 @@ Rules:
 - A lease is held from the moment it arrives until its result was answered; every heartbeat lists what is held, so that a
   restarted coordinator adopts it again.
 - A result leaves the outbox only when the coordinator answered that it is durable; sending it twice is safe.
+- What is leased with `stop_in_silence` is stopped when no heartbeat was answered for the leases' time to live: from some
+  time after that the coordinator may let an agent onto this kernel.
 - A slot that dies takes its own job with it and nothing else. What waits behind it is not blamed.
 - On SIGTERM nothing new is asked for, what waits is given back, what runs may finish within the grace time.
 """
@@ -54,6 +56,7 @@ LONGEST_RESTART_PAUSE_S = 30.0
 CANCEL_PATIENCE_S = 2.0
 """What a slot gets to stop its job, before the worker goes without it."""
 WITHDRAW_PATIENCE_S = 1.0
+SILENCE_LOOK_S = 0.5
 
 
 class SlotLike(Protocol):
@@ -110,6 +113,9 @@ class Supervisor:
         self._running: dict[str, SlotLike] = {}
         self._cancelled: set[str] = set()
         self._session = ""
+        self._lease_ttl_s = 0.0
+        self._leased: dict[str, Lease] = {}
+        """What runs here."""
         self._registering = asyncio.Lock()
         self._draining = asyncio.Event()
         self._warm_environments: OrderedDict[str, None] = OrderedDict()
@@ -138,7 +144,9 @@ class Supervisor:
             async with asyncio.TaskGroup() as group:
                 lease = group.create_task(self._lease_loop())
                 slots = [group.create_task(self._slot_loop(index)) for index in range(self._options.slots)]
-                group.create_task(self._stop_when_drained(lease, slots))
+                silence = group.create_task(self._stop_in_silence())
+                await self._stop_when_drained(lease, slots)
+                silence.cancel()
         except* RefusedError as errors:
             refused = errors
         while isinstance(refused, BaseExceptionGroup):
@@ -172,7 +180,7 @@ class Supervisor:
                 machine_id=options.machine_id,
             )
             reply = await self._ask.until_answered("register", message, Registered)
-            self._session = reply.session
+            self._session, self._lease_ttl_s = reply.session, reply.lease_ttl_s
             self._heartbeat.start(reply.session, reply.heartbeat_s)
             log.info(
                 "registered", worker=options.name, cluster=self._link.credentials.cluster, slots=options.slots
@@ -222,7 +230,7 @@ class Supervisor:
                 await self._capacity_freed.wait()
                 continue
             wanted = max(1, 2 * slots - len(self._queue) - len(self._running))
-            session = self._session
+            session, serial = self._session, self._held.settled + 1
             request = LeaseRequest(
                 worker=self._options.name,
                 session=session,
@@ -230,12 +238,14 @@ class Supervisor:
                 wait_s=LEASE_POLL_S,
                 warm_bundles=self._bundles.warm[-8:],
                 warm_environments=tuple(self._warm_environments),
+                serial=serial,
             )
             try:
                 reply = await self._ask.until_answered("lease", request, Leases, wait_s=LEASE_POLL_S)
             except RefusedError as error:
                 if error.status != Refusal.UNKNOWN_WORKER:
                     raise
+                self._held.settle(serial)
                 await self._register_again(session)
                 continue
             for lease_id in reply.cancelled:
@@ -243,6 +253,7 @@ class Supervisor:
             for lease in reply.leases:
                 self._queue[lease.lease_id] = lease
                 self._held.put(_held(lease, running=False))
+            self._held.settle(serial)
             for lease_id in reply.cancelled:
                 self._cancel(lease_id)
             if reply.leases:
@@ -300,6 +311,7 @@ class Supervisor:
         """Plays one lease and puts its result into the outbox; False when the slot must be replaced."""
         job = lease.job
         self._running[lease.lease_id] = slot
+        self._leased[lease.lease_id] = lease
         self._held.put(_held(lease, running=True))
         last_told = 0.0
 
@@ -317,7 +329,13 @@ class Supervisor:
                     await stack.enter_async_context(self._bundles.use(job.bundle)) if job.bundle else None
                 )
                 self._capacity_freed.set()
-                outcomes = await slot.play(await self._with_recordings(job), folder, on_progress)
+                job = await self._with_recordings(job)
+                if (
+                    lease.lease_id in self._cancelled
+                ):  # while it waited for its files, when there was nothing to stop
+                    self._put_result(lease, "returned")
+                    return healthy
+                outcomes = await slot.play(job, folder, on_progress)
             self._warm_environments[job.env] = None
             if lease.lease_id in self._cancelled:
                 self._put_result(lease, "returned")
@@ -340,6 +358,7 @@ class Supervisor:
             raise
         finally:
             self._running.pop(lease.lease_id, None)
+            self._leased.pop(lease.lease_id, None)
             self._cancelled.discard(lease.lease_id)
             self._capacity_freed.set()
         return healthy
@@ -379,6 +398,15 @@ class Supervisor:
     def _settled(self, result: JobResult) -> None:
         self._held.drop(result.lease_id)
         self._capacity_freed.set()
+
+    async def _stop_in_silence(self) -> None:
+        while True:
+            await asyncio.sleep(SILENCE_LOOK_S)
+            if self._heartbeat.silent_s <= self._lease_ttl_s:
+                continue
+            for lease in (*self._queue.values(), *self._leased.values()):
+                if lease.stop_in_silence:
+                    self._cancel(lease.lease_id)
 
     # Ending.
 

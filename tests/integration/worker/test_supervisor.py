@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,7 @@ async def supervising(
         environments=(LINE,),
         fingerprint=FINGERPRINT,
         host="test",
+        boot_id=f"kernel-of-{name}",
         scratch=scratch / name,
         grace_s=grace_s,
     )
@@ -357,6 +359,52 @@ def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
             leaver.drain()
         run_task.cancel()
         await asyncio.gather(run_task, return_exceptions=True)
+
+    run(scenario)
+
+
+def test_hidden_episodes_are_stopped_when_the_coordinator_is_silent_and_others_are_not(
+    coordinator: Coordinator, tmp_path: Path
+) -> None:
+    stopped: list[str] = []
+    playing = asyncio.Event()
+    go_on = asyncio.Event()
+
+    async def hang_once(slot: ScriptedSlot, job: Job) -> None:
+        if go_on.is_set():
+            return
+        if "/validation/" in job.job_id or "/random/" in job.job_id:
+            playing.set()
+            waits = [asyncio.create_task(event.wait()) for event in (slot.stopped, go_on)]
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            for wait in waits:
+                wait.cancel()
+            if slot.stopped.is_set():
+                stopped.append(job.job_id)
+
+    async def scenario() -> None:
+        async with (
+            supervising(coordinator, tmp_path, hang_once, slots=4) as worker,
+            operator_of(coordinator) as operator,
+        ):
+            created = await operator.create(n_validation=2, n_heldout=2)
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("policy"), (0,), "k0")
+                await gateway.results(0)
+                await gateway.close()
+            await playing.wait()
+            worker._lease_ttl_s = 2.0
+            coordinator.process.send_signal(signal.SIGSTOP)
+            try:
+                async with asyncio.timeout(60.0):
+                    while len(stopped) < 2:
+                        await asyncio.sleep(0.05)
+            finally:
+                coordinator.process.send_signal(signal.SIGCONT)
+            go_on.set()
+            finished = await operator.finished(created.run)
+        assert sorted(name.rsplit("/", 2)[1] for name in stopped) == ["validation", "validation"]
+        assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
 
     run(scenario)
 
