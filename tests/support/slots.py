@@ -41,6 +41,9 @@ class Policy:
 """
 """A policy for `toy/line` that does what it should."""
 
+STUCK = HONEST.replace("return [", "import time; time.sleep(60); return [")
+"""One that answers the first question after a minute."""
+
 _MISBEHAVING = """
 import ctypes, json, os, signal, struct, sys, threading, time
 import numpy as np
@@ -167,3 +170,44 @@ def rows(outcome: EpisodeOutcome) -> list[Row]:
     assert outcome.trajectory is not None
     assert outcome.trajectory.inline is not None
     return list(decode(outcome.trajectory.inline).rows())
+
+
+# A slot's processes.
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        found += [int(child) for child in (task / "children").read_text().split()]
+    return found
+
+
+def family(pid: int) -> list[int]:
+    """The process and all its descendants, outermost first."""
+    return [pid, *(member for child in children(pid) for member in family(child))]
+
+
+def runs(pid: int) -> bool:
+    """Whether the process is there and not just waiting for its parent to take note of its end."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def pid_of(slot: Slot) -> int:
+    assert slot._process is not None
+    return slot._process.pid
+
+
+async def begun(
+    slot: Slot, slots: Slots, policy: str, **options: object
+) -> asyncio.Task[tuple[EpisodeOutcome, ...]]:
+    """A job that is being played: its policy's process is there and has begun to work."""
+    before = len(family(pid_of(slot)))
+    job = make_job(**options)  # type: ignore[arg-type]
+    task = asyncio.create_task(slot.play(job, slots.bundle(policy), lambda episodes, steps: None))
+    while len(family(pid_of(slot))) < before:
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.2)
+    return task

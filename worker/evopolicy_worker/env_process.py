@@ -101,7 +101,8 @@ class EnvProcess:
                 self._channel.send(_described(work.environments))
                 continue
             self._channel.send(self._play(player, *work))
-            with contextlib.suppress(SandboxError):
+            # A sandbox that has ended meanwhile is the next job's to find.
+            with contextlib.suppress(SandboxError, SlotDiedError):
                 player.prepare()
 
     def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Answer:
@@ -112,13 +113,11 @@ class EnvProcess:
             return messages.Played(cancelled=progress.cancelled)
         except CancelledJobError:
             return messages.Played(cancelled=True)
-        except SlotDiedError as error:
-            return messages.Fault(kind="died", message=fault_of(error))
         except Exception as error:
             if progress.cancelled:
                 # Whatever it met on its way out.
                 return messages.Played(cancelled=True)
-            kind = "sandbox" if isinstance(error, SandboxError) else "worker"
+            kind = "sandbox" if isinstance(error, SandboxError | SlotDiedError) else "worker"
             return messages.Fault(kind=kind, message=fault_of(error))
         finally:
             self._progress = None

@@ -10,6 +10,8 @@ Rules:
 - What the policy did is a result, and so is what its actions did to the environment: an environment that breaks down on
   them plays the episode once more, anew and with random actions alone. What the environment or the sandbox did wrong
   otherwise is raised.
+- A policy that is ended from outside is started again, and the episode with it. What it had returned stands: whatever a
+  policy may do to itself, it never gets to throw its dice again.
 """
 
 from __future__ import annotations
@@ -43,9 +45,10 @@ from evopolicy_common.scratch import remove_tree
 from evopolicy_common.trajectory import Recorder, decode
 from evopolicy_worker import environments, float_environment
 from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.endings import EndedFromOutsideError
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
-from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
+from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess, oom_kills
 from evopolicy_worker.recording import VideoRecorder
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Zygote
@@ -56,6 +59,8 @@ MAX_JOB_OUTPUT_BYTES = 64 << 20
 """Of what is kept of a job's stdout, stderr and tracebacks, each episode has an equal share: 327 may use their limits up."""
 MAX_BLOB_BYTES = 1 << 30
 """Of one trajectory or video."""
+MAX_ENDS = 5
+"""So often is one episode's policy started again here after an end from outside; then the job is played elsewhere."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
 
@@ -99,6 +104,7 @@ class Player:
         self._prepared: Child | None = None
         self._n_policies = 0
         self._folders: list[Path] = []
+        self._oom_kills = oom_kills()
         self._videos = VideoRecorder()
 
     def play(
@@ -133,44 +139,54 @@ class Player:
         self, k: int, job: Job, spec: EpisodeSpec, policies: _Policies, progress: Progress
     ) -> tuple[PolicyFailure | None, bytes]:
         """The failure in one episode, and its outcome as it is told."""
-        episode = _Episode(job, spec, self._environment(job.env), policies, progress, self._videos)
-        try:
-            outcome = episode.play(k)
-            return outcome.failure, _framed(_brief(outcome, _share(job)))
-        except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
-            raise
-        except Exception as error:
-            if not episode.acted or progress.cancelled:
+        taken: list[Any] = []
+        failure: PolicyFailure | None = None
+        n_ends = 0
+        while True:
+            environment = self._environment(job.env)
+            episode = _Episode(job, spec, environment, policies, progress, self._videos, taken, failure)
+            try:
+                outcome = episode.play(k)
+                return outcome.failure, _framed(_brief(outcome, _share(job)))
+            except EndedFromOutsideError as error:
+                # Where one policy plays several episodes it took with it what it had learned.
+                n_ends += 1
+                if progress.cancelled or job.policy_scope == "submit" or n_ends > MAX_ENDS:
+                    raise
+                note(f"a policy is started again: {fault_of(error)}")
+                policies.drop()
+            except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
                 raise
-            # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
-            print(
-                f"{messages.NOTE}{job.env} broke down on a policy's actions: {fault_of(error)}",
-                file=sys.stderr,
-            )
-            self._environments.pop(job.env).close()
-            failure = episode.failure or PolicyFailure(
-                category="act_error", step_index=None, message=BROKE_DOWN
-            )
-        environment = self._environment(job.env)
-        episode = _Episode(job, spec, environment, policies, progress, self._videos, failure)
-        return failure, _framed(_brief(episode.play(k), _share(job)))
+            except Exception as error:
+                if progress.cancelled or not episode.acted or failure is not None:
+                    raise
+                # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
+                note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
+                self._environments.pop(job.env).close()
+                failure = episode.failure or PolicyFailure(
+                    category="act_error", step_index=None, message=BROKE_DOWN
+                )
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
         self._bury()
         if self._prepared is None:
             self._prepared = self._zygote.spawn()
+        self._oom_kills = oom_kills()
 
     def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
         child, self._prepared = self._prepared, None
         if child is None:
             self._bury()
             child = self._zygote.spawn()
+            self._oom_kills = oom_kills()
         self._n_policies += 1
         folder = self._scratch / "policies" / str(self._n_policies)
         if self._jail.home is None:
             self._folders.append(folder)
-        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, str(folder))
+        return PolicyProcess(
+            self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
+        )
 
     def _bury(self) -> None:
         """The processes of the policies so far are gone after this, and so are their folders."""
@@ -229,10 +245,7 @@ class _Policies:
                 )
             )
         policy = self._policy = progress.policy = self._player.new_policy(job.limits)
-        n = len(job.episodes) if job.policy_scope == "submit" else 1
-        if job.policy_every:
-            n = min(n, job.policy_every)
-        policy.init(files, spec.policy_seed, self._env_meta, job.observations, cpu_s=job.limits.cpu_s * n)
+        policy.init(files, spec.policy_seed, self._env_meta, job.observations)
         return policy
 
     def release(self) -> Ended:
@@ -251,6 +264,10 @@ class _Policies:
 
     def close(self, progress: Progress) -> None:
         progress.policy = None
+        self._end()
+
+    def drop(self) -> None:
+        """The policy is lost; the next episode gets another one."""
         self._end()
 
     def _end(self) -> None:
@@ -273,9 +290,14 @@ class _Episode:
         policies: _Policies,
         progress: Progress,
         videos: VideoRecorder,
-        failure: PolicyFailure | None = None,
+        taken: list[Any],
+        failure: PolicyFailure | None,
     ) -> None:
-        """`failure`: why no policy is asked, and random actions are played from the first step on."""
+        """`taken`: what the policy has returned in this episode before it was ended from outside, which stands: it is asked
+        again, and its first answers do not count. Those that do are added. `failure`: why no policy is asked, and random
+        actions are played from the first step on.
+        """
+        self._taken = taken
         self._job = job
         self._spec = spec
         self._environment = environment
@@ -364,6 +386,8 @@ class _Episode:
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
         total, t = 0.0, 0
+        taken = self._taken
+        n_taken, keep = len(taken), taken.append
         float_environment.reset()
         obs = environment.reset(self._spec.case)
         while True:
@@ -372,6 +396,10 @@ class _Episode:
                 try:
                     returned = policy.act(obs)
                     self.acted = True
+                    if t < n_taken:
+                        returned = taken[t]
+                    else:
+                        keep(returned)
                     action, invalid = repair(returned)
                 except PolicyFailedError as error:
                     self._note(error.failure, t)
@@ -471,6 +499,11 @@ def _blob(data: bytes) -> BlobRef:
     if len(data) > MAX_BLOB_BYTES:
         raise WorkerError(f"a recording of {len(data):,} bytes; {MAX_BLOB_BYTES:,} are the limit")
     return BlobRef(digest=digest_of(data), size=len(data), inline=data)
+
+
+def note(text: str) -> None:
+    """Tell an operator, by the worker's log."""
+    print(f"{messages.NOTE}{text}", file=sys.stderr, flush=True)
 
 
 def fault_of(error: BaseException) -> str:

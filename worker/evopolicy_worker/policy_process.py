@@ -1,28 +1,30 @@
 """One policy in the sandbox, as the episode loop sees it: init, reset, act, and how it failed.
 
-Rules: whatever the policy does is either an answer or a `PolicyFailedError`; what is the sandbox's own fault is a
-SandboxError or SlotDiedError and never blamed on the policy. A policy that failed by dying or by breaking the pipes' rules
-is `dead`; one whose code raised lives on.
+Rules: whatever the policy does is either an answer or a `PolicyFailedError`; what is the sandbox's own fault, or was done
+to it from outside (`endings`), is a SandboxError and never blamed on the policy. A policy that failed by dying or by breaking the
+pipes' rules is `dead`; one whose code raised lives on. Once an episode is played, no end of its policy voids it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
+import resource
 import signal
 import sys
 import threading
 import time
 from typing import Any, NamedTuple
 
-from evopolicy_common.errors import SandboxError
+from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
 from evopolicy_common.simulators import SIMULATORS
-from evopolicy_worker import frames
-from evopolicy_worker.monitor import Monitor, Watch
+from evopolicy_worker import endings, frames
+from evopolicy_worker.endings import EndedFromOutsideError, Ending
+from evopolicy_worker.monitor import Monitor, Verdict, Watch
+from evopolicy_worker.sandbox import zygote as zygotes
 from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import DEATH_TIMEOUT_S, Child, Exit, Zygote, wait_dead
+from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 
 _DENIED = frozenset(
     {
@@ -34,6 +36,12 @@ _DENIED = frozenset(
 _GRACE_S = 1.0
 _SEAL_S = 60.0
 """For what is our own work before the bundle is imported."""
+_EXIT_S = 5.0
+"""For a process that is ending to be gone."""
+_PF_EXITING = 0x4
+_LARGE_SHARE = 0.125
+"""Where the system has ended processes for want of memory, and this one without a word: it was for its own memory when it held
+more than such a share of its limit."""
 _SHIM_BROKEN = 70
 """The status with which `inside/zygote.py` ends a process that it should never come back from."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
@@ -86,8 +94,10 @@ class PolicyProcess:
         jail: Jail,
         limits: ResourceLimits,
         folder: str,
+        oom_kills: int | None = None,
     ) -> None:
-        """`folder` is where its files are when the jail gives it no home of its own."""
+        """`folder` is where its files are when the jail gives it no home of its own; `oom_kills`, what that function gave
+        before."""
         self._zygote = zygote
         self._child = child
         self._monitor = monitor
@@ -95,7 +105,10 @@ class PolicyProcess:
         self._home = jail.home or folder
         self._enclosed = jail.home is not None
         self._watch = Watch(child, limits, count_threads=not self._enclosed)
-        self._base_bytes = _address_space(child.host_pid)
+        self._base_bytes, self._base_resident = _memory(child.host_pid)
+        self._oom_kills = oom_kills
+        # A CPU limit of the worker's own is the policy's too, and ends it by SIGKILL.
+        self._held = bool(jail.config["seals"]) and resource.getrlimit(resource.RLIMIT_CPU) == (-1, -1)
         self._write: frames.Writer = list
         self._action_bytes = 0
         self._usual_bytes = 0
@@ -113,10 +126,8 @@ class PolicyProcess:
         seed: bytes,
         env_meta: dict[str, Any],
         observations: str,
-        *,
-        cpu_s: float,
     ) -> None:
-        """Seal the process, import the bundle and build its Policy. `cpu_s` is what all its episodes may use together.
+        """Seal the process, import the bundle and build its Policy.
 
         Raises PolicyFailedError with a category of NO_POLICY.
         """
@@ -127,7 +138,6 @@ class PolicyProcess:
         n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
         rlimits = {
             "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
-            "RLIMIT_CPU": math.ceil(cpu_s) + 2,
             "RLIMIT_FSIZE": limits.file_bytes,
             "RLIMIT_NOFILE": limits.open_files,
             "RLIMIT_CORE": 0,
@@ -211,7 +221,10 @@ class PolicyProcess:
         return self._watch.spent_s
 
     def take_output(self) -> Ended:
-        """Output and CPU time of the episode that ends; the policy lives on when it can."""
+        """Output and CPU time of the episode that ends; the policy lives on when it can.
+
+        EndedFromOutsideError when it was ended so: the policy of the episodes to come is lost.
+        """
         if not self.dead:
             with contextlib.suppress(PolicyFailedError):
                 self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.FLUSH, 0)], "act", _GRACE_S)
@@ -226,10 +239,10 @@ class PolicyProcess:
         return ended
 
     def end(self) -> Ended:
-        """End the process, if it has not ended, and collect what it leaves. SlotDiedError when it cannot be ended."""
+        """End the process, if it has not ended, and collect what it leaves."""
         if self._finished is None:
             if not self.dead:
-                with contextlib.suppress(PolicyFailedError):
+                with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
                     self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.END, 0)], "act", _GRACE_S)
             watch = self._watch
             cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
@@ -237,7 +250,7 @@ class PolicyProcess:
             watch.drain()
             self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
             with self._closing:
-                if self.dead:
+                if self._exit is not None:
                     self._child.close()
                 else:
                     # It has said its last; what a hostile one writes from now on is not read.
@@ -380,46 +393,75 @@ class PolicyProcess:
         return self._failed(self._fatal("killed"), text, limit=limit, used=used)
 
     def _died(self) -> PolicyFailedError:
-        """Its pipe closed: a limit, or an end of its own."""
+        """Its pipe closed: the policy's failure, by the table of endings. EndedFromOutsideError when it is none."""
+        watch, limits = self._watch, self._limits
         alive = not wait_dead(self._child.pidfd, 0.05)
+        if alive and _exiting(self._child.host_pid):
+            alive = not wait_dead(self._child.pidfd, _EXIT_S)
         self._bury()
-        verdict = self._watch.verdict
-        if self._watch.what == "seal":
-            how = (
-                verdict.message if verdict is not None else self._exit.describe() if self._exit else "is gone"
+        exit_, found = self._exit, watch.verdict
+        if found is None and exit_ is not None and not alive:
+            found = self._limit_of(exit_)
+        if found is not None:
+            ending, text = Ending("policy", "SIGKILL", found.category), found.message
+        elif alive:
+            ending, text = Ending("policy", "pipe"), "the policy closed the pipe that it answers on"
+        elif exit_ is None:
+            ending, text = Ending("sandbox", "SIGKILL"), "the policy's sandbox ended"
+        else:
+            ending, text = (
+                Ending("policy", endings.how(exit_.status)),
+                f"the policy's process {exit_.describe()}",
             )
-            raise SandboxError(f"a policy's process could not seal itself: it {how}")
-        if verdict is not None:
-            return self._failed(
-                self._fatal(verdict.category), verdict.message, limit=verdict.limit, used=verdict.used
+            if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
+                text += ", as it does when the code in it that answers for the policy was broken"
+            if os.WIFSIGNALED(exit_.status) and os.WTERMSIG(exit_.status) == signal.SIGBUS:
+                text += f", as for writing to a mapped file when its files have {limits.file_bytes:,} bytes, the limit"
+        category = endings.verdict(ending._replace(began=watch.what != "seal", held=self._held))
+        if category is None:
+            if watch.what == "seal":
+                raise EndedFromOutsideError(f"a policy's process could not seal itself: {text}")
+            raise EndedFromOutsideError(f"{text}, and neither the policy nor a limit can have done that")
+        if found is None:
+            return self._failed(self._fatal(category), text)
+        return self._failed(self._fatal(category), text, limit=found.limit, used=found.used)
+
+    def _limit_of(self, exit_: Exit) -> Verdict | None:
+        """The limit for which the system ended it."""
+        if not os.WIFSIGNALED(exit_.status):
+            return None
+        limits, cpu_s = self._limits, self._cpu_of_episode()
+        if cpu_s > limits.cpu_s:
+            text = f"the policy used more than {limits.cpu_s:g} s of CPU time"
+            return Verdict("cpu_limit", text, limits.cpu_s, cpu_s)
+        held = exit_.peak_bytes - self._base_resident
+        counted = oom_kills()
+        killed = endings.how(exit_.status) == "SIGKILL"
+        if (
+            killed
+            and held > _LARGE_SHARE * limits.memory_bytes
+            and (counted is None or counted != self._oom_kills)
+        ):
+            text = (
+                f"the system ended the policy for want of memory: it held {held:,} bytes beside Python's own;"
+                f" {limits.memory_bytes:,} are the limit"
             )
-        if alive:
-            return self._failed(self._fatal("killed"), "the policy closed the pipe that it answers on")
-        exit_ = self._exit
-        assert exit_ is not None
-        used = self._cpu_of_episode()
-        if os.WIFSIGNALED(exit_.status) and used > self._limits.cpu_s:
-            text = f"the policy used more than {self._limits.cpu_s:g} s of CPU time"
-            return self._failed(self._fatal("cpu_limit"), text, limit=self._limits.cpu_s, used=used)
-        text = f"the policy's process {exit_.describe()}"
-        if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
-            text += ", as it does when the code in it that answers for the policy was broken"
-        if os.WIFSIGNALED(exit_.status) and os.WTERMSIG(exit_.status) == signal.SIGBUS:
-            text += f", as for writing to a mapped file when its files have {self._limits.file_bytes:,} bytes, the limit"
-        return self._failed(self._fatal("killed"), text)
+            return Verdict("oom", text, limits.memory_bytes, held)
+        return None
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:
         """Before there is a Policy, whatever ends the process means that the bundle yields none."""
         return "init_error" if self._watch.what == "init" else category
 
     def _bury(self) -> None:
-        """The process is dead when this returns."""
+        """The process is dead when this returns, or was told to die and is buried later; `_exit` says how it ended."""
         self.dead = True
         self._watch.since = 0.0
         self._child.kill()
-        if not wait_dead(self._child.pidfd, DEATH_TIMEOUT_S):
-            raise SandboxError(f"a policy's process does not end within {DEATH_TIMEOUT_S:g} s of SIGKILL")
-        self._exit = self._zygote.wait(self._child)
+        if wait_dead(self._child.pidfd, zygotes.DEATH_TIMEOUT_S):
+            # None when the sandbox has ended.
+            with contextlib.suppress(SlotDiedError):
+                self._exit = self._zygote.wait(self._child)
 
     def _cpu_of_episode(self) -> float:
         """CPU time that the dead process had used since the episode began, seconds; 0.0 when nobody knows."""
@@ -462,10 +504,30 @@ class PolicyProcess:
         return text.replace("/packages/", "")
 
 
-def _address_space(pid: int) -> int:
-    """Bytes of address space that the process has; as much as Python with numpy has when that cannot be read."""
+def oom_kills() -> int | None:
+    """How many processes this machine has ended so far for want of memory; None when it does not tell."""
+    with contextlib.suppress(OSError, ValueError), open("/proc/vmstat") as lines:
+        for line in lines:
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    return None
+
+
+def _memory(pid: int) -> tuple[int, int]:
+    """Bytes of address space and of memory that the process has; what Python with numpy has when that cannot be read."""
     try:
         with open(f"/proc/{pid}/statm") as file:
-            return int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            space, resident = file.read().split()[:2]
     except (OSError, ValueError):
-        return 1 << 29
+        return 1 << 29, 1 << 25
+    page = os.sysconf("SC_PAGE_SIZE")
+    return int(space) * page, int(resident) * page
+
+
+def _exiting(pid: int) -> bool:
+    """Whether the process is on its way out."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return bool(int(file.read().rpartition(")")[2].split()[6]) & _PF_EXITING)
+    except (OSError, ValueError, IndexError):
+        return True

@@ -266,8 +266,6 @@ def bundle_files(folder: Path, sent: str = "") -> messages.Files:
 def _error(answer: messages.Answer) -> WorkerError | SandboxError:
     if not isinstance(answer, messages.Fault):
         return WorkerError(f"the slot's process answered {type(answer).__name__} out of turn")
-    if answer.kind == "died":
-        return SlotDiedError(answer.message)
     return SandboxError(answer.message) if answer.kind == "sandbox" else WorkerError(answer.message)
 
 

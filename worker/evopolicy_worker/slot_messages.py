@@ -90,7 +90,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
     """Our own failure, never the policy's."""
 
     kind: str
-    """`sandbox`, `worker`, or `died`: the slot is of no more use."""
+    """`sandbox` or `worker`."""
     message: str
 
 

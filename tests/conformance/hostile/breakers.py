@@ -273,8 +273,25 @@ BREAKERS = (
     Breaker(
         name="stopping itself",
         act="os.kill(os.getpid(), signal.SIGSTOP); time.sleep(60)",
-        verdict="act_timeout",
-        limits=limits(act_wall_s=0.3),
+        verdict="act_error",
+    ),
+    Breaker(
+        name="killing itself, to be played again",
+        act="os.kill(os.getpid(), signal.SIGKILL); time.sleep(60)",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="a timer that kills itself",
+        act="libc, which = ctypes.CDLL(None), ctypes.c_void_p()\n"
+        "            event = struct.pack('<qii48x', 0, 9, 0)\n"
+        "            if libc.timer_create(1, event, ctypes.byref(which)): raise OSError('no timer')\n"
+        "            libc.timer_settime(which, 0, struct.pack('<qqqq', 0, 0, 0, 10**7), None); time.sleep(60)",
+        verdict="act_error",
+    ),
+    Breaker(
+        name="a lower limit on its processor time, to be killed by the kernel",
+        act="import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass",
+        verdict="act_error",
     ),
     Breaker(name="endless recursion", act="f = lambda: f(); f()", verdict="act_error"),
     Breaker(

@@ -3,7 +3,9 @@
 Rules of the policy's filter, which this module owns:
 - What is not listed is refused (EPERM; ENOSYS for numbers younger than the lists, so that a C library falls back).
 - No process is ever made: `fork` and the like answer EAGAIN, as at a process limit. Threads are allowed.
-- No sockets, no signals to anyone else, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
+- No signals to anyone else, and none to itself that nobody can tell from one of outside: SIGKILL and the stops, also by a timer
+  or a limit of its own. `endings` rests on this.
+- No sockets, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
   limit) or CPU affinity.
 - Sandboxes show the same read-only files, and nothing of them may carry a message: no locks, no waiting for each other on a
   mapped page (a futex that is not private to the process), no looking at or changing what of them is in memory. Nor is
@@ -60,6 +62,7 @@ _FUTEX_PRIVATE = 128
 _FUTEX_WAIT, _FUTEX_WAIT_BITSET = 0, 9
 _PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
 _MODES_AND_TIMES = ("chmod", "fchmod", "fchmodat", "utime", "utimes", "utimensat", "futimesat")
+_NOT_TO_ITSELF = (9, 19, 20, 21, 22)  # SIGKILL, SIGSTOP, SIGTSTP, SIGTTIN, SIGTTOU
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
 _YOUNGEST = 450
@@ -117,9 +120,18 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         "ioctl": _one_of(1, _IOCTL, errno.ENOTTY),
         "fcntl": _one_of(1, _FCNTL, errno.EPERM),
         "prctl": _one_of(0, _PRCTL, errno.EPERM),
-        "kill": _one_of(0, (PID_MARK,), errno.EPERM),
-        "tgkill": _one_of(0, (PID_MARK,), errno.EPERM),
-        "prlimit64": _one_of(0, (0, PID_MARK), errno.EPERM),
+        "kill": _own_signals(1),
+        "tgkill": _own_signals(2),
+        # Its limits may be looked at. Of another CPU limit it could be killed as if from outside.
+        "prlimit64": [
+            (_LOAD, 0, 0, _argument(2)),
+            (_JUMP_EQUAL, 1, 0, 0),
+            _refuse(errno.EPERM),
+            (_LOAD, 0, 0, _argument(2) + 4),
+            (_JUMP_EQUAL, 1, 0, 0),
+            _refuse(errno.EPERM),
+            *_one_of(0, (0, PID_MARK), errno.EPERM),
+        ],
         "clone": [
             (_LOAD, 0, 0, _argument(0)),
             (_AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),
@@ -234,6 +246,14 @@ def _no_cutting(argument: int) -> list[Instruction]:
         _refuse(errno.EPERM),
         _ALLOWED,
     ]
+
+
+def _own_signals(argument: int) -> list[Instruction]:
+    """Allows a signal to itself, in that argument, unless it is one of `_NOT_TO_ITSELF`."""
+    block: list[Instruction] = [(_LOAD, 0, 0, _argument(argument))]
+    for number in _NOT_TO_ITSELF:
+        block += [(_JUMP_EQUAL, 0, 1, number), _refuse(errno.EPERM)]
+    return [*block, *_one_of(0, (PID_MARK,), errno.EPERM)]
 
 
 def _one_of(argument: int, allowed: tuple[int, ...], otherwise: int) -> list[Instruction]:

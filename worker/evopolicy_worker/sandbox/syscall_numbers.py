@@ -17,10 +17,10 @@ mremap=25 mprotect=10 madvise=28 brk=12 msync=26 membarrier=324 futex=202 set_ro
 get_robust_list=274 rseq=334 set_tid_address=218 restart_syscall=219 rt_sigaction=13 rt_sigprocmask=14
 rt_sigreturn=15 rt_sigpending=127 rt_sigsuspend=130 rt_sigtimedwait=128 sigaltstack=131 pause=34 alarm=37
 getitimer=36 setitimer=38 nanosleep=35 clock_nanosleep=230 clock_gettime=228 clock_getres=229
-gettimeofday=96 time=201 times=100 getrusage=98 timer_create=222 timer_settime=223 timer_gettime=224
-timer_getoverrun=225 timer_delete=226 getpid=39 getppid=110 gettid=186 getuid=102 geteuid=107 getgid=104
+gettimeofday=96 time=201 times=100 getrusage=98
+getpid=39 getppid=110 gettid=186 getuid=102 geteuid=107 getgid=104
 getegid=108 getgroups=115 getresuid=118 getresgid=120 getpgrp=111 getpgid=121 getsid=124 uname=63
-getcpu=309 getrandom=318 getrlimit=97 setrlimit=160 prlimit64=302 sched_yield=24
+getcpu=309 getrandom=318 getrlimit=97 prlimit64=302 sched_yield=24
 sched_getaffinity=204 sched_getparam=143 sched_getscheduler=145 sched_get_priority_max=146
 sched_get_priority_min=147 exit=60 exit_group=231 wait4=61 waitid=247 arch_prctl=158 getpriority=140
 ioctl=16 fcntl=72 prctl=157 clone=56 clone3=435 fork=57 vfork=58 kill=62 tgkill=234
@@ -39,10 +39,10 @@ membarrier=283 futex=98 set_robust_list=99 get_robust_list=100 rseq=293 set_tid_
 restart_syscall=128 rt_sigaction=134 rt_sigprocmask=135 rt_sigreturn=139 rt_sigpending=136
 rt_sigsuspend=133 rt_sigtimedwait=137 sigaltstack=132 getitimer=102 setitimer=103 nanosleep=101
 clock_nanosleep=115 clock_gettime=113 clock_getres=114 gettimeofday=169 times=153 getrusage=165
-timer_create=107 timer_settime=110 timer_gettime=108 timer_getoverrun=109 timer_delete=111 getpid=172
+getpid=172
 getppid=173 gettid=178 getuid=174 geteuid=175 getgid=176 getegid=177 getgroups=158 getresuid=148
 getresgid=150 getpgid=155 getsid=156 uname=160 getcpu=168 getrandom=278 getrlimit=163
-setrlimit=164 prlimit64=261 sched_yield=124 sched_getaffinity=123 sched_getparam=121
+prlimit64=261 sched_yield=124 sched_getaffinity=123 sched_getparam=121
 sched_getscheduler=120 sched_get_priority_max=125 sched_get_priority_min=126 exit=93 exit_group=94
 wait4=260 waitid=95 getpriority=141 ioctl=29 fcntl=25 prctl=167 clone=220 clone3=435 kill=129 tgkill=131
 """

@@ -57,6 +57,8 @@ class Exit(msgspec.Struct, frozen=True, kw_only=True):
     status: int
     """As from waitpid."""
     cpu_s: float
+    peak_bytes: int = 0
+    """The most memory that it held."""
 
     def describe(self) -> str:
         if os.WIFSIGNALED(self.status):
@@ -134,7 +136,7 @@ class Zygote:
     def wait(self, child: Child) -> Exit:
         """How a killed or ended child ended. Takes its entry from the process table."""
         answer, _ = self._ask({"wait": child.pid}, [])
-        return Exit(status=answer["status"], cpu_s=answer["cpu_s"])
+        return msgspec.convert(answer, Exit)
 
     def bury_later(self, child: Child) -> None:
         """Kill the child now, and learn of its end when there is time: a process takes milliseconds to be taken down."""

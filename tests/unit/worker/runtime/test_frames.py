@@ -225,11 +225,30 @@ def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.Mo
     assert allowed(program, clone, 0x1200011) & 0xFFFF == 11  # fork()
     assert allowed(program, clone, 0x10010F00) & 0xFFFF == 11  # a thread in a new namespace
     assert allowed(program, fork) & 0xFFFF == 11
-    assert allowed(program, kill, seccomp.PID_MARK, 9) == seccomp._ALLOW
-    assert allowed(program, kill, 1, 9) & 0xFFFF == 1
+    assert allowed(program, kill, seccomp.PID_MARK, 15) == seccomp._ALLOW
+    assert allowed(program, kill, 1, 15) & 0xFFFF == 1
     assert allowed(program, prctl, 4, 1) & 0xFFFF == 1
     assert allowed(program, mount) & 0xFFFF == 1
     assert allowed(program, 0x40000000) == seccomp._KILL_PROCESS
+
+
+def test_the_filter_lets_a_process_do_nothing_to_itself_that_looks_like_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
+    program = seccomp.policy_filter()
+    own, kill, tgkill, prlimit = seccomp.PID_MARK, 62, 234, 302
+    for number in range(65):
+        allows = number not in (9, 19, 20, 21, 22)
+        assert (allowed(program, kill, own, number) == seccomp._ALLOW) == allows
+        assert (allowed(program, tgkill, own, 5, number) == seccomp._ALLOW) == allows
+        assert allowed(program, tgkill, 1, 1, number) & 0xFFFF == 1
+    assert allowed(program, prlimit, 0, 0, 0, 0x7F00DEADBEEF) == seccomp._ALLOW
+    for new in (0x7F00DEADBEEF, 0x10000000000, 0x1000):
+        assert allowed(program, prlimit, 0, 0, new) & 0xFFFF == 1
+        assert allowed(program, prlimit, own, 0, new) & 0xFFFF == 1
+    for other in (160, 222, 200, 129, 297, 424, 101, 317):  # setrlimit, timer_create, tkill, … seccomp
+        assert allowed(program, other) & 0xFFFF == 1
 
 
 def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: pytest.MonkeyPatch) -> None:

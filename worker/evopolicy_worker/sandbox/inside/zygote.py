@@ -147,7 +147,11 @@ def zygote(control: socket.socket, config: dict[str, Any]) -> list[int]:
         request = json.loads(message)
         if "wait" in request:
             _, status, usage = os.wait4(request["wait"], 0)
-            answer = {"status": status, "cpu_s": usage.ru_utime + usage.ru_stime}
+            answer = {
+                "status": status,
+                "cpu_s": usage.ru_utime + usage.ru_stime,
+                "peak_bytes": usage.ru_maxrss * 1024,
+            }
             control.send(json.dumps(answer).encode())
             continue
         try:

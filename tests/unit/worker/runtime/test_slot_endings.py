@@ -1,0 +1,445 @@
+"""Every way in which a slot can end, with its verdict: each row of the table, a fuzz over it, and real kills of real processes."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from slots import HONEST, QUICK, Slots, begun, family, make_job, misbehaving, pid_of, rows
+
+from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_worker import endings
+from evopolicy_worker.endings import FAULTS, FIRSTS, HOWS, TABLE, Ending
+from evopolicy_worker.slot import Slot
+
+PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)
+
+# The table.
+
+EXAMPLES: dict[str, tuple[Ending, str | None]] = {
+    "a policy's process before the bundle's code": (Ending("policy", "SIGKILL", began=False), None),
+    "a limit was passed": (Ending("policy", "SIGKILL", "oom"), "oom"),
+    "it exited": (Ending("policy", "exit"), "killed"),
+    "it crashed": (Ending("policy", "fault"), "killed"),
+    "a signal that it can send itself": (Ending("policy", "signal"), "killed"),
+    "it closed its pipe": (Ending("policy", "pipe"), "killed"),
+    "it broke the pipes' rules": (Ending("policy", "frame"), "killed"),
+    "killed or stopped where it can signal itself": (Ending("policy", "SIGKILL", held=False), "killed"),
+    "killed or stopped, sealed, and no limit explains it": (Ending("policy", "SIGKILL"), None),
+    "bubblewrap or the zygote": (Ending("sandbox", "SIGKILL"), None),
+    "the environment crashed on its actions": (Ending("environment", "fault"), "killed"),
+    "the environment crashed before any": (Ending("environment", "fault", began=False), None),
+    "the environment was killed or stopped": (Ending("environment", "SIGKILL"), None),
+    "the worker": (Ending("supervisor", "SIGKILL"), None),
+}
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.what)
+def test_each_row_of_the_table_gives_its_verdict(row: endings.Row) -> None:
+    ending, expected = EXAMPLES[row.what]
+    assert row.fits(ending)
+    assert endings.verdict(ending) == expected
+
+
+def every_ending() -> Iterator[Ending]:
+    limits = (None, "oom", "cpu_limit", "act_timeout", "episode_timeout", "process_limit")
+    for first, how, limit, began, held in itertools.product(
+        FIRSTS, HOWS, limits, (True, False), (True, False)
+    ):
+        yield Ending(first, how, limit, began, held)  # type: ignore[arg-type]
+
+
+def test_every_ending_fits_exactly_one_row() -> None:
+    for ending in every_ending():
+        assert sum(row.fits(ending) for row in TABLE) == 1, ending
+
+
+def test_whatever_a_policy_can_bring_about_is_its_own() -> None:
+    for ending in every_ending():
+        ours = endings.verdict(ending) is None
+        if ending.first == "policy" and ending.began:
+            # Nothing but what only others can do to a sealed process, and no limit asks for.
+            provable = ending.held and ending.limit is None and ending.how in ("SIGKILL", "stop")
+            assert ours == provable, ending
+        elif ending.first == "environment":
+            assert ours == (not ending.began or ending.how not in ("exit", "fault")), ending
+        else:
+            assert ours, ending
+
+
+@given(st.integers(0, 0xFFFF), st.sampled_from(FIRSTS), st.booleans(), st.booleans())
+def test_every_status_of_a_process_has_a_verdict(
+    status: int, first: endings.First, began: bool, held: bool
+) -> None:
+    how = endings.how(status)
+    endings.verdict(Ending(first, how, None, began, held))
+    ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+    assert (how == "SIGKILL") == (ended_by == signal.SIGKILL)
+    assert (how == "fault") == (ended_by in FAULTS)
+
+
+# Real kills.
+
+# Its answers depend on all that it has seen, and it says so: a policy that is started again has to catch up.
+STATEFUL = """
+import hashlib, os, time
+
+class Policy:
+    def __init__(self, *spaces):
+        self.seen = hashlib.sha256()
+        self.n = 0
+        print("built", flush=True)
+
+    def reset(self, episode_index):
+        self.seen.update(bytes([episode_index % 256]))
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == PAUSE_AT:
+            time.sleep(PAUSE_S)
+        self.seen.update(obs.tobytes())
+        print(self.seen.hexdigest(), flush=True)
+        return [self.seen.digest()[0] / 128.0 - 1.0]
+"""
+
+
+def stateful(pause_s: float = 3.0, at: int = 31) -> str:
+    return STATEFUL.replace("PAUSE_AT", str(at)).replace("PAUSE_S", str(pause_s))
+
+
+def essence(outcome: EpisodeOutcome) -> EpisodeOutcome:
+    return msgspec.structs.replace(outcome, wall_s=0.0, policy_cpu_s=0.0)
+
+
+async def in_its_pause(slot: Slot, pid: int) -> None:
+    """Until the policy sleeps in its pause: it uses no time on a processor."""
+
+    def used() -> str:
+        return " ".join(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13])
+
+    before, same = "", 0
+    while same < 5:
+        await asyncio.sleep(0.05)
+        now = used()
+        same, before = (same + 1 if now == before else 0), now
+
+
+def played(
+    slots: Slots, slot: Slot, signals: list[int], pause_s: float = 3.0, **options: object
+) -> EpisodeOutcome:
+    """One episode in which the policy's process gets these signals in its pause."""
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, stateful(pause_s), limits=PATIENT, **options)
+        pid = family(pid_of(slot))[-1]
+        await in_its_pause(slot, pid)
+        for number in signals:
+            os.kill(pid, number)
+            await asyncio.sleep(0.1)
+        return await asyncio.wait_for(task, 100)
+
+    (outcome,) = slots.run(work())
+    return outcome
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
+def test_a_policy_that_is_killed_from_outside_is_started_again_and_nothing_shows(
+    slots: Slots, tier: str
+) -> None:
+    slot = slots.slot(tier)  # type: ignore[arg-type]
+    undisturbed = slots.play(stateful(0.0), tier=tier, limits=PATIENT)
+    slot._said.clear()
+    disturbed = played(slots, slot, [signal.SIGKILL], tier=tier)
+    assert undisturbed.failure is None
+    assert essence(disturbed) == essence(undisturbed)
+    assert any("a policy is started again" in line for line in slot._said)
+
+
+def test_where_a_policy_may_signal_itself_a_kill_is_its_own(slots: Slots) -> None:
+    outcome = played(slots, slots.slot("none"), [signal.SIGKILL], tier="none")
+    assert outcome.failure is not None
+    assert outcome.failure.category == "killed"
+    assert outcome.length == 60
+
+
+def test_a_policy_of_several_episodes_that_is_killed_from_outside_is_played_again_elsewhere(
+    slots: Slots,
+) -> None:
+    with pytest.raises(SandboxError, match="SIGKILL, and neither the policy nor a limit can have done that"):
+        played(slots, slots.slot(), [signal.SIGKILL], n=1, policy_scope="submit")
+    assert slots.play(HONEST).failure is None
+
+
+def test_a_policy_that_is_killed_again_and_again_is_played_elsewhere(slots: Slots) -> None:
+    slot = slots.slot()
+
+    async def work() -> None:
+        task = await begun(slot, slots, stateful(), limits=PATIENT)
+        gone = 0
+        while not task.done():
+            pid = family(pid_of(slot))[-1]
+            if pid != gone and len(family(pid_of(slot))) > 5:
+                await in_its_pause(slot, pid)
+                os.kill(pid, signal.SIGKILL)
+                gone = pid
+            await asyncio.sleep(0.05)
+        with pytest.raises(SandboxError, match="neither the policy nor a limit"):
+            await task
+
+    slots.run(work())
+    assert slots.play(HONEST).failure is None
+
+
+def test_every_end_of_the_sandbox_is_ours(slots: Slots) -> None:
+    slot = slots.new()
+    slots.run(slot.start())
+    n = len(slots.run(members(slot)))
+    # Bubblewrap, its inner process, and the zygote's chain; the policy is the last, the environment's process the first.
+    for which in range(1, n - 1):
+
+        async def work(which: int = which) -> None:
+            await slot.start()
+            task = await begun(slot, slots, stateful(), limits=PATIENT)
+            pids = family(pid_of(slot))
+            await in_its_pause(slot, pids[-1])
+            os.kill(pids[which], signal.SIGKILL)
+            with pytest.raises(SandboxError, match="sandbox"):
+                await asyncio.wait_for(task, 60)
+
+        slots.run(work())
+    slots.run(slot.close())
+
+
+async def members(slot: Slot) -> list[int]:
+    return family(pid_of(slot))
+
+
+def test_a_sandbox_that_ends_while_nothing_is_played_costs_the_next_job_a_retry_and_no_more(
+    slots: Slots,
+) -> None:
+    slot = slots.new()
+
+    async def work() -> None:
+        await slot.start()
+        pids = family(pid_of(slot))
+        os.kill(pids[1], signal.SIGKILL)
+        await asyncio.sleep(0.3)
+        with pytest.raises(SandboxError):
+            await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
+        await slot.close()
+
+    slots.run(work())
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_kill_of_the_environments_process_is_ours(slots: Slots, number: int) -> None:
+    slot = slots.new()
+
+    async def work() -> None:
+        await slot.start()
+        task = await begun(slot, slots, stateful(), limits=PATIENT)
+        pids = family(pid_of(slot))
+        await in_its_pause(slot, pids[-1])
+        os.kill(pids[0], number)
+        with pytest.raises(SlotDiedError):
+            await asyncio.wait_for(task, 60)
+        await slot.close()
+
+    slots.run(work())
+
+
+# What a policy can do to itself. Each is its failure, or has no effect; none gives it another throw of its dice.
+
+SELF_MADE = {
+    "abort": "os.abort()",
+    "a segmentation fault": "ctypes.string_at(0)",
+    "a full stack": "f = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: f()); sys.setrecursionlimit(1 << 30); f()",
+    "_exit": "os._exit(9)",
+    "all signals by kill": "every(lambda k: os.kill(os.getpid(), k))",
+    "all signals by raise": "every(signal.raise_signal)",
+    "all signals by pthread_kill": "every(lambda k: signal.pthread_kill(threading.get_ident(), k))",
+    "all signals by number": "every(lambda k: libc.syscall(62, os.getpid(), k))",
+    "all signals by tgkill": "every(lambda k: libc.syscall(234, os.getpid(), threading.get_native_id(), k))",
+    "all signals by tkill": "every(lambda k: libc.syscall(200, threading.get_native_id(), k))",
+    "all signals, queued": "every(lambda k: libc.syscall(129, os.getpid(), k, bytes(128)))",
+    "all signals to a group": "every(lambda k: os.killpg(0, k))",
+    "all signals to everyone": "every(lambda k: os.kill(-1, k))",
+    "SIGKILL from a timer": (
+        "timer(9); t = time.monotonic()\n            while time.monotonic() < t + 0.3: pass"
+    ),
+    "SIGSTOP from a timer": (
+        "timer(19); t = time.monotonic()\n            while time.monotonic() < t + 0.3: pass"
+    ),
+    "a processor limit of its own": (
+        "resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass"
+    ),
+    "a processor limit by number": (
+        "libc.syscall(160, 0, struct.pack('<QQ', 1, 1)) and 1 / 0\n            while True: pass"
+    ),
+    "a processor limit from an address of which half is nought": (
+        "at = libc.mmap(1 << 40, 4096, 3, 0x32, -1, 0); ctypes.memmove(at, struct.pack('<QQ', 1, 1), 16)\n"
+        "            libc.prlimit(0, 0, ctypes.c_void_p(at), None) and 1 / 0\n            while True: pass"
+    ),
+    "a parent's death signal": "libc.prctl(1, 9) and 1 / 0",
+    "a strict filter": "libc.prctl(22, 1) and 1 / 0\n            os.getppid()",
+    "becoming nothing": "os.execv('/bin/false', ['false'])",
+    "a call of the other architecture": "run(b'\\x6a\\x14\\x58\\xcd\\x80\\xc3')",
+    "an illegal instruction": "run(b'\\x0f\\x0b')",
+    "a halt": "run(b'\\xf4')",
+    "more memory than there may be": "self.a = bytearray(1 << 40)",
+    "all memory that there may be": "self.a = [bytearray(1 << 20) for _ in iter(int, 1)]",
+    "threads without end": "[threading.Thread(target=time.sleep, args=(9,)).start() for _ in iter(int, 1)]",
+    "files without end": "[open(f'f{k}', 'wb').write(bytes(1 << 20)) for k in range(1 << 30)]",
+    "a mapped file without room": (
+        "import mmap; f = open('/tmp/m', 'wb+'); f.truncate(3 << 20); g = open('/tmp/n', 'wb')\n"
+        "            m = mmap.mmap(f.fileno(), 3 << 20)\n            try: g.write(bytes(4 << 20)); g.flush()\n"
+        "            except OSError: pass\n            m[:] = bytes([1]) * (3 << 20)"
+    ),
+    "no pipes": "os.closerange(0, 256)",
+    "no main thread": (
+        "threading.Thread(target=lambda: (time.sleep(0.1), os.closerange(0, 256), time.sleep(9))).start()\n"
+        "            libc.syscall(60, 0)"
+    ),
+    "a broken return from a signal": "libc.syscall(15)",
+    "no address for its thread": "libc.syscall(334, 1, 32, 0, 0); run(b'\\x48\\x31\\xe4\\x50\\xc3')",
+}
+
+CLOCKED = """
+import ctypes, os, resource, signal, struct, sys, threading, time
+
+libc = ctypes.CDLL(None, use_errno=True)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t] + [ctypes.c_int] * 3 + [ctypes.c_long]
+
+def every(send):
+    for number in [9, 19, 20, 21, 22, *range(1, 65)]:
+        try:
+            send(number)
+        except (OSError, ValueError):
+            pass
+    time.sleep(0.05)
+
+def timer(number):
+    which = ctypes.c_int()
+    event = struct.pack("<qii48x", 0, number, 0)
+    if libc.syscall(222, 1, event, ctypes.byref(which)):
+        raise OSError(ctypes.get_errno(), "timer_create")
+    libc.syscall(223, which.value, 0, struct.pack("<qqqq", 0, 0, 0, 10_000_000), None)
+
+def run(code):
+    at = libc.mmap(None, 4096, 7, 0x22, -1, 0)
+    ctypes.memmove(at, code, len(code))
+    ctypes.CFUNCTYPE(None)(at)()
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+
+    def reset(self, episode_index):
+        pass
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == 1:
+            # Its luck.
+            return [(time.time_ns() % 1000) / 1000]
+        if self.n == AT:
+            WAY
+        return [0.0]
+"""
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
+@pytest.mark.parametrize("at", [4, 60])
+def test_a_policy_whose_luck_is_the_clock_never_throws_again(slots: Slots, tier: str, at: int) -> None:
+    limits = msgspec.structs.replace(QUICK, act_wall_s=1.0, cpu_s=1.5)
+    slot = slots.slot(tier)  # type: ignore[arg-type]
+    slots.play(HONEST, tier=tier)
+    pid = pid_of(slot)
+    for name, way in SELF_MADE.items():
+        slot._said.clear()
+        outcome = slots.play(CLOCKED.replace("WAY", way).replace("AT", str(at)), tier=tier, limits=limits)
+        assert outcome.length == 60, name
+        assert not any("started again" in line for line in slot._said), (name, outcome.failure)
+        if outcome.failure is not None:
+            assert outcome.failure.step_index == at - 1, name
+    assert pid_of(slot) == pid
+    assert slots.play(HONEST, tier=tier).failure is None
+
+
+def test_what_a_policy_had_returned_stands_when_it_is_started_again(slots: Slots) -> None:
+    luck = "luck = (time.time_ns() // 1000 % 1_000_000) / 1e6; print(luck, flush=True); return [luck]"
+    source = CLOCKED.replace("return [(time.time_ns() % 1000) / 1000]", luck)
+    source = source.replace("WAY", "time.sleep(3)").replace("AT", "31")
+    slot = slots.slot()
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, source, limits=PATIENT)
+        pid = family(pid_of(slot))[-1]
+        await in_its_pause(slot, pid)
+        os.kill(pid, signal.SIGKILL)
+        return await asyncio.wait_for(task, 60)
+
+    (outcome,) = slots.run(work())
+    assert outcome.failure is None
+    # What it says it threw is the second throw; what it played is the first.
+    assert rows(outcome)[0].action != [float(outcome.stdout)]
+    assert isinstance(rows(outcome)[0].action[0], float)
+
+
+# Memory of the machine's.
+
+
+@pytest.fixture
+def memory_group(tmp_path: Path) -> Iterator[Path]:
+    """A memory cgroup of one's own."""
+    group = Path("/sys/fs/cgroup/memory") / f"evopolicy-{os.getpid()}-{tmp_path.name}"
+    try:
+        group.mkdir()
+    except OSError as error:
+        pytest.skip(
+            f"no memory cgroup can be made ({error}): run as root where the memory controller is writable"
+        )
+    yield group
+    group.rmdir()
+
+
+def eats(n_bytes: int) -> str:
+    return misbehaving(
+        act=f"time.sleep(2)\n            self.a = bytes({n_bytes}).replace(bytes(1), b'x')"
+    ).replace("def __init__", "again = os.path.exists('x')\n\n    def __init__")
+
+
+@pytest.mark.parametrize(
+    ("eaten", "limit", "category"), [(100 << 20, 48 << 20, "oom"), (12 << 20, 4 << 20, None)]
+)
+def test_a_policy_that_the_machine_ends_for_want_of_memory_failed_if_the_memory_was_its_own(
+    slots: Slots, memory_group: Path, eaten: int, limit: int, category: str | None
+) -> None:
+    slot = slots.slot()
+    (memory_group / "memory.limit_in_bytes").write_text(str(limit))
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, eats(eaten), limits=PATIENT)
+        pid = family(pid_of(slot))[-1]
+        await in_its_pause(slot, pid)
+        (memory_group / "cgroup.procs").write_text(str(pid))
+        return await asyncio.wait_for(task, 60)
+
+    slot._said.clear()
+    (outcome,) = slots.run(work())
+    assert (outcome.failure.category if outcome.failure else None) == category
+    if outcome.failure is not None:
+        assert outcome.failure.limit == PATIENT.memory_bytes
+    else:
+        assert any("a policy is started again" in line for line in slot._said)
+    assert slots.play(HONEST).failure is None

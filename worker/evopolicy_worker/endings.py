@@ -1,0 +1,153 @@
+"""How a slot can end, and whose doing each end is: a table, without I/O.
+
+The principle: whatever a policy's process can bring about by itself is the policy's result; whatever it provably cannot is ours,
+and is played again. The seal is the proof: it refuses a policy every signal but those to itself, and of these SIGKILL and the
+stops (`sandbox.seccomp`), so that a SIGKILL that no limit explains came from outside.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Literal, NamedTuple, get_args
+
+from evopolicy_common.errors import SandboxError
+from evopolicy_common.messages.episode import FailureCategory
+
+First = Literal["policy", "sandbox", "environment", "supervisor"]
+"""Which process ended first. `sandbox`: bubblewrap or the zygote, whose end is the policy's. `supervisor`: the worker."""
+How = Literal["exit", "fault", "signal", "SIGKILL", "stop", "pipe", "frame"]
+"""`exit`: with a status. `fault`: by a signal that a process brings upon itself (`FAULTS`). `signal`: by another one.
+`stop`: stopped, and not let go on. `pipe`: it closed its pipe and lives. `frame`: it sent what is none."""
+
+FAULTS = frozenset(
+    {
+        *(signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT),
+        *(signal.SIGSYS, signal.SIGTRAP),
+    }
+)
+
+
+class EndedFromOutsideError(SandboxError):
+    """A process of the slot's was ended or stopped, and the policy cannot have done it."""
+
+
+class Ending(NamedTuple):
+    """What is known of an end."""
+
+    first: First
+    how: How
+    limit: FailureCategory | None = None
+    """The category of the limit that explains it."""
+    began: bool = True
+    """Of the policy: whether any of its bundle's code had run. Of the environment: whether an action of the policy's had
+    reached it in this episode."""
+    held: bool = True
+    """Whether the policy's process cannot have signalled itself: it is sealed, and under no CPU limit of the system's."""
+
+
+class Row(NamedTuple):
+    """Endings of one kind, and their verdict; None in a condition: any."""
+
+    what: str
+    first: frozenset[First]
+    how: frozenset[How] | None
+    verdict: FailureCategory | Literal["limit", "outside"]
+    """The policy's failure; `limit`: that of the limit. `outside`: ours, to be played again."""
+    limit: bool | None = None
+    began: bool | None = None
+    held: bool | None = None
+
+    def fits(self, ending: Ending) -> bool:
+        """Whether it is of this kind."""
+        return (
+            ending.first in self.first
+            and (self.how is None or ending.how in self.how)
+            and self.limit in (None, ending.limit is not None)
+            and self.began in (None, ending.began)
+            and self.held in (None, ending.held)
+        )
+
+
+def _set(*names: First) -> frozenset[First]:
+    return frozenset(names)
+
+
+def _how(*names: How) -> frozenset[How]:
+    return frozenset(names)
+
+
+TABLE: tuple[Row, ...] = (
+    Row("a policy's process before the bundle's code", _set("policy"), None, "outside", began=False),
+    Row("a limit was passed", _set("policy"), None, "limit", limit=True, began=True),
+    Row("it exited", _set("policy"), _how("exit"), "killed", limit=False, began=True),
+    Row("it crashed", _set("policy"), _how("fault"), "killed", limit=False, began=True),
+    Row(
+        "a signal that it can send itself", _set("policy"), _how("signal"), "killed", limit=False, began=True
+    ),
+    Row("it closed its pipe", _set("policy"), _how("pipe"), "killed", limit=False, began=True),
+    Row("it broke the pipes' rules", _set("policy"), _how("frame"), "killed", limit=False, began=True),
+    Row(
+        "killed or stopped where it can signal itself",
+        _set("policy"),
+        _how("SIGKILL", "stop"),
+        "killed",
+        limit=False,
+        began=True,
+        held=False,
+    ),
+    Row(
+        "killed or stopped, sealed, and no limit explains it",
+        _set("policy"),
+        _how("SIGKILL", "stop"),
+        "outside",
+        limit=False,
+        began=True,
+        held=True,
+    ),
+    Row("bubblewrap or the zygote", _set("sandbox"), None, "outside"),
+    Row(
+        "the environment crashed on its actions",
+        _set("environment"),
+        _how("exit", "fault"),
+        "killed",
+        began=True,
+    ),
+    Row(
+        "the environment crashed before any",
+        _set("environment"),
+        _how("exit", "fault"),
+        "outside",
+        began=False,
+    ),
+    Row(
+        "the environment was killed or stopped",
+        _set("environment"),
+        _how("signal", "SIGKILL", "stop", "pipe", "frame"),
+        "outside",
+    ),
+    Row("the worker", _set("supervisor"), None, "outside"),
+)
+"""Every ending fits exactly one row."""
+
+
+def verdict(ending: Ending) -> FailureCategory | None:
+    """The policy's failure; None when it is ours, and played again."""
+    (row,) = [row for row in TABLE if row.fits(ending)]
+    if row.verdict == "outside":
+        return None
+    return ending.limit if row.verdict == "limit" else row.verdict
+
+
+def how(status: int) -> How:
+    """How a process ended, by its status as from waitpid."""
+    if not os.WIFSIGNALED(status):
+        return "exit"
+    number = os.WTERMSIG(status)
+    if number == signal.SIGKILL:
+        return "SIGKILL"
+    return "fault" if number in FAULTS else "signal"
+
+
+FIRSTS: tuple[First, ...] = get_args(First)
+HOWS: tuple[How, ...] = get_args(How)
