@@ -62,7 +62,7 @@ class WorkerError(EvopolicyError):
 
 
 class SlotDiedError(WorkerError):
-    """A slot's processes died under a job while its supervisor lives: a strike against the job's bundle."""
+    """A slot's processes were ended from outside while its supervisor lives."""
 
 
 class StorageError(EvopolicyError):

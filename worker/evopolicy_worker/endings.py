@@ -12,7 +12,7 @@ import signal
 from typing import Literal, NamedTuple, get_args
 
 from evopolicy_common.errors import SandboxError
-from evopolicy_common.messages.episode import FailureCategory
+from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 
 First = Literal["policy", "sandbox", "environment", "supervisor"]
 """Which process ended first. `sandbox`: bubblewrap or the zygote, whose end is the policy's. `supervisor`: the worker."""
@@ -137,6 +137,15 @@ def verdict(ending: Ending) -> FailureCategory | None:
     if row.verdict == "outside":
         return None
     return ending.limit if row.verdict == "limit" else row.verdict
+
+
+def broken_down(ending: Ending) -> PolicyFailure | None:
+    """The policy's failure for an end of the environment's process; None when it is ours."""
+    category = verdict(ending)
+    if category is None:
+        return None
+    text = "the environment broke down on the policy's actions; the episode was played again from its first step with random actions"
+    return PolicyFailure(category=category, step_index=None, message=text)
 
 
 def how(status: int) -> How:

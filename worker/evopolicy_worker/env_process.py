@@ -109,7 +109,10 @@ class EnvProcess:
         self._monitor.ticking = True
         self._monitor.wake()
         try:
-            player.play(command.job, self._files(command.bundle), progress, self._channel.send_frame)
+            files = self._files(command.bundle)
+            player.play(
+                command.job, files, progress, self._channel.send_frame, command.first, command.failure
+            )
             return messages.Played(cancelled=progress.cancelled)
         except CancelledJobError:
             return messages.Played(cancelled=True)

@@ -43,9 +43,9 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.scratch import remove_tree
 from evopolicy_common.trajectory import Recorder, decode
-from evopolicy_worker import environments, float_environment
+from evopolicy_worker import endings, environments, float_environment
 from evopolicy_worker import slot_messages as messages
-from evopolicy_worker.endings import EndedFromOutsideError
+from evopolicy_worker.endings import EndedFromOutsideError, Ending
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.monitor import Monitor
 from evopolicy_worker.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess, oom_kills
@@ -65,10 +65,7 @@ MAX_WARM_ENVIRONMENTS = 4
 """Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
 
 
-BROKE_DOWN = (
-    "the environment broke down on the policy's actions; the episode was played again from its first step with random"
-    " actions"
-)
+_ACTING = messages.framed(messages.Acting())
 
 
 class CancelledJobError(Exception):
@@ -108,10 +105,17 @@ class Player:
         self._videos = VideoRecorder()
 
     def play(
-        self, job: Job, files: BundleFiles | None, progress: Progress, tell: Callable[[bytes], None]
+        self,
+        job: Job,
+        files: BundleFiles | None,
+        progress: Progress,
+        tell: Callable[[bytes], None],
+        first: int = 0,
+        failure: PolicyFailure | None = None,
     ) -> None:
         """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`. `files`: its bundle.
 
+        It begins with the `first`, which is played without its policy where that has failed with `failure`.
         Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
         """
         environment = self._environment(job.env)
@@ -122,29 +126,38 @@ class Player:
         if not job.video:
             self._videos.close()
         try:
-            for k, spec in enumerate(job.episodes):
+            progress.episodes_done = first
+            for k in range(first, len(job.episodes)):
+                spec = job.episodes[k]
                 if progress.cancelled:
                     raise CancelledJobError
-                failure, frame = self._play(k, job, spec, policies, progress)
+                failure, frame = self._play(k, job, spec, policies, progress, tell, failure)
                 tell(frame)
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
                     for other in job.episodes[k + 1 :]:
                         tell(_framed(_brief(_unplayed(other.index, failure), _share(job))))
                     break
+                failure = None
         finally:
             policies.close(progress)
 
     def _play(
-        self, k: int, job: Job, spec: EpisodeSpec, policies: _Policies, progress: Progress
+        self,
+        k: int,
+        job: Job,
+        spec: EpisodeSpec,
+        policies: _Policies,
+        progress: Progress,
+        tell: Callable[[bytes], None],
+        failure: PolicyFailure | None,
     ) -> tuple[PolicyFailure | None, bytes]:
         """The failure in one episode, and its outcome as it is told."""
         taken: list[Any] = []
-        failure: PolicyFailure | None = None
         n_ends = 0
         while True:
             environment = self._environment(job.env)
-            episode = _Episode(job, spec, environment, policies, progress, self._videos, taken, failure)
+            episode = _Episode(job, spec, environment, policies, progress, self._videos, tell, taken, failure)
             try:
                 outcome = episode.play(k)
                 return outcome.failure, _framed(_brief(outcome, _share(job)))
@@ -163,9 +176,7 @@ class Player:
                 # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
                 note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
                 self._environments.pop(job.env).close()
-                failure = episode.failure or PolicyFailure(
-                    category="act_error", step_index=None, message=BROKE_DOWN
-                )
+                failure = episode.failure or endings.broken_down(Ending("environment", "exit"))
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
@@ -290,6 +301,7 @@ class _Episode:
         policies: _Policies,
         progress: Progress,
         videos: VideoRecorder,
+        tell: Callable[[bytes], None],
         taken: list[Any],
         failure: PolicyFailure | None,
     ) -> None:
@@ -297,6 +309,7 @@ class _Episode:
         again, and its first answers do not count. Those that do are added. `failure`: why no policy is asked, and random
         actions are played from the first step on.
         """
+        self._tell = tell
         self._taken = taken
         self._job = job
         self._spec = spec
@@ -395,7 +408,9 @@ class _Episode:
             if policy is not None:
                 try:
                     returned = policy.act(obs)
-                    self.acted = True
+                    if not self.acted:
+                        self.acted = True
+                        self._tell(_ACTING)
                     if t < n_taken:
                         returned = taken[t]
                     else:

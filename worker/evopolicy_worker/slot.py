@@ -1,8 +1,8 @@
 """A slot: one core's worth of episodes. The supervisor's end of an environment process and its sandbox.
 
-Rules: a job's failure is its policy's (an outcome), ours (WorkerError, SandboxError: played elsewhere) or the death of
-the slot's processes (SlotDiedError: a strike against the bundle). `cancel` leaves the slot usable; after an error `start`
-makes it new. One job at a time.
+Rules: a job's failure is its policy's (an outcome) or ours (WorkerError, SandboxError, SlotDiedError: played elsewhere), as the
+table of `endings` says. Where the environment's process crashes on a policy's actions, a new one plays the episode with random
+actions, and what is left of the job. `cancel` leaves the slot usable; after an error `start` makes it new. One job at a time.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ import structlog
 
 from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.scratch import remove_tree
+from evopolicy_worker import endings
 from evopolicy_worker import slot_messages as messages
+from evopolicy_worker.endings import Ending, How
 from evopolicy_worker.sandbox import env_jail, jail
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -122,18 +124,32 @@ class Slot:
             files = None if bundle is None else await asyncio.to_thread(bundle_files, bundle, self._sent)
             if self._cancelled:
                 return ()
-            await self._send(messages.Play(job=job, bundle=files))
-            self._sent = files.key if files is not None else self._sent
+            failure: PolicyFailure | None = None
             while True:
-                answer = await self._answer()
-                if isinstance(answer, messages.Told):
-                    on_progress(answer.episodes_done, answer.steps)
-                elif isinstance(answer, messages.Finished):
-                    outcomes.append(answer.outcome)
-                elif isinstance(answer, messages.Played):
+                began = False
+                try:
+                    await self._send(
+                        messages.Play(job=job, bundle=files, first=len(outcomes), failure=failure)
+                    )
+                    self._sent = files.key if files is not None else self._sent
+                    while not isinstance(answer := await self._answer(), messages.Played):
+                        if isinstance(answer, messages.Told):
+                            on_progress(answer.episodes_done, answer.steps)
+                        elif isinstance(answer, messages.Acting):
+                            began = True
+                        elif isinstance(answer, messages.Finished):
+                            began = False
+                            outcomes.append(answer.outcome)
+                        else:
+                            raise _error(answer)
                     return () if answer.cancelled else tuple(outcomes)
-                else:
-                    raise _error(answer)
+                except SlotDiedError as error:
+                    failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=began))
+                    if failure is None or self._cancelled or bundle is None:
+                        raise
+                    log.warning("slot died on a policy's actions", job=job.job_id, error=str(error))
+                await self.start()
+                files = await asyncio.to_thread(bundle_files, bundle)
         except asyncio.CancelledError:
             # Nobody reads the rest of this job's answers: the processes are of no more use.
             self._end_process()
@@ -211,6 +227,14 @@ class Slot:
             raise WorkerError(f"an answer of the slot's process cannot be read: {error}") from error
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             raise SlotDiedError(await self._last_words()) from error
+
+    def _how_it_ended(self) -> How:
+        code = None if self._process is None else self._process.returncode
+        if code is None:
+            return "pipe"
+        if self._start.tier == "bwrap" and code > 128:
+            code = 128 - code  # bubblewrap's word for a signal
+        return endings.how(-code if code < 0 else code << 8)
 
     async def _last_words(self) -> str:
         process = self._process

@@ -7,7 +7,7 @@ import struct
 import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 
 LENGTH = struct.Struct("<I")
 NOTE = "note: "
@@ -45,6 +45,10 @@ class Play(Message, frozen=True, kw_only=True, tag="play"):
 
     job: Job
     bundle: Files | None
+    first: int = 0
+    """The episode to begin with, counted in the job."""
+    failure: PolicyFailure | None = None
+    """Of the policy in that episode: it brought down the process that played it before."""
 
 
 class Describe(Message, frozen=True, kw_only=True, tag="describe"):
@@ -66,6 +70,10 @@ class Told(Message, frozen=True, kw_only=True, tag="progress"):
 
     episodes_done: int
     steps: int
+
+
+class Acting(Message, frozen=True, kw_only=True, tag="acting"):
+    """The first action of a policy is about to reach the environment in the job's next episode."""
 
 
 class Finished(Message, frozen=True, kw_only=True, tag="finished"):
@@ -95,7 +103,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 
 
 Command = Start | Play | Describe | Cancel
-Answer = Ready | Told | Finished | Played | Described | Fault
+Answer = Ready | Told | Acting | Finished | Played | Described | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)

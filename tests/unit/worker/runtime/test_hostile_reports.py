@@ -110,15 +110,14 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
         assert handed_in(outcome) == outcome
 
 
-def told(frame: bytes) -> EpisodeOutcome:
+def finished(frame: bytes) -> list[EpisodeOutcome]:
     message = messages.answers.decode(frame[messages.LENGTH.size :])
-    assert isinstance(message, messages.Finished)
-    return message.outcome
+    return [message.outcome] if isinstance(message, messages.Finished) else []
 
 
 def handed_in(outcome: EpisodeOutcome) -> EpisodeOutcome:
     """The outcome after its way from the slot's process through the supervisor to the coordinator."""
-    outcome = told(messages.framed(messages.Finished(outcome=outcome)))
+    (outcome,) = finished(messages.framed(messages.Finished(outcome=outcome)))
     result = JobResult(lease_id="l", job_id="j", attempt=1, kind="done", episodes=(outcome,))
     message = codec.decode(
         codec.worker_requests, codec.encode(HandIn(worker="w", session="s", results=(result,)))
@@ -292,7 +291,7 @@ def play(player: Player, slots: Slots, source: str, n: int = 1, **options: Any) 
     files = bundle_files(slots.bundle(source))
     assert files.names is not None
     bundle = BundleFiles(files.names, files.data)
-    player.play(job, bundle, Progress(), lambda frame: outcomes.append(told(frame)))
+    player.play(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
     return outcomes
 
 
@@ -304,7 +303,7 @@ def test_an_action_that_breaks_the_environment_is_the_policys_failure(
     (outcome,) = play(player, slots, BREAKER)
     failure = outcome.failure
     assert failure is not None
-    assert (failure.category, failure.step_index) == ("act_error", None)
+    assert (failure.category, failure.step_index) == ("killed", None)
     assert "the environment broke down" in failure.message
     assert "4711" not in failure.message
     # It is worth what random actions are, from the first step on.

@@ -199,28 +199,42 @@ def test_a_policy_that_is_killed_again_and_again_is_played_elsewhere(slots: Slot
     assert slots.play(HONEST).failure is None
 
 
-def test_every_end_of_the_sandbox_is_ours(slots: Slots) -> None:
+def place_of_env(pids: list[int]) -> int:
+    """Where in a slot's family the environment's process is: outside are its jail's, below it the sandbox's."""
+    lines = [Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0") for pid in pids]
+    return next(
+        k
+        for k, line in enumerate(lines)
+        if b"bwrap" not in line[0] and b"evopolicy_worker.env_process" in line
+    )
+
+
+def after(
+    slots: Slots, slot: Slot, number: int, place: int, source: str = "", **options: object
+) -> list[EpisodeOutcome]:
+    """What comes of a job when one process of the slot gets that signal in the policy's pause.
+
+    `place`: in the slot's family, counted from the environment's process.
+    """
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        await slot.start()
+        task = await begun(slot, slots, source or stateful(), limits=PATIENT, **options)
+        pids = family(pid_of(slot))
+        await in_its_pause(slot, pids[-1])
+        os.kill(pids[place_of_env(pids) + place], number)
+        return await asyncio.wait_for(task, 100)
+
+    return list(slots.run(work()))
+
+
+# Its two bubblewraps, the two parents of the zygote's as root, the zygote; the policy is the last.
+@pytest.mark.parametrize("place", range(1, 6 if os.geteuid() == 0 else 4))
+def test_every_end_of_the_sandbox_is_ours(slots: Slots, place: int) -> None:
     slot = slots.new()
-    slots.run(slot.start())
-    n = len(slots.run(members(slot)))
-    # Bubblewrap, its inner process, and the zygote's chain; the policy is the last, the environment's process the first.
-    for which in range(1, n - 1):
-
-        async def work(which: int = which) -> None:
-            await slot.start()
-            task = await begun(slot, slots, stateful(), limits=PATIENT)
-            pids = family(pid_of(slot))
-            await in_its_pause(slot, pids[-1])
-            os.kill(pids[which], signal.SIGKILL)
-            with pytest.raises(SandboxError, match="sandbox"):
-                await asyncio.wait_for(task, 60)
-
-        slots.run(work())
+    with pytest.raises(SandboxError, match="sandbox"):
+        after(slots, slot, signal.SIGKILL, place)
     slots.run(slot.close())
-
-
-async def members(slot: Slot) -> list[int]:
-    return family(pid_of(slot))
 
 
 def test_a_sandbox_that_ends_while_nothing_is_played_costs_the_next_job_a_retry_and_no_more(
@@ -231,7 +245,7 @@ def test_a_sandbox_that_ends_while_nothing_is_played_costs_the_next_job_a_retry_
     async def work() -> None:
         await slot.start()
         pids = family(pid_of(slot))
-        os.kill(pids[1], signal.SIGKILL)
+        os.kill(pids[place_of_env(pids) + 1], signal.SIGKILL)
         await asyncio.sleep(0.3)
         with pytest.raises(SandboxError):
             await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
@@ -240,21 +254,49 @@ def test_a_sandbox_that_ends_while_nothing_is_played_costs_the_next_job_a_retry_
     slots.run(work())
 
 
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_kill_of_the_environments_process_is_ours(slots: Slots, number: int) -> None:
+def test_a_kill_of_the_environments_process_is_ours(slots: Slots, number: int, tier: str) -> None:
+    slot = slots.new(tier)  # type: ignore[arg-type]
+    with pytest.raises(SlotDiedError):
+        after(slots, slot, number, 0, tier=tier)
+    slots.run(slot.close())
+
+
+@pytest.mark.parametrize("place", [-2, -1])
+def test_a_kill_of_the_environments_jail_is_ours(slots: Slots, place: int) -> None:
     slot = slots.new()
+    with pytest.raises(SlotDiedError):
+        after(slots, slot, signal.SIGKILL, place)
+    slots.run(slot.close())
 
-    async def work() -> None:
-        await slot.start()
-        task = await begun(slot, slots, stateful(), limits=PATIENT)
-        pids = family(pid_of(slot))
-        await in_its_pause(slot, pids[-1])
-        os.kill(pids[0], number)
-        with pytest.raises(SlotDiedError):
-            await asyncio.wait_for(task, 60)
-        await slot.close()
 
-    slots.run(work())
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
+def test_an_environment_that_crashes_on_a_policys_actions_is_the_policys_failure(
+    slots: Slots, tier: str
+) -> None:
+    slot = slots.new(tier)  # type: ignore[arg-type]
+    # It crashes in the second of three episodes of one policy.
+    source = (
+        stateful()
+        .replace("self.n += 1", "self.n += 1 if self.e == 1 else 0")
+        .replace("self.seen.update(bytes([", "self.e = episode_index; self.seen.update(bytes([")
+    )
+    outcomes = after(slots, slot, signal.SIGSEGV, 0, source, tier=tier, first=0, n=3, policy_scope="submit")
+    assert [outcome.index for outcome in outcomes] == [0, 1, 2]
+    failures = [outcome.failure for outcome in outcomes]
+    assert [failure and failure.category for failure in failures] == [None, "killed", None]
+    (alone,) = slots.play_all(misbehaving(reset="raise ValueError"), seed=8, tier=tier)
+    assert outcomes[1].episode_return == alone.episode_return
+    assert [len(rows(outcome)) for outcome in outcomes] == [60] * 3
+    slots.run(slot.close())
+
+
+def test_an_environment_that_crashes_before_a_policys_first_action_is_ours(slots: Slots) -> None:
+    slot = slots.new()
+    with pytest.raises(SlotDiedError):
+        after(slots, slot, signal.SIGSEGV, 0, stateful(at=1))
+    slots.run(slot.close())
 
 
 # What a policy can do to itself. Each is its failure, or has no effect; none gives it another throw of its dice.
