@@ -1,13 +1,20 @@
-"""A table as data, and its plain forms: CSV (full precision) and Markdown (rounded, best and second marked)."""
+"""A table as data, and its plain forms: CSV (full precision) and Markdown (rounded, best and second marked).
+
+Cells hold what agents and policies wrote. In CSV a text that a spreadsheet would take for a formula gets an apostrophe in
+front; in Markdown no text becomes HTML, an image or a link; in both nothing is left that would steer a terminal.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import msgspec
+
+from evopolicy_common.terminal import harmless, one_line
 
 Kind = Literal["text", "integer", "number", "percent"]
 DASH = "–"
@@ -60,19 +67,34 @@ def shown(value: Any, column: Column) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """Header of column keys; numbers unrounded; empty for no value."""
+    """Header of column keys; numbers unrounded; empty for no value; an apostrophe before a text that looks like a formula."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([column.key for column in table.columns])
     for row in table.rows:
         values = [row.get(column.key) for column in table.columns]
-        writer.writerow(["" if value is None else value for value in values])
+        writer.writerow([_csv_cell(value) for value in values])
     return out.getvalue()
+
+
+# A number, or two as in an interval: `-1.5`, `-1.5 to +2e3`.
+_NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
+
+
+def _csv_cell(value: Any) -> Any:
+    if value is None:
+        return ""
+    if not isinstance(value, str):
+        return value
+    text = harmless(value)
+    formula = text.lstrip().startswith(("=", "+", "-", "@")) and not _NUMBERS.fullmatch(text)
+    return f"'{text}" if formula else text
 
 
 def to_markdown(table: Table) -> str:
     """A pipe table under its title; best in bold, second-best in italics."""
-    lines = [f"## {table.title}", "", table.caption, ""] if table.caption else [f"## {table.title}", ""]
+    title = f"## {_pipe(table.title)}"
+    lines = [title, "", _pipe(table.caption), ""] if table.caption else [title, ""]
     lines.append("| " + " | ".join(_pipe(column.title) for column in table.columns) + " |")
     lines.append("|" + "|".join("---" if column.kind == "text" else "---:" for column in table.columns) + "|")
     wrap = {0: "{}", 1: "**{}**", 2: "*{}*"}
@@ -85,8 +107,17 @@ def to_markdown(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
+_MARKUP = re.compile(r"[\\|`\[\]<>]")
+
+
 def _pipe(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+    """A cell's text: nothing in it ends the cell or becomes HTML, code, a link or an image."""
+    return _MARKUP.sub(_escaped, one_line(text))
+
+
+def _escaped(found: re.Match[str]) -> str:
+    # Not every reader takes a backslash before these two.
+    return {"<": "&lt;", ">": "&gt;"}.get(found[0], f"\\{found[0]}")
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:

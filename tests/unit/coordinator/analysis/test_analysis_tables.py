@@ -22,6 +22,7 @@ from evopolicy_coordinator.analysis.phases import events_of, phases
 from evopolicy_coordinator.analysis.reader import read_run
 from evopolicy_coordinator.analysis.tables import (
     Column,
+    Table,
     best_marks,
     shown,
     to_csv,
@@ -41,6 +42,48 @@ def test_markdown_marks_best_and_second_and_escapes_pipes() -> None:
     assert "| A & B_1 | **1.23** | 50 % | **3** |" in lines
     assert "| C\\|D | – | 13 % | 0 |" in lines
     assert "| E | *0.00* | – | **3** |" in lines
+
+
+HOSTILE = (
+    ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
+    ("+1+cmd", "'+1+cmd"),
+    ("-1-cmd", "'-1-cmd"),
+    ("@SUM(A1)", "'@SUM(A1)"),
+    ("\t=1", "'\t=1"),
+    ("-1.5", "-1.5"),
+    ("-0.300 to +1.2e-05", "-0.300 to +1.2e-05"),
+    ("a=b", "a=b"),
+    ("\x1b]8;;http://evil\x1b\\x", "\ufffd]8;;http://evil\ufffd\\x"),
+)
+
+
+@pytest.mark.parametrize(("text", "written"), HOSTILE)
+def test_csv_holds_no_formula_and_nothing_that_steers_a_terminal(text: str, written: str) -> None:
+    table = Table(
+        name="t",
+        title="T",
+        caption="",
+        columns=(Column(key="who", title="Who"), Column(key="x", title="X", kind="number")),
+        rows=({"who": text, "x": -1.5},),
+    )
+    assert list(csv.reader(io.StringIO(to_csv(table)))) == [["who", "x"], [written, "-1.5"]]
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("<img src=x onerror=alert(1)>", "&lt;img src=x onerror=alert(1)&gt;"),
+        ("![x](http://evil/x.png)", "!\\[x\\](http://evil/x.png)"),
+        ("a\\|b", "a\\\\\\|b"),
+        ("`<b>`\nx", "\\`&lt;b&gt;\\` x"),
+        ("\x1b[2J", "\ufffd\\[2J"),
+    ],
+)
+def test_markdown_shows_text_and_no_html_links_or_images(text: str, written: str) -> None:
+    table = Table(
+        name="t", title="T", caption="", columns=(Column(key="who", title="Who"),), rows=({"who": text},)
+    )
+    assert to_markdown(table).splitlines()[-1] == f"| {written} |"
 
 
 def test_number_too_small_to_show_is_told_from_nought() -> None:
