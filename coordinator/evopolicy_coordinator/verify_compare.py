@@ -82,7 +82,10 @@ def same(left: Any, right: Any) -> bool:
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of an episode's `trajectory.jsonl`. ValueError or OSError when it cannot be read."""
-    rows = [json.loads(line) for line in (folder / "trajectory.jsonl").read_bytes().splitlines()]
+    try:
+        rows = [json.loads(line) for line in (folder / "trajectory.jsonl").read_bytes().splitlines()]
+    except RecursionError:
+        raise ValueError("a row is nested too deeply") from None
     if not all(isinstance(row, dict) and {"action", "reward"} <= row.keys() for row in rows):
         raise ValueError("a row is not one of a trajectory")
     return rows
@@ -138,7 +141,10 @@ def reads_as(told: Any, value: Any) -> bool:
         number = _NAMES.get(told, told) if isinstance(told, str) else told
         if isinstance(number, bool) or not isinstance(number, int | float):
             return False
-        read = np.asarray(number, dtype=np.asarray(value).dtype)
+        try:
+            read = np.asarray(number, dtype=np.asarray(value).dtype)
+        except OverflowError:
+            return False
         return bool(np.isnan(read) and np.isnan(value)) or read.tobytes() == np.asarray(value).tobytes()
     if isinstance(value, np.integer):
         value = int(value)

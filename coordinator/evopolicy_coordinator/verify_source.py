@@ -24,6 +24,7 @@ from evopolicy_common.summary import Summary, decode_summary
 
 RANDOM = -1
 """Submit index of the random reference."""
+_MAX_DIGITS = 9
 
 
 class Played(msgspec.Struct, frozen=True, kw_only=True):
@@ -137,7 +138,8 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
         )
 
     for text, mean in outcome.val_scores.items():
-        if (own := train.get(int(text))) is not None:
+        index = int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else -1
+        if (own := train.get(index)) is not None:
             add("validation", own, dimensions.n_validation, None, mean)
     if outcome.best_submit_index is not None and (own := train.get(outcome.best_submit_index)) is not None:
         add(

@@ -22,6 +22,7 @@ from evopolicy_gateway.harnesses.trouble import trouble_of
 from evopolicy_gateway.harnesses.usage import Usage, count
 
 TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
+_MAX_OPEN_MESSAGES = 1000
 _ISOLATION = ("--safe-mode", "--strict-mcp-config")
 
 
@@ -84,8 +85,12 @@ class ClaudeReader(TurnReader):
     def _message(self, message: Mapping[str, Any]) -> None:
         identity = string(message.get("id"))
         if identity:
-            self._messages[identity] = usage_of(mapping(message.get("usage")))
-            self.usage = sum(self._messages.values(), Usage())
+            told = usage_of(mapping(message.get("usage")))
+            self.usage = self.usage - self._messages.pop(identity, Usage()) + told
+            self._messages[identity] = told
+            if len(self._messages) > _MAX_OPEN_MESSAGES:
+                # What is dropped stays counted: a message is not told anew after so many others.
+                del self._messages[next(iter(self._messages))]
         content = message.get("content")
         for block in content if isinstance(content, list) else ():
             self._block(mapping(block))

@@ -15,6 +15,7 @@ from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.trouble import Trouble
 from evopolicy_gateway.harnesses.usage import Usage
 
+_MAX_VERSION_CHARS = 2000
 _VERSION = re.compile(r"\d+\.\d+(?:\.\d+)?[\w.+-]*")
 
 
@@ -88,7 +89,7 @@ class Dialect(ABC):
 
     def version_in(self, text: str) -> str | None:
         """The version in what it says to `--version`."""
-        found = _VERSION.search(text)
+        found = _VERSION.search(text[:_MAX_VERSION_CHARS])
         return None if found is None else found.group(0)
 
 

@@ -22,7 +22,8 @@ _LOOKS_LIKE = re.compile(
     rb"|\bxox[abprs]-[A-Za-z0-9-]{10,}"
     rb"|\bhf_[A-Za-z0-9]{20,}"
     rb"|\bAKIA[A-Z0-9]{16}\b"
-    rb"|\beyJ[A-Za-z0-9_-]{10,}\.[A-Za-z0-9_-]{10,}\.[A-Za-z0-9_-]{5,}"
+    # Its first part is bounded, as a line of nothing but beginnings would take time by its square.
+    rb"|\beyJ[A-Za-z0-9_-]{10,1024}\.[A-Za-z0-9_-]{10,}\.[A-Za-z0-9_-]{5,}"
 )
 _BEARER = re.compile(rb"(\b[Bb]earer\s+)[A-Za-z0-9._~+/=-]{12,}")
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from typing import Literal
@@ -19,6 +20,8 @@ Kind = Literal["passing", "quota", "lost", "final", "cap"]
 
 MAX_BACKOFF_S = 300.0
 _MAX_MESSAGE = 500
+_MAX_SEARCHED = 20_000
+"""Characters of a message in which a time to wait is looked for."""
 
 _LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
 _QUOTA = re.compile(
@@ -67,7 +70,7 @@ def trouble_of(message: str, status: int | None = None, now: float | None = None
         return Trouble(kind="lost", message=text)
     if code in (401, 403) or _FINAL.search(text):
         return Trouble(kind="final", message=text, provider=True)
-    wait_s = _wait_in(message, time.time() if now is None else now)
+    wait_s = _wait_in(message[:_MAX_SEARCHED], time.time() if now is None else now)
     if code == 402 or _QUOTA.search(text):
         return Trouble(kind="quota", message=text, provider=True, wait_s=wait_s)
     if code is not None and 400 <= code < 500 and code not in (408, 409, 425, 429):
@@ -83,6 +86,12 @@ def backoff_s(attempt: int, base_s: float, chance: float) -> float:
 
 
 def _wait_in(text: str, now: float) -> float | None:
+    """Seconds to wait, finite, where the text tells."""
+    told = _told_wait(text, now)
+    return told if told is not None and math.isfinite(told) else None
+
+
+def _told_wait(text: str, now: float) -> float | None:
     if (seconds := _RESETS_IN.search(text)) is not None:
         return float(seconds.group(1))
     if (epoch := _EPOCH.search(text)) is not None:

@@ -45,6 +45,16 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
             reasoning=reasoning,
         )
 
+    def __sub__(self, other: Usage) -> Usage:
+        """Without `other`, which is part of it; `reasoning` stays."""
+        return Usage(
+            input_noncached=self.input_noncached - other.input_noncached,
+            cache_read=self.cache_read - other.cache_read,
+            cache_creation=self.cache_creation - other.cache_creation,
+            output=self.output - other.output,
+            reasoning=self.reasoning,
+        )
+
     @property
     def total(self) -> int:
         """All tokens, cached ones too."""
@@ -69,6 +79,12 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
         return document
 
 
+MAX_COUNT = 10**12
+"""No turn takes more tokens: sums of what a stream claims stay numbers that every reader takes."""
+
+
 def count(value: Any) -> int:
-    """A count of a stream; 0 for what is none."""
-    return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
+    """A count of a stream, at most `MAX_COUNT`; 0 for what is none."""
+    return (
+        min(value, MAX_COUNT) if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
+    )

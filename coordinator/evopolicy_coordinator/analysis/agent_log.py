@@ -9,10 +9,15 @@ A submit's place in the stream is where its answer (`submit_id`, or its summary)
 line begins with its name. Where
 the log never shows answers but stamps its lines, times decide. Where it does neither, nothing is attributed: messages
 are then listed apart rather than guessed into place.
+
+A log is an agent's to write as it likes. So each rule here takes time in proportion to its length, and there are bounds for
+what is kept of it.
 """
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
@@ -27,13 +32,20 @@ from evopolicy_coordinator.analysis.records import Submit
 MAX_LOG_BYTES = 64 << 20
 """A log is read up to here; what comes later is not attributed."""
 MAX_MESSAGE_CHARS = 6000
+MAX_EVENTS = 200_000
+"""A log is read up to here, too."""
+MAX_PATHS = 1000
+"""Feedback paths, and images, that are kept for one submit."""
+_MAX_PATH_CHARS = 4096
 
 _FEEDBACK = re.compile(r"feedback/[\w./*?\[\]{},-]*")
-_IMAGE = re.compile(r"[\w./-]+\.(?:png|jpe?g|gif|webp)\b", re.IGNORECASE)
+_PATH = re.compile(r"[\w./-]+")
+_IMAGE_SUFFIX = re.compile(r"(?<=.)\.(?:png|jpe?g|gif|webp)\b", re.IGNORECASE)
 _ANSWER = re.compile(r"submit_(?:id|index)[\\\"'\s:=]+(?:submit_)?0*(\d+)")
 _NAMED = re.compile(r"submit_0*(\d{1,9})\b")
 _WRAPPERS = ("event", "line", "payload", "data", "raw")
 _TIMES = ("timestamp", "at", "time", "ts")
+_MAX_STAMP_CHARS = 64
 
 
 class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,7 +88,7 @@ class LogReading(msgspec.Struct, frozen=True, kw_only=True):
 def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
     """Reads the log beside a run; empty when there is none. Raises nothing for damaged content."""
     try:
-        events = list(_events(_lines(path)))
+        events = list(itertools.islice(_events(_lines(path)), MAX_EVENTS))
     except OSError:
         return LogReading()
     return place(events, submits)
@@ -100,13 +112,14 @@ def _by_answers(
 ) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
     placed: dict[int, list[LogEvent]] = {}
     pending: list[LogEvent] = []
-    waiting = list(expected)
+    places = {index: place for place, index in enumerate(expected)}
+    first_waiting = 0
     for event in events:
-        answered = next((index for index in event.answers if index in waiting), None)
+        answered = next((index for index in event.answers if places.get(index, -1) >= first_waiting), None)
         if answered is not None:
             placed[answered] = pending
             pending = []
-            waiting = waiting[waiting.index(answered) + 1 :]
+            first_waiting = places[answered] + 1
         pending.append(event)
     return (placed, pending) if placed else None
 
@@ -119,14 +132,16 @@ def _by_times(
     ]
     if not starts or not any(event.at is not None for event in events):
         return None
+    # A submit before which a later start stands gets no event: the first that starts late enough does.
+    latest = list(itertools.accumulate((started for started, _ in starts), max))
     placed: dict[int, list[LogEvent]] = {}
     rest: list[LogEvent] = []
     for event in events:
-        index = next((i for started, i in starts if event.at is not None and event.at <= started), None)
-        if index is None:
+        place = len(starts) if event.at is None else bisect.bisect_left(latest, event.at)
+        if place == len(starts):
             rest.append(event)
         else:
-            placed.setdefault(index, []).append(event)
+            placed.setdefault(starts[place][1], []).append(event)
     return placed, rest
 
 
@@ -139,7 +154,11 @@ def _evidence(events: Iterable[LogEvent]) -> Evidence:
         images.update(dict.fromkeys(event.images))
         if event.message:
             messages.append(event.message)
-    return Evidence(read=tuple(read), messages=tuple(messages), images=tuple(images))
+    return Evidence(
+        read=tuple(itertools.islice(read, MAX_PATHS)),
+        messages=tuple(messages),
+        images=tuple(itertools.islice(images, MAX_PATHS)),
+    )
 
 
 def _lines(path: Path) -> Iterator[bytes]:
@@ -219,9 +238,21 @@ def _call(texts: Sequence[str], at: float | None) -> LogEvent:
     read: dict[str, None] = {}
     images: dict[str, None] = {}
     for text in texts:
-        read.update(dict.fromkeys(match.rstrip("./,") for match in _FEEDBACK.findall(text)))
-        images.update(dict.fromkeys(_IMAGE.findall(text)))
+        read.update(dict.fromkeys(path.rstrip("./,") for path in _FEEDBACK.findall(text) if _is_short(path)))
+        images.update(dict.fromkeys(filter(_is_short, _images(text))))
     return LogEvent(read=tuple(read), images=tuple(images), at=at)
+
+
+def _images(text: str) -> Iterator[str]:
+    """Every run of a path's characters that holds an image's suffix, up to the last one in it."""
+    for run in _PATH.findall(text):
+        ends = [found.end() for found in _IMAGE_SUFFIX.finditer(run)]
+        if ends:
+            yield run[: ends[-1]]
+
+
+def _is_short(path: str) -> bool:
+    return len(path) <= _MAX_PATH_CHARS
 
 
 def _answers(texts: Sequence[str]) -> tuple[int, ...]:
@@ -251,14 +282,14 @@ def _stamp(value: dict[str, Any]) -> float | None:
 
 
 def _instant(value: Any) -> float | None:
-    if isinstance(value, bool) or value is None:
-        return None
-    if isinstance(value, int | float):
-        return float(value) / (1000.0 if value > 1e11 else 1.0)
     try:
-        return datetime.fromisoformat(value).timestamp() if isinstance(value, str) and value else None
-    except (ValueError, OverflowError):
-        return None
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value) / (1000.0 if value > 1e11 else 1.0)
+        if isinstance(value, str) and 0 < len(value) <= _MAX_STAMP_CHARS:
+            return datetime.fromisoformat(value).timestamp()
+    except (ValueError, OverflowError, OSError):
+        pass
+    return None
 
 
 def _clip(text: str) -> str:

@@ -7,7 +7,6 @@ scores. Policies are parsed, never run.
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 import re
@@ -16,12 +15,14 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.run_record import RunRecord, decode_checkpoint_metrics, decode_run_record
 from evopolicy_common.summary import Summary, decode_summary
+from evopolicy_coordinator.analysis.line_diff import n_changed
 from evopolicy_coordinator.analysis.records import LeftOut, Run, Source, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.sources import (
     reachable_modules,
@@ -32,12 +33,13 @@ from evopolicy_coordinator.analysis.topology import describe
 
 Files = Mapping[str, bytes]
 
-_SUBMIT = re.compile(r"submit_(\d+)")
+_SUBMIT = re.compile(r"submit_([0-9]{1,9})")
+_MAX_REASON_CHARS = 1000
 _PARALLEL_FROM = 40
 """Runs from which reading in several processes pays for starting them."""
 _MAX_RUN_JSON_BYTES = 64 << 20
-_MAX_DIFF_LINES = 20_000
-"""Above this a diff counts lines as a multiset: quadratic time is not worth an exact size."""
+_LARGEST = 1e100
+"""No number of a run is larger: sums of squares over many runs stay finite."""
 
 
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,8 +124,9 @@ def read_or_explain(folder: Path) -> Run | LeftOut:
         return read_run(folder)
     except UnreadableRunError as error:
         return LeftOut(path=folder, reason=str(error))
-    except (OSError, ValueError, RecursionError, MemoryError) as error:
-        return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}")
+    except Exception as error:
+        # Whatever an agent has left behind, the other runs are read.
+        return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}"[:_MAX_REASON_CHARS])
 
 
 def read_run(folder: Path) -> Run:
@@ -145,7 +148,22 @@ def read_run(folder: Path) -> Run:
     selected = next((submit for submit in submits if submit.index == outcome.best_submit_index), None)
     if outcome.status == "completed" and selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has left nothing behind")
-    return Run(path=folder, record=record, submits=submits)
+    run = Run(path=folder, record=record, submits=submits)
+    _check_numbers({"run.json": run.record, "submits": run.submits})
+    return run
+
+
+def _check_numbers(told: Any) -> None:
+    """UnreadableRunError where a number is too large for means over runs: JSON has numbers of any size."""
+    queue: list[tuple[str, Any]] = [("", msgspec.to_builtins(told))]
+    while queue:
+        name, value = queue.pop()
+        if isinstance(value, dict):
+            queue += [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
+        elif isinstance(value, list | tuple):
+            queue += [(name, inner) for inner in value]
+        elif isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
+            raise UnreadableRunError(f"{name}: a number beyond {_LARGEST:g} is none of a run")
 
 
 def _read_record(folder: Path) -> RunRecord:
@@ -274,27 +292,5 @@ def count_changed_lines(before: Files, after: Files) -> int:
     for path in sorted({*before, *after}):
         old, new = before.get(path, b""), after.get(path, b"")
         if old != new:
-            changed += _changed(old.splitlines(), new.splitlines())
+            changed += n_changed(old.splitlines(), new.splitlines())
     return changed
-
-
-def _changed(old: list[bytes], new: list[bytes]) -> int:
-    head = 0
-    for before, after in zip(old, new, strict=False):
-        if before != after:
-            break
-        head += 1
-    old, new = old[head:], new[head:]
-    while old and new and old[-1] == new[-1]:
-        old.pop()
-        new.pop()
-    if len(old) + len(new) > _MAX_DIFF_LINES:
-        counts: dict[bytes, int] = {}
-        for line in old:
-            counts[line] = counts.get(line, 0) + 1
-        for line in new:
-            counts[line] = counts.get(line, 0) - 1
-        return sum(abs(count) for count in counts.values())
-    matcher = difflib.SequenceMatcher(None, old, new, autojunk=False)
-    kept = sum(block.size for block in matcher.get_matching_blocks())
-    return len(old) + len(new) - 2 * kept

@@ -6,6 +6,7 @@ in memory. `rows` turns any list of records into dicts, ready for a data frame.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
@@ -142,6 +143,11 @@ def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
         if found.is_dir():
             return found
     return run / folder / f"submit_{index:03d}"
+
+
+def path_text(path: Path) -> str:
+    """The path as text that can be written, also where it is no UTF-8."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def rows(records: Iterable[Any]) -> list[dict[str, Any]]:

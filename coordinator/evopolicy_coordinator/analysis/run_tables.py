@@ -8,7 +8,7 @@ from typing import Any
 
 from evopolicy_common import catalogue
 from evopolicy_coordinator.analysis.edits import demand_of
-from evopolicy_coordinator.analysis.records import Run
+from evopolicy_coordinator.analysis.records import Run, path_text
 from evopolicy_coordinator.analysis.scores import family_of, family_title, ordered_environments, title_of
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables import Column, Table
@@ -305,5 +305,5 @@ def _left_out(study: Study) -> Table:
         title="Left out",
         caption="Folders that are no complete run, and why. They are in no table and no figure.",
         columns=(Column(key="path", title="Folder"), Column(key="reason", title="Reason")),
-        rows=tuple({"path": str(item.path), "reason": item.reason} for item in study.left_out),
+        rows=tuple({"path": path_text(item.path), "reason": item.reason} for item in study.left_out),
     )

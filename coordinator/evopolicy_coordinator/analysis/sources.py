@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,9 @@ MAX_FILE_BYTES = 1 << 20
 """Python files above this are not parsed: they are data in disguise, and would stall a report."""
 
 MAX_FILES = 400
+
+# CPython's parser makes a new text of each beginning of `a.a.a…`: gigabytes for an import of fifty thousand parts.
+_ENDLESS_NAME = re.compile(rb"\b(?:\w++[ \t\f\r\n\\]*+\.[ \t\f\r\n\\]*+){100}")
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
@@ -41,7 +45,9 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
 
 
 def parse(source: bytes) -> ast.Module | None:
-    """The module's tree, or None when this Python cannot parse it."""
+    """The module's tree, or None when this Python cannot parse it, or only with memory by the square of its length."""
+    if _ENDLESS_NAME.search(source) is not None:
+        return None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -72,6 +78,7 @@ def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
     is no `policy.py`.
     """
     by_name = {_module_name(path): path for path in files}
+    depth = 1 + max((name.count(".") for name in by_name), default=0)
     modules: dict[str, Module] = {}
     queue = ["policy"]
     while queue:
@@ -83,7 +90,7 @@ def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
         if module.tree is None:
             continue
         for target in _imported(module, path.endswith("__init__.py")):
-            for part in _prefixes(target):
+            for part in _prefixes(target, depth):
                 if part in by_name:
                     module.locals.add(part)
                     queue.append(part)
@@ -107,8 +114,9 @@ def _module_name(path: str) -> str:
     return ".".join(parts)
 
 
-def _prefixes(dotted: str) -> list[str]:
-    parts = dotted.split(".")
+def _prefixes(dotted: str, depth: int) -> list[str]:
+    """The names of at most `depth` parts that it begins with: `import a.a.a…` may have any number."""
+    parts = dotted.split(".", depth)[:depth]
     return [".".join(parts[: i + 1]) for i in range(len(parts))]
 
 

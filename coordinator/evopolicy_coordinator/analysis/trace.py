@@ -6,7 +6,6 @@ the policy changed, and what came of it. Sources and images stay on disk until a
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ import msgspec
 from evopolicy_common.left_files import left_files
 from evopolicy_coordinator.analysis.agent_log import Evidence, LogReading, read_agent_log
 from evopolicy_coordinator.analysis.edits import Transition, classify
+from evopolicy_coordinator.analysis.line_diff import unified
 from evopolicy_coordinator.analysis.records import Run, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.sources import read_python_files
 
@@ -104,11 +104,7 @@ def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
         old, new = before.get(path, ""), after.get(path, "")
         if old == new:
             continue
-        lines = [
-            line.rstrip("\n")
-            for line in difflib.unified_diff(old.splitlines(), new.splitlines(), lineterm="")
-        ]
-        body = lines[2:]  # without the two file headers
+        body = unified(old.splitlines(), new.splitlines())
         out.append(
             FileDiff(path=path, lines=tuple(body[:MAX_DIFF_LINES]), cut=max(0, len(body) - MAX_DIFF_LINES))
         )

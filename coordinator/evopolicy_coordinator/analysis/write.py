@@ -26,13 +26,14 @@ from evopolicy_coordinator.analysis.html.pages import (
     FigureView,
     PlayedEpisode,
     default_title,
+    failed_page,
     index_page,
     replays_page,
     trace_page,
 )
 from evopolicy_coordinator.analysis.latex import to_latex
 from evopolicy_coordinator.analysis.palette import Look, looks
-from evopolicy_coordinator.analysis.records import Run
+from evopolicy_coordinator.analysis.records import Run, path_text
 from evopolicy_coordinator.analysis.report_tables import tables_of
 from evopolicy_coordinator.analysis.run_tables import feedback_use, submits_of
 from evopolicy_coordinator.analysis.scores import ordered_environments
@@ -76,9 +77,15 @@ def write_report(
         for run in study.runs:
             by_env.setdefault(run.env, []).append(run)
         for done, run in enumerate(study.runs, start=1):
-            found = trace(run)
-            _write_trace(found, out, look, _beside(run, by_env[run.env]))
-            submits += submits_of(found)
+            try:
+                found = trace(run)
+                _write_trace(found, out, look, _beside(run, by_env[run.env]))
+                submits += submits_of(found)
+            except Exception as error:
+                # What an agent wrote into its log or sources spoils its own page at most.
+                page = failed_page(run, f"{type(error).__name__}: {error}")
+                path = out / "traces" / f"{slug(run)}.html"
+                path.write_text(page, encoding="utf-8", errors="replace")
             tell("run pages", done, len(study.runs))
         tables.append(feedback_use(submits))
     for table in tables:
@@ -97,7 +104,7 @@ def write_report(
     )
     (out / "report.json").write_bytes(_report_json(study, tables, figure_data))
     index = out / "index.html"
-    index.write_text(page, encoding="utf-8")
+    index.write_text(page, encoding="utf-8", errors="replace")
     return index
 
 
@@ -223,7 +230,7 @@ def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[st
     for env in ordered_environments(by_env):
         name = f"replays/{re.sub(r'[^A-Za-z0-9.-]+', '-', env)}.html"
         (out / "replays").mkdir(exist_ok=True)
-        (out / name).write_text(replays_page(env, by_env[env], look), encoding="utf-8")
+        (out / name).write_text(replays_page(env, by_env[env], look), encoding="utf-8", errors="replace")
         links[env] = name
     return links
 
@@ -247,7 +254,7 @@ def _report_json(study: Study, tables: list[Table], figures: dict[str, Any]) -> 
         "runs": [
             {
                 "name": run.name,
-                "path": str(run.path),
+                "path": path_text(run.path),
                 "entry": run.entry,
                 "env": run.env,
                 "exp_id": run.record.exp_id,
@@ -256,7 +263,7 @@ def _report_json(study: Study, tables: list[Table], figures: dict[str, Any]) -> 
             }
             for run in study.runs
         ],
-        "left_out": [{"path": str(item.path), "reason": item.reason} for item in study.left_out],
+        "left_out": [{"path": path_text(item.path), "reason": item.reason} for item in study.left_out],
         "mixtures": [str(mixture) for mixture in study.mixtures],
         "tables": {
             table.name: {

@@ -149,3 +149,15 @@ def test_a_file_that_holds_no_rows_of_a_trajectory_is_refused(tmp_path: Path) ->
     write_files(tmp_path / "ep", [{"reward": 1.0}])
     with pytest.raises(ValueError, match="not one of a trajectory"):
         read_rows(tmp_path / "ep")
+
+
+@pytest.mark.parametrize("row", ['{"action": ' + "[" * 100_000, '{"action": ' + "9" * 5000 + "}", "[]"])
+def test_a_row_of_any_shape_is_refused_as_one_that_cannot_be_read(tmp_path: Path, row: str) -> None:
+    (tmp_path / "trajectory.jsonl").write_text(row + "\n")
+    with pytest.raises(ValueError):  # noqa: PT011
+        read_rows(tmp_path)
+
+
+def test_a_number_without_measure_reads_as_no_float() -> None:
+    assert not reads_as(10**400, 1.0)
+    assert not reads_as(10**400, np.float32(1.0))

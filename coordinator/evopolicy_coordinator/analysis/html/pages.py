@@ -57,7 +57,7 @@ class PlayedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 @cache
 def _environment() -> Environment:
     folder = files(__package__).joinpath("templates")
-    names = ("base.html.j2", "macros.html.j2", "index.html.j2", "trace.html.j2", "replays.html.j2")
+    names = [f"{name}.html.j2" for name in ("base", "macros", "index", "trace", "failed", "replays")]
     loader = DictLoader({name: folder.joinpath(name).read_text(encoding="utf-8") for name in names})
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -299,6 +299,15 @@ def trace_page(
         unplaced=trace.unplaced,
         checkpoints=checkpoints,
     )  # fmt: skip
+
+
+def failed_page(run: Run, reason: str) -> str:
+    """In place of a run's page that could not be made."""
+    return (
+        _environment()
+        .get_template("failed.html.j2")
+        .render(title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}", reason=reason)
+    )
 
 
 def _trace_row(

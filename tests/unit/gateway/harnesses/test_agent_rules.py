@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
+from evopolicy_gateway.harnesses.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.clock import AgentClock
 from evopolicy_gateway.harnesses.codex import usage_of
 from evopolicy_gateway.harnesses.configured import ConfiguredCli, ConfiguredReader, values
 from evopolicy_gateway.harnesses.redaction import Redaction
 from evopolicy_gateway.harnesses.trouble import MAX_BACKOFF_S, backoff_s, trouble_of
-from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.harnesses.usage import MAX_COUNT, Usage
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
 
@@ -68,6 +69,53 @@ def test_back_off_doubles_within_its_jitter_and_its_bound(attempt: int, chance: 
     delay = backoff_s(attempt, 4.0, chance)
     whole = 4.0 * 2.0 ** min(attempt - 1, 16)
     assert min(MAX_BACKOFF_S, 0.75 * whole) <= delay <= min(MAX_BACKOFF_S, 1.25 * whole)
+
+
+LONG = 1_000_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "retry in " + "9" * 400 + " x",  # infinity times nothing
+        "retry in " + "9" * 400 + " hours",
+        "resets_in_seconds: " + "9" * 400,
+        "retry in " + "1" * LONG,
+        "retry in " + "1.1" * LONG,
+        "retry in " + "1 s, " * (LONG // 5),
+        "retry in 1 " * (LONG // 11),
+        " " * LONG,
+    ],
+)
+def test_no_text_of_a_cli_gives_an_endless_wait_or_takes_long(text: str) -> None:
+    wait_s = trouble_of(text, now=1.0).wait_s
+    assert wait_s is None or 0.0 <= wait_s < float("inf")
+
+
+@pytest.mark.parametrize(
+    "piece", ["eyJ-", "eyJaaaaaaaaaaaa.", "sk-", "Bearer ", "bearer" + " " * 99, "-", "a.eyJ"]
+)
+def test_redaction_takes_time_that_grows_with_a_lines_length(piece: str) -> None:
+    Redaction(["secret-word"])((piece * (LONG // len(piece))).encode())
+
+
+def test_counts_of_tokens_are_bounded() -> None:
+    told = usage_of({"input_tokens": 10**400, "cached_input_tokens": -1, "output_tokens": 1 << 70})
+    assert (told.input_noncached, told.cache_read, told.output) == (MAX_COUNT, 0, MAX_COUNT)
+
+
+def test_messages_of_claude_are_counted_once_each_however_many_there_are() -> None:
+    reader = ClaudeReader()
+
+    def told(identity: int, output: int) -> None:
+        usage = {"output_tokens": output, "input_tokens": 1}
+        reader.read({"type": "assistant", "message": {"id": f"m{identity}", "usage": usage}})
+
+    for identity in range(100_000):
+        told(identity, 1)
+        told(identity, 3)
+    assert (reader.usage.output, reader.usage.input_noncached) == (300_000, 100_000)
+    assert len(reader._messages) <= 1000
 
 
 def test_cached_input_is_taken_off_in_codex_streams() -> None:

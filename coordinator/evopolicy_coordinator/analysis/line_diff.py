@@ -1,0 +1,83 @@
+"""Differences of sources by lines, with a bound on the work: a policy's author may choose lines that all look alike.
+
+Where a comparison would take longer than `MAX_STEPS`, the sources count as wholly different: lines are counted as a multiset,
+and shown as all removed and all added. Nothing here depends on time, so the same sources give the same numbers everywhere.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+MAX_STEPS = 3_000_000
+"""Pairs of equal lines that are looked at: about a second."""
+_CONTEXT = 3
+
+
+class _TooAlikeError(Exception):
+    """The lines repeat so often that comparing them would take too long."""
+
+
+class _Matcher(difflib.SequenceMatcher[Any]):
+    def __init__(self, old: Sequence[Any], new: Sequence[Any]) -> None:
+        self._left = MAX_STEPS
+        self._old = old
+        super().__init__(None, old, new, autojunk=False)
+
+    def find_longest_match(
+        self, alo: int = 0, ahi: int | None = None, blo: int = 0, bhi: int | None = None
+    ) -> difflib.Match:
+        places: dict[Any, list[int]] = self.b2j  # type: ignore[attr-defined]
+        end = len(self._old) if ahi is None else ahi
+        self._left -= sum(1 + len(places.get(self._old[i], ())) for i in range(alo, end))
+        if self._left < 0:
+            raise _TooAlikeError
+        return super().find_longest_match(alo, ahi, blo, bhi)
+
+
+def n_changed(old: Sequence[Hashable], new: Sequence[Hashable]) -> int:
+    """Lines removed plus lines added."""
+    head, tail = _equal_ends(old, new)
+    old, new = old[head : len(old) - tail], new[head : len(new) - tail]
+    try:
+        kept = sum(block.size for block in _Matcher(old, new).get_matching_blocks())
+    except _TooAlikeError:
+        kept = (Counter(old) & Counter(new)).total()
+    return len(old) + len(new) - 2 * kept
+
+
+def unified(old: Sequence[str], new: Sequence[str]) -> list[str]:
+    """A unified diff with three lines of context, without the two lines that name the files."""
+    try:
+        groups = list(_Matcher(old, new).get_grouped_opcodes(_CONTEXT))
+    except _TooAlikeError:
+        groups = [[("replace", 0, len(old), 0, len(new))]]
+    out: list[str] = []
+    for group in groups:
+        (_, first_old, _, first_new, _), (_, _, last_old, _, last_new) = group[0], group[-1]
+        out.append(f"@@ -{_range(first_old, last_old)} +{_range(first_new, last_new)} @@")
+        for tag, a, b, c, d in group:
+            if tag == "equal":
+                out += [f" {line}" for line in old[a:b]]
+                continue
+            out += [f"-{line}" for line in old[a:b]]
+            out += [f"+{line}" for line in new[c:d]]
+    return out
+
+
+def _equal_ends(old: Sequence[Hashable], new: Sequence[Hashable]) -> tuple[int, int]:
+    """How many lines are equal at the beginning, and of the others at the end."""
+    shorter = min(len(old), len(new))
+    head = next((i for i in range(shorter) if old[i] != new[i]), shorter)
+    tail = next((i for i in range(shorter - head) if old[-1 - i] != new[-1 - i]), shorter - head)
+    return head, tail
+
+
+def _range(start: int, stop: int) -> str:
+    """As in `diff -u`."""
+    length = stop - start
+    if length == 1:
+        return str(start + 1)
+    return f"{start + 1 if length else start},{length}"
