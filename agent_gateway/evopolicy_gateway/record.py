@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import msgspec
 
@@ -27,6 +27,7 @@ from evopolicy_common.run_record import (
     ExperimentDimensions,
     Outcome,
     ReferenceScore,
+    RejectedStatus,
     RejectedSubmit,
     Replay,
     RunRecord,
@@ -127,13 +128,13 @@ def run_record(
         outcome=_outcome(finished),
         rejected_submits=tuple(
             RejectedSubmit(
-                status="budget_invalid" if one.status == "budget_invalid" else "invalid_env_instance",
+                status=cast(RejectedStatus, one.status),
                 message=one.message,
                 at=utc_text(one.at),
                 after_submits=one.after_submits,
             )
             for one in rejected
-            if one.status in ("budget_invalid", "invalid_env_instance")
+            if one.status in get_args(RejectedStatus)
         ),
         artifacts=Artifacts(
             workspace="workspace" if staged else None,

@@ -161,10 +161,13 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+RejectedStatus = Literal["budget_invalid", "invalid_env_instance", "run_closed"]
+
+
 class RejectedSubmit(msgspec.Struct, frozen=True, kw_only=True):
     """A request that was refused before the snapshot and cost nothing."""
 
-    status: Literal["budget_invalid", "invalid_env_instance"]
+    status: RejectedStatus
     message: str
     at: str = ""
     after_submits: int = 0
