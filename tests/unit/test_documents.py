@@ -15,7 +15,7 @@ from evopolicy_coordinator.intake import _VERBS
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
     *("README.md", "ARCHITECTURE.md", "SECURITY.md", "deploy/README.md", "examples/policies/README.md"),
-    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md"))),
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
 FOLDERS = ("common", "coordinator", "worker", "agent_gateway", "deploy", "docs", "examples", "tests")
 ELSEWHERE = frozenset({"AGENTS.md", "system/policy.py", "policy.py", "my_policy/policy.py", "my_agent.py"})
