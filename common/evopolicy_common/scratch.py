@@ -1,7 +1,8 @@
 """Folders in the system's temporary folder that are thrown away, also after their owner was killed.
 
 Rules: a folder belongs to the process that holds the lock on its file `owner`, from before that file has its name; it goes
-with the owner, or at the next start of anything of its kind by the same user. Short paths, for unix sockets.
+with the owner, or at the next start of anything of its kind by the same user. One whose maker was killed before it had that
+file goes once it is a minute old. Short paths, for unix sockets.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 _OWNER = "owner"
+_MAKING_S = 60.0
+"""More than it takes from the folder to its file."""
 
 
 @contextlib.contextmanager
@@ -42,7 +46,13 @@ def clear_stale(kind: str) -> int:
         with contextlib.suppress(OSError):
             if root.is_symlink() or root.lstat().st_uid != os.getuid():
                 continue
-            lock = os.open(root / _OWNER, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            try:
+                lock = os.open(root / _OWNER, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            except FileNotFoundError:
+                if time.time() - root.lstat().st_mtime > _MAKING_S:
+                    remove_tree(root)
+                    cleared += 1
+                continue
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 remove_tree(root)

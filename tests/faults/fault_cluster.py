@@ -15,10 +15,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from host_faults import Cable, Clock
 from own_processes import only_what_starts_inside
@@ -38,6 +38,17 @@ TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
 PATIENCE_S = 100.0
 DISK_BYTES = 48 << 20
 """Of each file system: the coordinator's state is on one, the run directories on another."""
+KINDS = {
+    "slot": ("python", "evopolicy_worker.env_process"),
+    "slot's jail": ("bwrap", "evopolicy_worker.env_process"),
+    "policy's jail": ("bwrap", "zygote.py"),
+    "zygote": ("python", "zygote.py"),
+    "policy": ("python", "zygote.py"),
+    "gateway": ("python", "serve_cli"),
+    "keeper": ("python", "harnesses.keeper"),
+}
+"""Words of a process's program, and of its command line."""
+ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
 Site = Literal["one host", "two hosts", "clock that jumps"]
 """One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable."""
 
@@ -119,9 +130,9 @@ class Kept:
 
 
 class FaultCluster:
-    """Coordinator and a worker with two slots, kept up, at one of the `Site`s."""
+    """Coordinator and workers with two slots each, kept up, at one of the `Site`s."""
 
-    def __init__(self, root: Path, site: Site, stack: contextlib.ExitStack) -> None:
+    def __init__(self, root: Path, site: Site, stack: contextlib.ExitStack, workers: int = 1) -> None:
         """What is started here ends with the stack, also when not all of it can be started."""
         self.root = root
         root.mkdir(exist_ok=True)
@@ -134,7 +145,12 @@ class FaultCluster:
             )
             stack.callback(subprocess.run, ["umount", "--lazy", folder], check=True)
         self.clock = Clock(root) if site == "clock that jumps" else None
-        self._environment = {} if self.clock is None else self.clock.environment
+        # Of their own, so that what is left there is theirs.
+        self.temporary = root / "tmp"
+        self.temporary.mkdir()
+        self._environment = {"TMPDIR": str(self.temporary)}
+        if self.clock is not None:
+            self._environment |= self.clock.environment
         self.cable = Cable() if site == "two hosts" else None
         if self.cable is not None:
             stack.callback(self.cable.close)
@@ -152,8 +168,8 @@ class FaultCluster:
         ready = json.loads(self._ready.read_text())
         self.files: dict[str, str] = ready["credentials"]
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
-        worker += ["--env", "toy/line", "--slots", "2"]
-        worker += ["--grace", "1", "--name", "w", "--credentials", self.files["worker"]]
+        worker += ["--env", "toy/*", "--slots", "2"]
+        worker += ["--grace", "1", "--credentials", self.files["worker"]]
         self.link: WeakLink | None = None
         if self.cable is None:
             self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
@@ -161,8 +177,10 @@ class FaultCluster:
             worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
         else:
             worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
-        self.worker = Kept(worker, root / "worker.log", self._environment)
-        stack.callback(self.worker.end)
+        self.workers = []
+        for name, log in (("w", "worker.log"), ("v", "worker-2.log"))[:workers]:
+            self.workers.append(Kept([*worker, "--name", name], root / log, self._environment))
+            stack.callback(self.workers[-1].end)
         self.afterwards: list[operator.CancelRun] = []
         """What the coordinator is to be told once a fault is over."""
         self._agent = root / "agent.py"
@@ -174,21 +192,32 @@ class FaultCluster:
 
     def command(self, name: str) -> subprocess.Popen[str]:
         """A run that has been started, or after its command was killed: that is gone on with."""
-        arguments = ["run", "--env", "toy/line", "--agent", f"command:{sys.executable} {self._agent}"]
+        arguments = ["run", "--env", "toy/line", "--agent", self.agent]
         arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(SUBMITS * EPISODES), "--resume"]
         arguments += ["--validation", str(HIDDEN), "--heldout", str(HIDDEN), "--runs", str(self.runs)]
-        self.run = subprocess.Popen(
+        self.run = self.operator_command(arguments)
+        return self.run
+
+    @property
+    def agent(self) -> str:
+        """As `--agent` takes it."""
+        return f"command:{sys.executable} {self._agent}"
+
+    def operator_command(
+        self, arguments: list[str], said: int | IO[str] = subprocess.PIPE
+    ) -> subprocess.Popen[str]:
+        """`evopolicy` with these arguments and the operator's credentials."""
+        return subprocess.Popen(
             [
                 *(sys.executable, "-m", "evopolicy_gateway.cli", *arguments),
                 *("--credentials", self.files["operator"]),
             ],
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
+            stderr=said,
             text=True,
             cwd=self.root,
             env={**os.environ, **self._environment},
         )
-        return self.run
 
     async def tell_afterwards(self) -> None:
         told, self.afterwards = self.afterwards, []
@@ -205,38 +234,57 @@ class FaultCluster:
 
     def find(self, kind: str) -> list[int]:
         """Processes of that kind now, in order of their ids."""
-        if kind in ("coordinator", "worker"):
-            return [(self.coordinator if kind == "coordinator" else self.worker).process.pid]
+        if kind == "coordinator":
+            return [self.coordinator.process.pid]
+        if kind == "worker":
+            return [worker.process.pid for worker in self.workers]
         if kind == "run":
             return [] if self.run.poll() is not None else [self.run.pid]
-        wanted = {
-            "slot": "evopolicy_worker.env_process",
-            "zygote": "zygote.py",
-            "gateway": "serve_cli",
-            "keeper": "harnesses.keeper",
-        }[kind]
-        return [pid for pid in processes.descendants(os.getpid()) if wanted in command_line(pid)]
+        program, wanted = KINDS[kind]
+        lines = {pid: command_line(pid) for pid in processes.descendants(os.getpid())}
+        found = [pid for pid, line in lines.items() if wanted in line and program in line.partition(" ")[0]]
+        if kind in ("zygote", "policy"):
+            # As root the zygote has two processes above it that wait for it; a policy's is one of its own, below it.
+            depths = {pid: depth(pid, found) for pid in found}
+            found = [pid for pid in found if (depths[pid] == ZYGOTE_DEPTH + 1) == (kind == "policy")]
+        return found
 
     def strays(self) -> list[str]:
         """What lives below this process beside the coordinator, the worker and what the worker's slots need."""
         here = os.getpid()
-        kept = {self.coordinator.process.pid, self.worker.process.pid}
+        kept = {self.coordinator.process.pid, *self.find("worker")}
         if self.cable is not None:
             kept.add(self.cable.holder.pid)
-        of_worker = set(processes.descendants(self.worker.process.pid))
-        found = [pid for pid in processes.descendants(here) if pid not in kept | of_worker]
-        slots = [pid for pid in of_worker if "evopolicy_worker.env_process" in command_line(pid)]
+        of_workers = {pid for worker in self.find("worker") for pid in processes.descendants(worker)}
+        found = [pid for pid in processes.descendants(here) if pid not in kept | of_workers]
+        slots = self.find("slot")
         words = [f"{pid}: {command_line(pid)[:120]}" for pid in found if command_line(pid)]
-        return words + ([f"{len(slots)} slot processes"] if len(slots) > 2 else [])
+        return words + ([f"{len(slots)} slot processes"] if len(slots) > 2 * len(self.workers) else [])
 
 
 @contextlib.contextmanager
-def fault_cluster(root: Path, site: Site = "one host") -> Iterator[FaultCluster]:
+def fault_cluster(root: Path, site: Site = "one host", workers: int = 1) -> Iterator[FaultCluster]:
     """The cluster inside the `with`; everything that was started there is gone after it."""
     with only_what_starts_inside(), contextlib.ExitStack() as stack:
         processes.become_subreaper()
         stack.callback(processes.end_descendants, 0.0)
-        yield FaultCluster(root, site, stack)
+        yield FaultCluster(root, site, stack, workers)
+
+
+def depth(pid: int, among: Collection[int]) -> int:
+    """How many of the processes above it, one after another, are among these."""
+    n = 0
+    while (pid := parent(pid)) in among:
+        n += 1
+    return n
+
+
+def parent(pid: int) -> int:
+    """0 for a process that is gone."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
 
 
 def command_line(pid: int) -> str:

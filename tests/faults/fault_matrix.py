@@ -3,7 +3,8 @@
 A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when its
 command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the
 published list (`evopolicy_common.run_difference`), its budget spent to the episode, and no process be left over. A worker
-that was frozen past its leases must say so. Exit code 1 when anything is not as it must be.
+that was frozen past its leases must say so. Exit code 1 when anything is not as it must be. With `--chaos SECONDS` instead:
+several faults at once, at random (`chaos.py`); another seed by `--first-seed`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import chaos
 from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system
 
@@ -381,6 +383,12 @@ def main() -> None:
     )
     parser.add_argument("--json", action="store_true", help="a JSON line for each row")
     parser.add_argument("--keep", type=Path, help="folder for the cluster and the runs; default: thrown away")
+    parser.add_argument(
+        "--chaos",
+        type=float,
+        metavar="SECONDS",
+        help="several faults at once, at random, for so long (chaos.py)",
+    )
     options = parser.parse_args()
 
     def tell(row: Row) -> None:
@@ -393,6 +401,8 @@ def main() -> None:
     enter_namespaces()
     # Ended from outside, it still takes everything down that it has started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if options.chaos is not None:
+        sys.exit(0 if chaos.run(options.chaos, options.first_seed, options.keep) else 1)
     with contextlib.ExitStack() as stack:
         root = options.keep
         if root is None:
