@@ -158,6 +158,20 @@ _STRANGER = Response(
 )
 
 
+_STOPPING = Response(
+    orjson.dumps(
+        {
+            "status": "closed",
+            "error": {
+                "message": "the gateway stops; what it has accepted goes on: ask again, with the same Idempotency-Key"
+            },
+        }
+    ),
+    status_code=503,
+    media_type="application/json",
+)
+
+
 async def _request_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
@@ -205,7 +219,12 @@ class _TokenGate:
             path = slash = ""
         inner = dict(scope) | {"path": slash + path, "raw_path": None, "root_path": ""}
         exchange = _Exchange(scope, receive, send, LINGER)
-        await self._app(inner, exchange.receive, exchange.send)
+        try:
+            await self._app(inner, exchange.receive, exchange.send)
+        except asyncio.CancelledError:
+            # The service ends while this request waits. Nobody is told to stop: the server only waits for this to return.
+            if not exchange.answered:
+                await _STOPPING(scope, exchange.receive, exchange.send)
 
     def _bears(self, scope: Scope) -> bool:
         """Whether the request carries the bearer token, once."""
@@ -226,6 +245,8 @@ class _Exchange:
         self._receive = receive
         self._send = send
         self._refused = False
+        self.answered = False
+        """Whether the answer has begun."""
         # Who waits for "100 Continue" sends no body to a refusal.
         self._unread = (b"expect", b"100-continue") not in scope["headers"]
 
@@ -238,6 +259,7 @@ class _Exchange:
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
             self._refused = message["status"] >= 400
+            self.answered = True
         last = message["type"] == "http.response.body" and not message.get("more_body", False)
         if not (last and self._refused and self._unread):
             await self._send(message)

@@ -236,3 +236,29 @@ def test_a_port_that_somebody_else_has_taken_is_told(tmp_path: Path, monkeypatch
                         pass
 
     asyncio.run(main())
+
+
+def test_a_gateway_that_stops_with_a_submit_open_tells_so_without_a_traceback(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            double.go.clear()
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double) as s:
+                header = {"Idempotency-Key": "mine"}
+                request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY, headers=header))
+                while not double.submits:
+                    await asyncio.sleep(0.01)
+                s.gateway.tell(None)
+                answer = await request
+                assert answer.status_code == 503
+                assert answer.json()["status"] == "closed"
+                assert "Idempotency-Key" in answer.json()["error"]["message"]
+            double.go.set()
+            async with gateway_on(folder, double) as s:
+                assert (await s.http.post(s.urls.submit, json=BODY, headers=header)).status_code == 200
+
+    asyncio.run(main())
+    assert [record.message for record in caplog.records if record.exc_info] == []

@@ -95,3 +95,13 @@ def test_folders_without_rights_are_removed_and_a_link_is_not_followed(tmp_path:
     remove_tree(tmp_path / "missing")
     assert not folder.exists()
     assert link.is_symlink()
+
+
+def test_a_folder_whose_maker_was_killed_before_it_was_owned_goes_once_it_is_old(tmp_path: Path) -> None:
+    young, old = (tmp_path / f"evopolicy-local-{name}" for name in ("young", "old"))
+    for folder in (young, old):
+        (folder / "in").mkdir(parents=True)
+    os.utime(old, (0, 0))
+    assert clear_stale("local") == 1
+    assert young.exists()
+    assert not old.exists()

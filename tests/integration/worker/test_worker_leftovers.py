@@ -1,0 +1,109 @@
+"""Workers that are killed: what they had started goes with them, and what they had made goes at the next start."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from own_processes import alive
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_gateway import processes
+from evopolicy_worker import cli
+from evopolicy_worker.slot import Slot
+
+WORKER = """
+import asyncio, sys
+from pathlib import Path
+from evopolicy_common.scratch import scratch_folder
+from evopolicy_worker import cli
+from evopolicy_worker.sandbox import available_tiers
+
+print("begun", flush=True)
+tiers = available_tiers()
+print("tiers", flush=True)
+with scratch_folder("worker") as scratch:
+    asyncio.run(cli.describe_all(["gym/acrobot", "gym/bipedal"], tiers[0], scratch))
+    print("described", flush=True)
+"""
+"""What a worker does before it waits for its coordinator."""
+
+
+def start(temporary: Path) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", WORKER],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    )
+
+
+def semaphores() -> set[str]:
+    return {name for name in os.listdir("/dev/shm") if name.startswith("sem.")}
+
+
+def test_a_worker_that_is_killed_at_any_moment_of_its_start_leaves_nothing(tmp_path: Path) -> None:
+    before = semaphores()
+    seen: set[int] = set()
+    for k in range(8):
+        worker = start(tmp_path)
+        assert worker.stdout is not None
+        assert worker.stdout.readline() == b"begun\n"
+        end = time.monotonic() + 0.3 * k
+        while worker.poll() is None and time.monotonic() < end:
+            seen.update(processes.descendants(worker.pid))
+            time.sleep(0.005)
+        seen.update(processes.descendants(worker.pid))
+        worker.kill()
+        worker.communicate()
+    deadline = time.monotonic() + 30
+    while (left := [pid for pid in seen if alive(pid)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not left
+    assert seen
+    for folder in tmp_path.iterdir():
+        # Its maker may have been killed before it was owned: such a one goes when it is a minute old.
+        os.utime(folder, (0, 0))
+    worker = start(tmp_path)
+    assert b"described" in worker.communicate(timeout=120)[0]
+    assert list(tmp_path.glob("evopolicy-tier-*")) == list(tmp_path.glob("evopolicy-worker-*")) == []
+    assert semaphores() <= before
+
+
+@pytest.mark.parametrize("kills", [2, cli.DESCRIBE_TRIES])
+def test_a_describing_process_that_is_killed_is_started_again(
+    tmp_path: Path, kills: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "DESCRIBE_PAUSE_S", 0.0)
+    describe = Slot.describe
+    left = kills
+
+    async def killed(self: Slot, env_ids: list[str]) -> object:
+        nonlocal left
+        if left:
+            left -= 1
+            assert self._process is not None
+            inside = processes.descendants(self._process.pid)
+            os.kill(inside[1], signal.SIGKILL)
+        return await describe(self, env_ids)
+
+    monkeypatch.setattr(Slot, "describe", killed)
+    work = cli.describe_all(["toy/line", "gym/acrobot"], "bwrap", tmp_path)
+    if kills == cli.DESCRIBE_TRIES:
+        with pytest.raises(WorkerError, match="ended with status"):
+            asyncio.run(work)
+    else:
+        found = asyncio.run(work)
+        assert [each.env for each in found] == ["toy/line", "gym/acrobot"]
+    assert left == 0
+
+
+def test_what_cannot_be_described_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(WorkerError, match="no/such"):
+        asyncio.run(cli.describe_all(["no/such"], "bwrap", tmp_path))
