@@ -109,6 +109,11 @@ PROBES = (
         off=NO_SANDBOX,
         stays_shut=frozenset({"a file's length by opening it"}),
     ),
+    Probe(
+        name="counters",
+        off=NO_SEAL,
+        stays_shut=frozenset({"shared memory of a device", "a huge page"}),
+    ),
     Probe(name="kernel_root", off=None),
     Probe(name="forks", off=NO_SANDBOX),
     Probe(name="exec_itself", off=NO_SANDBOX),
@@ -133,7 +138,7 @@ def document() -> str:
         ways = ["unsealed"] * breaker.unsealed + ["with a higher limit"] * (breaker.off is not None)
         ways += ["in the environment's process"] * breaker.in_process
         rows.append((breaker.name, verdict, ", ".join(ways) or "-"))
-    rows += [(what, "nothing is found", "with tier `none`") for what in PAIRS]
+    rows += [(what, "nothing is found", off) for what, off in PAIRS.items()]
     rows += [
         (bundle.name, f"`{bundle.verdict}`", "by a plain copy" if bundle.harm else "-") for bundle in BUNDLES
     ]
@@ -145,11 +150,15 @@ def document() -> str:
     return Path(__file__).with_name("document.md").read_text().replace("{table}", table)
 
 
-PAIRS = (
-    "Leaves files, shared memory and state for the next episode, which looks for them",
-    "Two policies in parallel slots talk by files, shared memory, sockets, locks, a page of a shared file or a device's times",
-    "Searches all objects, frames and generators for the case's seed",
-)
+PAIRS = {
+    "Leaves files, shared memory and state for the next episode, which looks for them": "with tier `none`",
+    "Two policies in parallel slots talk by files, shared memory, sockets, locks, a page of a shared file or a device's"
+    " times": "with tier `none`",
+    "Reads all of its memory for what the policies before it in the slot have left: their number, how long they took, how"
+    " they ended": "-",
+    "Searches all objects, frames and generators for the case's seed": "with tier `none`",
+}
+"""What is tried with more than one episode, and how it was seen to succeed."""
 
 
 if __name__ == "__main__":

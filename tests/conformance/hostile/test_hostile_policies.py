@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import socket
+import struct
 import threading
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from breakers import BREAKERS, PATIENT, Breaker
 from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
-from slots import HONEST, Slots, make_job, rows
+from slots import HONEST, Slots, make_job, misbehaving, rows
 from undefended import harmed
 
 import evopolicy_worker
@@ -211,6 +215,79 @@ def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> No
     hidden = slots.play(source, record="actions").stdout
     assert train == hidden
     assert len(train) > 1000
+
+
+def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots) -> None:
+    slot = slots.new("bwrap")
+    slots.run(slot.start())
+    patient = msgspec.structs.replace(PATIENT, output_bytes=1 << 20)
+
+    def look(pages: list[int]) -> tuple[tuple[int, ...], dict[str, str]]:
+        files: dict[str, str | bytes] = {
+            "policy.py": (POLICIES / "own_memory.py").read_text(),
+            "target.json": json.dumps(pages),
+        }
+        outcome = slots.play(files, slot=slot, limits=patient)
+        assert outcome.failure is None, outcome.failure
+        n, packed, shown = json.loads(outcome.stdout)
+        return struct.unpack(f"<{n}I", zlib.decompress(base64.b64decode(packed))), shown
+
+    try:
+        first, _ = look([])
+        differing: set[int] = set()
+        for status in (3, 77):
+            slots.play(misbehaving(act=f"time.sleep(0.05); os._exit({status})"), slot=slot, limits=patient)
+            digests, _ = look([])
+            assert len(digests) == len(first) > 1000, "its memory has another size"
+            differing |= {
+                k for k, (one, other) in enumerate(zip(first, digests, strict=True)) if one != other
+            }
+        shown = [look(sorted(differing))[1] for _ in range(3)]
+    finally:
+        slots.run(slot.close())
+    words = 0
+    for page in shown[0]:
+        contents = [bytes.fromhex(one[page]) for one in shown]
+        n = sum(len({content[k : k + 8] for content in contents}) > 1 for k in range(0, len(contents[0]), 8))
+        # The clock's page, which the kernel shows to every process, has more words that change.
+        words += n if n < 12 else 0
+    # The time at which its own files were written, and the core that it runs on.
+    assert words <= 3, shown
+
+
+USEFUL = """
+import ctypes, mmap, os, pathlib, queue, shutil, sys, tempfile, threading, time
+import numpy as np
+
+class Policy:
+    def __init__(self, *spaces):
+        with tempfile.NamedTemporaryFile() as file:
+            file.write(b"x" * 100); file.flush(); os.fsync(file.fileno())
+        np.save("table.npy", np.arange(1000.0))
+        table = np.load("table.npy", mmap_mode="r+"); table[3] = 7.0; table.flush()
+        shutil.copytree(".", "../tmp/copy")
+        assert np.load("../tmp/copy/table.npy")[3] == 7.0
+        assert pathlib.Path("../tmp/copy/policy.py").stat().st_size == os.path.getsize("policy.py")
+        assert len(mmap.mmap(-1, 4096, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)) == 4096
+        answers, event = queue.Queue(), threading.Event()
+        threads = [threading.Thread(target=lambda k=k: (event.wait(), answers.put(k))) for k in range(3)]
+        [thread.start() for thread in threads]; event.set(); [thread.join() for thread in threads]
+        assert sorted(answers.queue) == [0, 1, 2]
+        np.linalg.svd(np.random.default_rng().random((300, 300)))
+        assert ctypes.CDLL("libm.so.6").floor is not None
+        time.sleep(0.001); os.eventfd(0); sys.stdout.flush()
+
+    def reset(self, episode_index):
+        pass
+
+    def act(self, obs):
+        return [0.0]
+"""
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
+def test_what_honest_policies_use_is_there(slots: Slots, tier: str) -> None:
+    assert slots.play(USEFUL, tier=tier, limits=PATIENT).failure is None
 
 
 def test_no_pickle_is_ever_opened(slots: Slots, tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ INSTALL_BWRAP = "apt-get install bubblewrap (Debian, Ubuntu), dnf install bubble
 
 POLICY_HOME = "/home/policy"
 _PACKAGES = "/packages"
-_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+_DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
+"""Not `/dev/zero`: mapped, it is shared memory without a file, whose inode numbers are counted for the whole machine."""
 _FIRST_UID = 0x6D000000
 """As root, policies run as users from here on, which no machine gives to anyone."""
 
@@ -71,6 +72,7 @@ def plan(
     config: dict[str, object] = {
         "become_nobody": False,
         "namespaces": tier == "bwrap",
+        "home": POLICY_HOME,
         "devices": [device for device in _DEVICES if os.path.exists(device)],
         # An interpreter that is installed there must stay visible; the policy's TMPDIR is elsewhere in any case.
         "own_tmp": not any(path.startswith("/tmp/") for path in files.read),

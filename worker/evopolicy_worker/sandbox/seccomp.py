@@ -7,6 +7,9 @@ Rules of the policy's filter, which this module owns:
   or a limit of its own. `endings` rests on this.
 - No sockets, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
   limit) or CPU affinity.
+- Nothing that moves or shows a number of the whole machine: pipes and shared memory without a file (inode numbers), free
+  blocks and huge pages, mount ids, which `statx` shows whatever it is asked for. Nor does a `sync` reach a disk: how long it
+  takes depends on what others write.
 - Sandboxes show the same read-only files, and nothing of them may carry a message: no locks, no waiting for each other on a
   mapped page (a futex that is not private to the process), no looking at or changing what of them is in memory. Nor is
   there a view of the machine's memory and load.
@@ -60,9 +63,11 @@ _MADVISE = (
 )  # MADV_NORMAL, _RANDOM, _SEQUENTIAL, _WILLNEED, _DONTNEED, _FREE, _HUGEPAGE, _NOHUGEPAGE, _DONTDUMP, _DODUMP
 _FUTEX_PRIVATE = 128
 _FUTEX_WAIT, _FUTEX_WAIT_BITSET = 0, 9
+_MAP_SHARED, _MAP_ANONYMOUS, _MAP_HUGETLB = 0x01, 0x20, 0x40000
 _PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
 _MODES_AND_TIMES = ("chmod", "fchmod", "fchmodat", "utime", "utimes", "utimensat", "futimesat")
 _NOT_TO_ITSELF = (9, 19, 20, 21, 22)  # SIGKILL, SIGSTOP, SIGTSTP, SIGTTIN, SIGTTOU
+_EXTENDED_ATTRIBUTES = ("listxattr", "llistxattr", "flistxattr", "getxattr", "lgetxattr", "fgetxattr")
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
 _YOUNGEST = 450
@@ -114,6 +119,27 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         "fadvise64": [_refuse(0)],
         "readahead": [_refuse(0)],
         "madvise": _one_of(2, _MADVISE, errno.EINVAL),
+        "fsync": [_refuse(0)],
+        "fdatasync": [_refuse(0)],
+        "msync": [_refuse(0)],
+        # Pipes are for processes, of which there are no more: `subprocess` fails here as it would at `fork`.
+        "pipe": [_refuse(errno.EAGAIN)],
+        "pipe2": [_refuse(errno.EAGAIN)],
+        "statfs": [_refuse(errno.ENOSYS)],
+        "fstatfs": [_refuse(errno.ENOSYS)],
+        # Who asks so falls back to `newfstatat`, which shows no mount.
+        "statx": [_refuse(errno.ENOSYS)],
+        "mmap": [
+            (_LOAD, 0, 0, _argument(3)),
+            (_AND, 0, 0, _MAP_SHARED | _MAP_ANONYMOUS),
+            (_JUMP_EQUAL, 0, 1, _MAP_SHARED | _MAP_ANONYMOUS),
+            _refuse(errno.EPERM),
+            (_LOAD, 0, 0, _argument(3)),
+            (_AND, 0, 0, _MAP_HUGETLB),
+            (_JUMP_EQUAL, 0, 1, _MAP_HUGETLB),
+            _refuse(errno.ENOMEM),
+            _ALLOWED,
+        ],
         # The C library uses `preadv` where no flag is asked for.
         "preadv2": [_refuse(errno.ENOSYS)],
         "pwritev2": [_refuse(errno.ENOSYS)],
@@ -132,6 +158,8 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
             _refuse(errno.EPERM),
             *_one_of(0, (0, PID_MARK), errno.EPERM),
         ],
+        # As on a file system without them: `shutil.copytree` goes on then, and with no other answer.
+        **{name: [_refuse(errno.ENOTSUP)] for name in _EXTENDED_ATTRIBUTES},
         "clone": [
             (_LOAD, 0, 0, _argument(0)),
             (_AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),

@@ -24,6 +24,7 @@ getcpu=309 getrandom=318 getrlimit=97 prlimit64=302 sched_yield=24
 sched_getaffinity=204 sched_getparam=143 sched_getscheduler=145 sched_get_priority_max=146
 sched_get_priority_min=147 exit=60 exit_group=231 wait4=61 waitid=247 arch_prctl=158 getpriority=140
 ioctl=16 fcntl=72 prctl=157 clone=56 clone3=435 fork=57 vfork=58 kill=62 tgkill=234
+listxattr=194 llistxattr=195 flistxattr=196 getxattr=191 lgetxattr=192 fgetxattr=193
 """
 
 _AARCH64 = """
@@ -45,6 +46,7 @@ getresgid=150 getpgid=155 getsid=156 uname=160 getcpu=168 getrandom=278 getrlimi
 prlimit64=261 sched_yield=124 sched_getaffinity=123 sched_getparam=121
 sched_getscheduler=120 sched_get_priority_max=125 sched_get_priority_min=126 exit=93 exit_group=94
 wait4=260 waitid=95 getpriority=141 ioctl=29 fcntl=25 prctl=167 clone=220 clone3=435 kill=129 tgkill=131
+listxattr=11 llistxattr=12 flistxattr=13 getxattr=8 lgetxattr=9 fgetxattr=10
 """
 
 

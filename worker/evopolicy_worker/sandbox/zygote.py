@@ -1,7 +1,7 @@
 """The worker's end of a zygote: starts it, has it fork policy processes, learns how they ended.
 
 Rules: the zygote is ours and answers at once; when it does not, the slot is dead. Everything that a policy's process
-is given passes over pipes of its own, never through the zygote.
+is given, and all that it tells, passes over pipes of its own, never through the zygote: a later one could read it there.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ _MAX_MESSAGE = 1 << 16
 class Child(msgspec.Struct, kw_only=True):
     """A forked process that waits for its first request, and our ends of its pipes."""
 
-    pid: int
-    """In the zygote's namespace."""
     host_pid: int
     """In ours; 0 when it is gone already."""
     pidfd: int
@@ -40,6 +38,8 @@ class Child(msgspec.Struct, kw_only=True):
     replies: int
     stdout: int
     stderr: int
+    parent: socket.socket
+    """Tells how it ended."""
 
     def kill(self) -> None:
         """SIGKILL. In its own pid namespace this ends everything that it may have started."""
@@ -47,6 +47,7 @@ class Child(msgspec.Struct, kw_only=True):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def close(self) -> None:
+        self.parent.close()
         for fd in (self.pidfd, self.requests, self.replies, self.stdout, self.stderr):
             os.close(fd)
 
@@ -99,44 +100,52 @@ class Zygote:
                 raise SandboxError(
                     f"the sandbox does not start: {error}; {words or 'it said nothing'}"
                 ) from error
-        ours.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            # So that a host which cannot make processes here is told now. The first two forks leave traces for the next.
+            for _ in range(2):
+                self.bury_later(self.spawn())
+            self.bury()
+        except BaseException:
+            self.close()
+            raise
 
     def spawn(self) -> Child:
-        """A new policy process. SlotDiedError when the zygote is gone; SandboxError when it cannot fork."""
-        theirs: list[int] = []
-        ours: list[int] = []
+        """A new policy process. SlotDiedError when the zygote is gone; SandboxError when there can be no process."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.settimeout(ANSWER_TIMEOUT_S)
         try:
-            for reads_here in (False, True, True, True):
-                read, write = os.pipe2(os.O_CLOEXEC)
-                ours.append(read if reads_here else write)
-                theirs.append(write if reads_here else read)
-            answer, fds = self._ask({"fork": True}, theirs)
-        except BaseException:
-            for fd in ours:
-                os.close(fd)
+            with theirs:
+                socket.send_fds(self._control, [b"f"], [theirs.fileno()])
+            said, fds, _, _ = socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)
+            if not said:
+                raise ConnectionResetError("no process for a policy came of it")
+            if len(fds) != 5:
+                raise SandboxError(f"no process for a policy: {said.decode('utf-8', 'replace')}")
+        except OSError as error:
+            ours.close()
+            raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
+        except SandboxError:
+            ours.close()
             raise
-        finally:
-            for fd in theirs:
-                os.close(fd)
-        if "error" in answer:
-            for fd in ours:
-                os.close(fd)
-            raise SandboxError(f"no process for a policy: {answer['error']}")
-        pidfd = fds[0]
+        pidfd, requests, replies, stdout, stderr = fds
         return Child(
-            pid=answer["pid"],
             host_pid=pid_of(pidfd),
             pidfd=pidfd,
-            requests=ours[0],
-            replies=ours[1],
-            stdout=ours[2],
-            stderr=ours[3],
+            requests=requests,
+            replies=replies,
+            stdout=stdout,
+            stderr=stderr,
+            parent=ours,
         )
 
     def wait(self, child: Child) -> Exit:
         """How a killed or ended child ended. Takes its entry from the process table."""
-        answer, _ = self._ask({"wait": child.pid}, [])
-        return msgspec.convert(answer, Exit)
+        try:
+            child.parent.send(b"w")
+            said = child.parent.recv(_MAX_MESSAGE)
+            return msgspec.json.decode(said, type=Exit)
+        except (OSError, msgspec.DecodeError) as error:
+            raise SlotDiedError(f"the sandbox does not say how a policy's process ended: {error}") from error
 
     def bury_later(self, child: Child) -> None:
         """Kill the child now, and learn of its end when there is time: a process takes milliseconds to be taken down."""
@@ -173,13 +182,6 @@ class Zygote:
                 return
             else:
                 raise SandboxError(str(answer.get("error", answer)))
-
-    def _ask(self, request: dict[str, Any], fds: list[int]) -> tuple[dict[str, Any], list[int]]:
-        try:
-            socket.send_fds(self._control, [json.dumps(request).encode()], fds)
-            return self._receive()
-        except OSError as error:
-            raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
 
     def _receive(self) -> tuple[dict[str, Any], list[int]]:
         data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)

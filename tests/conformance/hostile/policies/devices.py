@@ -3,7 +3,7 @@ import os
 
 def attempts():
     yield "kernel messages", lambda: os.open("/dev/kmsg", os.O_RDONLY | os.O_NONBLOCK)
-    yield "other devices", lambda: set(os.listdir("/dev")) - {"null", "zero", "full", "random", "urandom"}
+    yield "other devices", lambda: set(os.listdir("/dev")) - {"null", "full", "random", "urandom"}
     yield "/sys", lambda: os.listdir("/sys")
     yield "the machine's memory", lambda: open("/proc/meminfo").read()
     yield "cgroups", lambda: os.listdir("/sys/fs/cgroup")

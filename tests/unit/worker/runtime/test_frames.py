@@ -174,6 +174,8 @@ def test_an_action_that_cannot_be_sent_is_told() -> None:
 CHECKED = {
     *("ioctl", "fcntl", "prctl", "prlimit64", "clone", "clone3", "fork", "vfork", "kill", "tgkill"),
     *("futex", "madvise", "fadvise64", "readahead", "preadv2", "pwritev2"),
+    *("pipe", "pipe2", "statfs", "fstatfs", "statx", "fsync", "fdatasync", "msync"),
+    *("listxattr", "llistxattr", "flistxattr", "getxattr", "lgetxattr", "fgetxattr"),
 }
 """Calls that depend on their arguments, or are refused in a way of their own."""
 
@@ -269,6 +271,24 @@ def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: p
     assert allowed(program, preadv2) & 0xFFFF == 38
     for number in (flock, sysinfo):
         assert allowed(program, number) & 0xFFFF == 1
+
+
+def test_the_filter_keeps_a_policy_from_what_is_counted_for_the_whole_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
+    program = seccomp.policy_filter()
+    mmap, fsync, statx, statfs, pipe2, getxattr = 9, 74, 332, 137, 293, 191
+    shared, private, anonymous, huge = 0x01, 0x02, 0x20, 0x40000
+    for flags in (private, private | anonymous, shared, 0x03, private | anonymous | 0x20000):
+        assert allowed(program, mmap, 0, 4096, 3, flags) == seccomp._ALLOW
+    for flags in (shared | anonymous, 0x03 | anonymous):
+        assert allowed(program, mmap, 0, 4096, 3, flags) & 0xFFFF == 1
+    assert allowed(program, mmap, 0, 1 << 21, 3, private | anonymous | huge) & 0xFFFF == 12
+    assert allowed(program, statx) & 0xFFFF == allowed(program, statfs) & 0xFFFF == 38
+    assert allowed(program, pipe2) & 0xFFFF == 11
+    assert allowed(program, getxattr) & 0xFFFF == 95
+    assert allowed(program, fsync) == seccomp._ERRNO  # said to be done
 
 
 def test_where_the_machines_files_are_seen_none_is_changed_or_cut(monkeypatch: pytest.MonkeyPatch) -> None:

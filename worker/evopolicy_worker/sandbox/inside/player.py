@@ -375,7 +375,7 @@ def kind_of(error: BaseException | None) -> str | None:
         if isinstance(error, MemoryError):
             return "memory"
         if isinstance(error, OSError):
-            if error.errno == errno.ENOSPC and os.statvfs(home).f_ffree == 0:
+            if error.errno == errno.ENOSPC and no_file_left():
                 return "inodes"
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
                 return "files"
@@ -388,6 +388,17 @@ def kind_of(error: BaseException | None) -> str | None:
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
         seen += 1
     return None
+
+
+def no_file_left() -> bool:
+    """Whether no file can be made in the policy's home. A link takes none of its bytes."""
+    path = f"{home}/tmp/evopolicy-{random.getrandbits(64):x}"
+    try:
+        os.symlink("-", path)
+        os.unlink(path)
+    except OSError as error:
+        return error.errno == errno.ENOSPC
+    return False
 
 
 def flush_output() -> None:

@@ -1,19 +1,23 @@
 """The zygote inside the sandbox: forks a process per policy, which seals itself before it reads the bundle.
 
 - The zygote never reads a bundle: imported there, hostile code would own every later episode. It has numpy imported.
-- Each child is pid 1 of a pid namespace of its own, with mounts of its own, and then gives up all that it could do:
+- Each policy's process is pid 1 of a pid namespace of its own, with mounts of its own, and then gives up all that it could do:
   capabilities, new privileges, files outside (Landlock), system calls (the filter), limits.
 - Started as root it first becomes an unprivileged user of a user namespace.
 
 Standard library and numpy only: the sandbox shows nothing else.
 """
 
+import collections
 import ctypes
+import functools
 import gc
 import importlib
 import importlib.util
 import io
+import itertools
 import json
+import operator
 import os
 import resource
 import signal
@@ -24,7 +28,10 @@ import traceback
 from typing import Any
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
-MS_RDONLY, MS_NOSUID, MS_NODEV, MS_REMOUNT, MS_BIND, MS_REC, MS_PRIVATE = 1, 2, 4, 32, 4096, 16384, 1 << 18
+MS_RDONLY, MS_NOSUID, MS_NODEV, MS_REMOUNT, MS_NOATIME, MS_BIND, MS_REC = 1, 2, 4, 32, 1024, 4096, 16384
+MS_PRIVATE = 1 << 18
+HOME_FLAGS = MS_NOSUID | MS_NODEV | MS_NOATIME
+N_PIPES = 4
 NOBODY = 65534
 PID_MARK = 0x7FFFABCD
 MAX_TEXT = 16_000
@@ -53,16 +60,14 @@ def main() -> None:
         if config["namespaces"]:
             for device in config["devices"]:
                 protect(device)
-            # Tried once here, so that a host which cannot do it is told at the start.
-            fork_isolated(os.pidfd_open(os.getpid()), probe=True)
     except BaseException as error:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
         raise
-    fds = zygote(control, config)
-    # Only a policy's process comes here. It must never go on as the zygote, whatever happens.
+    worker = zygote(control)
+    # Only its forks come here. They must never go on as the zygote, whatever happens.
     del control
     try:
-        policy_process(config, fds)
+        policys_parent(config, worker)
     finally:
         os._exit(70)
 
@@ -133,78 +138,84 @@ def warm(modules: list[str]) -> None:
     gc.freeze()
 
 
-def zygote(control: socket.socket, config: dict[str, Any]) -> list[int]:
-    """Serves the worker until it hangs up; returns in every child, with its descriptors.
+def zygote(control: socket.socket) -> int:
+    """Serves the worker until it hangs up; returns in a fork for each policy, with a socket to the worker.
 
-    A policy can look into the frames of its callers: in this one it would find how long the policies before it took.
+    A policy can read all memory that it was forked with. So this process must learn nothing of the policies before, nor
+    count them: it has no part in what they are told or tell, does not wait for them, and runs no Python between two forks,
+    whose interpreter counts what it does. What is left is the same five calls in a circle, with the same arguments.
     """
-    myself = os.pidfd_open(os.getpid()) if config["namespaces"] else -1
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    request = os.dup(0)
+    os.close(request)
+    asked, room = ctypes.create_string_buffer(1), ctypes.create_string_buffer(24)
+    pieces = (ctypes.c_size_t * 2)(ctypes.addressof(asked), 1)
+    # struct msghdr: no name, one piece, room for one descriptor, flags
+    message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(room), 24, 0)
+    calls = ctypes.PyDLL(None)
+
+    def step(name: str, result: Any, *arguments: Any) -> Any:
+        function = calls[name]
+        function.restype = result
+        return functools.partial(function, *arguments)
+
+    circle = (
+        # 0 ends the loop, here when the worker has hung up
+        step("recvmsg", ctypes.c_ssize_t, control.fileno(), message, 0),
+        # and here in the child.
+        step("fork", ctypes.c_int),
+        step("close", None, request),
+        step("memset", None, asked, 0, 1),
+        # A number in place of the child's, which counts the policies.
+        step("labs", ctypes.c_long, ctypes.c_long(1 << 40)),
+    )
     control.send(b'{"ready": true}')
-    while True:
-        message, fds, _, _ = socket.recv_fds(control, 4096, 4)
-        if not message:
-            os._exit(0)
-        request = json.loads(message)
-        if "wait" in request:
-            _, status, usage = os.wait4(request["wait"], 0)
-            answer = {
-                "status": status,
-                "cpu_s": usage.ru_utime + usage.ru_stime,
-                "peak_bytes": usage.ru_maxrss * 1024,
-            }
-            control.send(json.dumps(answer).encode())
-            continue
-        try:
-            child = fork_isolated(myself)
-        except OSError as error:
-            control.send(json.dumps({"error": f"fork: {error}"}).encode())
-            continue
-        if child == 0:
-            return fds
-        for fd in fds:
-            os.close(fd)
-        fd = os.pidfd_open(child)
-        socket.send_fds(control, [json.dumps({"pid": child}).encode()], [fd])
-        os.close(fd)
-
-
-def fork_isolated(myself: int, probe: bool = False) -> int:
-    """fork(), the child being pid 1 of a new pid namespace. `myself` is this process's pidfd; −1: a plain fork."""
-    if myself < 0:
-        return os.fork()
-    check(libc.unshare(CLONE_NEWPID), "unshare pid")
-    try:
-        child = os.fork()
-    except OSError:
-        child = -1
-    if child != 0:
-        # Else the next child would be born into the namespace of this one.
-        check(libc.setns(myself, CLONE_NEWPID), "setns pid")
-    if child < 0:
-        raise OSError("cannot fork")
-    if probe:
-        if child == 0:
-            result = libc.unshare(CLONE_NEWNS | CLONE_NEWIPC)
-            os._exit(1 if result < 0 else 0)
-        _, status = os.waitpid(child, 0)
-        os.close(myself)
-        if status:
-            raise OSError("a process in the sandbox may not make mount namespaces")
-    return child
+    calling = functools.partial(next, map(operator.call, itertools.cycle(circle)))
+    collections.deque(iter(calling, 0), maxlen=0)
+    if asked.raw == b"\0":
+        os._exit(0)
+    return request
 
 
 # One policy's process.
 
 
-def policy_process(config: dict[str, Any], fds: list[int]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def policys_parent(config: dict[str, Any], worker: int) -> None:
+    """Forks the policy's process, and tells the worker how it ended. `worker`: a socket."""
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    arrange_descriptors(fds)
-    fds.clear()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     try:
         if config["namespaces"]:
-            check(libc.unshare(CLONE_NEWNS | CLONE_NEWIPC), "unshare mounts, ipc")
+            check(libc.unshare(CLONE_NEWPID | CLONE_NEWNS | CLONE_NEWIPC), "unshare pid, mounts, ipc")
+        child = os.fork()
+    except OSError as error:
+        os.write(worker, f"{type(error).__name__}: {error}".encode())
+        return
+    if child == 0:
+        policy_process(config, worker)
+        return
+    # Until the worker asks, its clock can be read, also when it has ended.
+    os.read(worker, 1)
+    _, status, usage = os.wait4(child, 0)
+    how = {"status": status, "cpu_s": usage.ru_utime + usage.ru_stime, "peak_bytes": usage.ru_maxrss * 1024}
+    os.write(worker, json.dumps(how).encode())
+    os._exit(0)
+
+
+def policy_process(config: dict[str, Any], worker: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    try:
+        home = None
+        if config["namespaces"]:
+            home = config["home"]
             check(libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None), "private mounts")
+            mount_home(home, config["own_tmp"])
+        hand_out_pipes(worker, home)
+    except BaseException as error:
+        os.write(worker, f"{type(error).__name__}: {error}".encode()[:MAX_TEXT])
+        os._exit(71)
+    try:
         header = bytearray(player.REQUEST_HEADER.size)
         player.read_exactly(header)
         length, kind, json_length = player.REQUEST_HEADER.unpack(header)
@@ -213,8 +224,8 @@ def policy_process(config: dict[str, Any], fds: list[int]) -> None:
         if kind != player.INIT:
             raise OSError("the first request is not INIT")
         init = json.loads(bytes(body[:json_length]))
-        if config["namespaces"]:
-            mount_home(init, config["own_tmp"])
+        if home is not None:
+            limit_home(home, init["home_bytes"], init["home_inodes"])
         write_bundle(init, memoryview(body)[json_length:])
         seal(config, init)
     except BaseException as error:
@@ -224,9 +235,17 @@ def policy_process(config: dict[str, Any], fds: list[int]) -> None:
     player.play(init)
 
 
-def arrange_descriptors(fds: list[int]) -> None:
-    """Requests on 3, replies on 4, output on 1 and 2, an empty input of its own on 0; everything else closed."""
-    high = [os.dup2(fd, 100 + k) for k, fd in enumerate(fds)]
+def hand_out_pipes(worker: int, home: str | None) -> None:
+    """Requests on 3, replies on 4, output on 1 and 2, an empty input of its own on 0; everything else closed.
+
+    The worker gets this process's pidfd and the other ends.
+    """
+    pipes = [os.pipe() if home is None else private_pipe(f"{home}/pipe") for _ in range(N_PIPES)]
+    (requests, to_requests), (from_replies, replies), (from_stdout, stdout), (from_stderr, stderr) = pipes
+    with socket.socket(fileno=worker) as sock:
+        others = [os.pidfd_open(os.getpid()), to_requests, from_replies, from_stdout, from_stderr]
+        socket.send_fds(sock, [b" "], others)
+    high = [os.dup2(fd, 100 + k) for k, fd in enumerate((requests, replies, stdout, stderr))]
     # Not the zygote's: the flags of an open file are the same for all who share it, and would outlive the episode.
     os.dup2(os.open("/dev/null", os.O_RDWR), 0)
     for fd, target in zip(high, (player.REQUESTS, player.REPLIES, 1, 2), strict=True):
@@ -235,20 +254,37 @@ def arrange_descriptors(fds: list[int]) -> None:
     sys.stdout, sys.stderr = output_stream(1), output_stream(2)
 
 
+def private_pipe(path: str) -> tuple[int, int]:
+    """Both ends of a pipe that is a file of the policy's own file system.
+
+    Those of `pipe` are numbered through for the whole machine, and `fstat` shows the number.
+    """
+    os.mkfifo(path)
+    read = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    write = os.open(path, os.O_WRONLY)
+    os.unlink(path)
+    os.set_blocking(read, True)
+    return read, write
+
+
 def output_stream(fd: int) -> io.TextIOWrapper:
     """Text that is written line by line: what was printed before a policy is killed is kept."""
     raw = io.BufferedWriter(io.FileIO(fd, "w", closefd=False))
     return io.TextIOWrapper(raw, encoding="utf-8", errors="backslashreplace", line_buffering=True)
 
 
-def mount_home(init: dict[str, Any], own_tmp: bool) -> None:
-    """A file system of the policy's own and limited size, for its copy of `system/` and for /tmp."""
-    home = init["home"].encode()
-    options = f"size={init['home_bytes']},nr_inodes={init['home_inodes']},mode=0700".encode()
-    check(libc.mount(b"home", home, b"tmpfs", MS_NOSUID | MS_NODEV, options), "mount home")
-    os.mkdir(home + b"/tmp")
+def mount_home(home: str, own_tmp: bool) -> None:
+    """A file system of the policy's own, for its copy of `system/` and for /tmp."""
+    check(libc.mount(b"home", home.encode(), b"tmpfs", HOME_FLAGS, b"mode=0700"), "mount home")
+    os.mkdir(f"{home}/tmp")
     if own_tmp:
-        check(libc.mount(home + b"/tmp", b"/tmp", None, MS_BIND, None), "bind /tmp")
+        check(libc.mount(f"{home}/tmp".encode(), b"/tmp", None, MS_BIND, None), "bind /tmp")
+
+
+def limit_home(home: str, n_bytes: int, n_files: int) -> None:
+    """Limits its size. The pipes are files of it too."""
+    options = f"size={n_bytes},nr_inodes={n_files + N_PIPES}".encode()
+    check(libc.mount(None, home.encode(), None, HOME_FLAGS | MS_REMOUNT, options), "limit home")
 
 
 def write_bundle(init: dict[str, Any], data: memoryview) -> None:
