@@ -144,6 +144,7 @@ async def _stopped(orders: Orders) -> None:
 async def _main() -> int:
     setup_logging()
     processes.become_subreaper()
+    processes.leave_session_keyring()
     orders = Orders()
     loop = asyncio.get_running_loop()
     first = await orders.next()

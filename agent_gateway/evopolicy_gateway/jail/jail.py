@@ -15,6 +15,7 @@ import msgspec
 from evopolicy_gateway.jail.doors import Doors
 from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host
+from evopolicy_gateway.jail.syscalls import filter_program
 from evopolicy_gateway.jail.view import DOORWAY, View
 
 _PASSED = frozenset(
@@ -62,7 +63,13 @@ class Way:
         self._keeper: socket.socket | None = None
         self._child: socket.socket | None = None
         self._serving: asyncio.Task[None] | None = None
-        self.words = [*_PATIENT, *jail, "--", _base_python(), "-I", "-S", DOORWAY]
+        # Not on bubblewrap's command line, which the jail's first process shows to the agent: what is hidden is named there.
+        self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
+        self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
+        if (filter_ := filter_program()) is not None:
+            self._files.append(_readable(filter_))
+            self.words += ["--seccomp", str(self._files[1])]
+        self.words += ["--", _base_python(), "-I", "-S", DOORWAY]
         if doors is None:
             self.words += ["-", "-"]
         else:
@@ -72,19 +79,26 @@ class Way:
 
     @property
     def pass_fds(self) -> tuple[int, ...]:
-        return () if self._child is None else (self._child.fileno(),)
+        return (*self._files, *(() if self._child is None else (self._child.fileno(),)))
 
     def started(self, ended: Callable[[], Awaitable[object]]) -> None:
         """Serves the doors until `ended` comes back: the program is gone."""
+        self._close_files()
         if self._child is not None:
             self._child.close()
             self._serving = asyncio.create_task(self._serve(ended))
 
     def failed(self) -> None:
         """It could not be started."""
+        self._close_files()
         for sock in (self._keeper, self._child):
             if sock is not None:
                 sock.close()
+
+    def _close_files(self) -> None:
+        for fd in self._files:
+            os.close(fd)
+        self._files = []
 
     async def _serve(self, ended: Callable[[], Awaitable[object]]) -> None:
         assert self._doors is not None
@@ -97,6 +111,15 @@ class Way:
             await asyncio.gather(serving, return_exceptions=True)
             await self._doors.close()
             self._keeper.close()
+
+
+def _readable(data: bytes) -> int:
+    """A descriptor to read this from."""
+    fd = os.memfd_create("evopolicy-jail")
+    with open(fd, "wb", closefd=False) as file:
+        file.write(data)
+    os.lseek(fd, 0, os.SEEK_SET)
+    return fd
 
 
 # Asked to end, bubblewrap would end at once and take the program with it; so only the program is asked.

@@ -1,7 +1,8 @@
 """What a jailed program sees of this machine, as bubblewrap's arguments. Later ones lie over earlier ones.
 
 As root the jail's processes are still root to the files that they see, though without any capability: so what root may
-write by its name alone (`/proc/sys`) is read-only too.
+write by its name alone (`/proc/sys`) is read-only too. Of `/proc` there is what programs need. What the kernel counts there
+for the whole machine, some of it for root only, is covered: hidden episodes move those numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +28,13 @@ _ETC = (
 )
 _PRIVATE = ("/etc/ssl/private", "/etc/pki/tls/private")
 """The machine's own keys, which root may read."""
-_COVERED = ("/proc/sys", "/proc/sysrq-trigger", "/proc/irq", "/proc/bus")
+_PROC_SHOWN = frozenset(("cpuinfo", "filesystems", "meminfo", "sys", "version"))
+_PROC_COPIES = ("loadavg", "stat", "uptime")
+"""Files with counters of the whole machine that programs cannot do without: they see them as they were, and empty."""
+_COUNTERS = (
+    *(f"/proc/sys/fs/{name}" for name in ("aio-nr", "dentry-state", "file-nr", "inode-nr", "inode-state")),
+    *("/proc/sys/fs/quota", "/proc/sys/kernel/pty/nr"),
+)
 
 
 class View(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,13 +54,16 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
 
     def prepare(self) -> None:
         """Makes the agent's home and /tmp; what is there stays, for an agent that goes on after its keeper died."""
-        for name in ("home", "tmp"):
+        for name in ("home", "tmp", "proc"):
             (self.private / name).mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name in _PROC_COPIES:
+            content = Path("/proc", name).read_text()
+            (self.private / "proc" / name).write_text(_without_counts(name, content))
 
     def arguments(self) -> list[str]:
         """The command up to the program."""
         command = [*_bubblewrap(), *([] if self.open_network else ["--unshare-net"])]
-        command += [*_system(self.open_network), *_proc()]
+        command += [*_system(self.open_network), *self._proc()]
         command += [
             "--bind",
             str(self.private / "tmp"),
@@ -86,6 +96,19 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         command += ["--ro-bind", str(Path(__file__).with_name("doorway.py")), DOORWAY]
         return [*command, "--remount-ro", "/", "--chdir", workspace]
 
+    def _proc(self) -> list[str]:
+        words = ["--proc", "/proc", "--dev", "/dev", "--ro-bind", "/proc/sys", "/proc/sys"]
+        for path in _COUNTERS:
+            words += _covered(path)
+        for name in sorted(os.listdir("/proc")):
+            path = f"/proc/{name}"
+            if name in _PROC_COPIES:
+                words += ["--ro-bind", str(self.private / "proc" / name), path]
+            # Links lead to a process's own.
+            elif not name.isdecimal() and name not in _PROC_SHOWN and not os.path.islink(path):
+                words += _covered(path)
+        return words
+
     def _has_link(self, path: str, target: str) -> bool:
         """Whether an earlier program of this agent left the link: its /tmp and home outlive each of its programs."""
         for shown, name in ((self.home, "home"), ("/tmp", "tmp")):
@@ -114,13 +137,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
             for secret in self.hidden:
                 if secret.is_relative_to(real):
                     covered[os.path.join(folder, secret.relative_to(real))] = None
-        words: list[str] = []
-        for path in covered:
-            if os.path.isdir(path):
-                words += ["--tmpfs", path]
-            elif os.path.exists(path):
-                words += ["--ro-bind", "/dev/null", path]
-        return words
+        return [word for path in covered for word in _covered(path)]
 
     def _is_hidden(self, path: str) -> bool:
         real = Path(os.path.realpath(path))
@@ -155,11 +172,24 @@ def _system(open_network: bool) -> list[str]:
     return words
 
 
-def _proc() -> list[str]:
-    words = ["--proc", "/proc", "--dev", "/dev"]
-    for path in _COVERED:
-        words += ["--ro-bind-try", path, path]
-    return words
+def _covered(path: str) -> list[str]:
+    """Nothing in place of what is there, if anything is."""
+    if os.path.isdir(path):
+        return ["--tmpfs", path]
+    return ["--ro-bind", "/dev/null", path] if os.path.exists(path) else []
+
+
+def _without_counts(name: str, content: str) -> str:
+    """A file of `/proc` with zeros for what is counted."""
+    if name == "loadavg":
+        return "0.00 0.00 0.00 1/1 1\n"
+    if name == "uptime":
+        return f"{content.split()[0]} 0.00\n"
+    lines = []
+    for line in content.splitlines():
+        key, *numbers = line.split()
+        lines.append(line if key == "btime" else " ".join([key, *("0" for _ in numbers)]))
+    return "\n".join(lines) + "\n"
 
 
 def _is_in(path: str, folder: str) -> bool:

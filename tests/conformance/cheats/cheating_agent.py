@@ -297,6 +297,88 @@ def _():
     return True
 
 
+def keyctl(command, *arguments):
+    x86 = os.uname().machine == "x86_64"
+    libc = ctypes.CDLL(None, use_errno=True)
+    number = {"add": 248 if x86 else 217, "keyctl": 250 if x86 else 219}[command]
+    found = libc.syscall(number, *arguments)
+    if found < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return found
+
+
+SESSION_KEYRING, SEARCH, READ = -3, 10, 11
+
+
+@attempt("read a key of the operator's login")
+def _():
+    key = keyctl("keyctl", SEARCH, SESSION_KEYRING, b"user", b"evopolicy-operator", 0)
+    text = ctypes.create_string_buffer(100)
+    keyctl("keyctl", READ, key, text, 100)
+    return text.value.decode()
+
+
+@attempt("leave a note for other runs in a keyring")
+def _():
+    return keyctl("add", b"user", b"evopolicy-note", b"note", 4, SESSION_KEYRING)
+
+
+@attempt("read what is hidden from the jail's own command")
+def _():
+    with open("/proc/1/cmdline", "rb") as file:
+        words = file.read().decode()
+    if "--bind" not in words:
+        raise OSError(words[:100])
+    return True
+
+
+@attempt("find a process of the jail that no filter holds")
+def _():
+    for path in glob.glob("/proc/[0-9]*/status"):
+        with open(path) as file:
+            if "Seccomp:\t0" in file.read():
+                return path
+    raise OSError("all of them are held")
+
+
+@attempt("read what the kernel counts for the whole machine")
+def _():
+    found = []
+    paths = [path for path in glob.glob("/proc/*") if os.path.isfile(path) and not os.path.islink(path)]
+    paths += glob.glob("/proc/sys/fs/*e-nr") + glob.glob("/proc/sys/fs/*-state") + ["/proc/pressure/cpu"]
+    for path in paths:
+        # It would be waited for.
+        if path in ("/proc/kmsg", "/proc/kcore"):
+            continue
+        try:
+            with open(path, "rb") as file:
+                if file.read(1):
+                    found.append(os.path.relpath(path, "/proc"))
+        except OSError:
+            continue
+    return sorted(set(found) - {"cpuinfo", "filesystems", "version", "meminfo", "loadavg", "stat", "uptime"})
+
+
+@attempt("see when the machine is at work")
+def _():
+    def now():
+        return [text(path) for path in ("/proc/stat", "/proc/uptime", "/proc/loadavg")]
+
+    before = now()
+    time.sleep(0.3)
+    return now() != before
+
+
+@attempt("read the kernel's log")
+def _():
+    libc = ctypes.CDLL(None, use_errno=True)
+    number = 103 if os.uname().machine == "x86_64" else 116
+    found = libc.syscall(number, 3, ctypes.create_string_buffer(4096), 4096)
+    if found < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return found
+
+
 @attempt("leave a child behind")
 def _():
     child = (

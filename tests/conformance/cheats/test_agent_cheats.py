@@ -23,10 +23,18 @@ STOPPED = (
     *("import a simulator", "find a simulator's files", "send to the world", "list the runs"),
     *("open a socket to the machine below", "open a ring that makes sockets"),
     *("read another process's variables", "change the kernel's settings"),
+    *("read a key of the operator's login", "leave a note for other runs in a keyring"),
+    *("read what is hidden from the jail's own command", "find a process of the jail that no filter holds"),
+    *("read what the kernel counts for the whole machine", "see when the machine is at work"),
+    "read the kernel's log",
 )
 HOME = "read the operator's home"
 NEEDS_MORE_THAN_NO_JAIL = {
-    *("mount over feedback", "send to the world", "change the kernel's settings"),
+    *("mount over feedback", "send to the world", "change the kernel's settings", "read the kernel's log"),
+    # There is none outside.
+    "read what is hidden from the jail's own command",
+    # Stopped without a jail too: its keeper leaves the login's keyring behind.
+    "read a key of the operator's login",
     *(
         "read another process's variables",
         "read the gateway's memory",
