@@ -58,8 +58,8 @@ def test_progress_is_told_while_a_job_runs(slots: Slots) -> None:
         )
     )
     assert told == sorted(told)
-    assert told[0][1] > 0
-    assert told[-1][0] == 1
+    assert any(0 < steps < 120 for _, steps in told)
+    assert any(done == 1 for done, _ in told)
 
 
 @pytest.mark.parametrize("victim", ["env process", "zygote"])
