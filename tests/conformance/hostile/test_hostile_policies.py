@@ -6,14 +6,12 @@ import base64
 import json
 import os
 import socket
-import struct
 import threading
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from breakers import BREAKERS, PATIENT, Breaker
 from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
@@ -217,26 +215,29 @@ def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> No
     assert len(train) > 1000
 
 
+def unpacked(text: str) -> bytes:
+    return zlib.decompress(base64.b64decode(text))
+
+
 def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots) -> None:
     slot = slots.new("bwrap")
     slots.run(slot.start())
-    patient = msgspec.structs.replace(PATIENT, output_bytes=1 << 20)
 
-    def look(pages: list[int]) -> tuple[tuple[int, ...], dict[str, str]]:
+    def look(pages: list[int]) -> tuple[bytes, dict[str, bytes]]:
         files: dict[str, str | bytes] = {
             "policy.py": (POLICIES / "own_memory.py").read_text(),
             "target.json": json.dumps(pages),
         }
-        outcome = slots.play(files, slot=slot, limits=patient)
+        outcome = slots.play(files, slot=slot, limits=PATIENT)
         assert outcome.failure is None, outcome.failure
-        n, packed, shown = json.loads(outcome.stdout)
-        return struct.unpack(f"<{n}I", zlib.decompress(base64.b64decode(packed))), shown
+        digests, shown = json.loads(outcome.stdout)
+        return unpacked(digests), {page: unpacked(content) for page, content in shown.items()}
 
     try:
         first, _ = look([])
         differing: set[int] = set()
         for status in (3, 77):
-            slots.play(misbehaving(act=f"time.sleep(0.05); os._exit({status})"), slot=slot, limits=patient)
+            slots.play(misbehaving(act=f"time.sleep(0.05); os._exit({status})"), slot=slot, limits=PATIENT)
             digests, _ = look([])
             assert len(digests) == len(first) > 1000, "its memory has another size"
             differing |= {
@@ -247,7 +248,7 @@ def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots
         slots.run(slot.close())
     words = 0
     for page in shown[0]:
-        contents = [bytes.fromhex(one[page]) for one in shown]
+        contents = [one[page] for one in shown]
         n = sum(len({content[k : k + 8] for content in contents}) > 1 for k in range(0, len(contents[0]), 8))
         # The clock's page, which the kernel shows to every process, has more words that change.
         words += n if n < 12 else 0

@@ -1,5 +1,5 @@
 """Reads all memory that its process was forked with: a digest of every page, and the pages that it is asked for."""
-import base64, ctypes, json, os, struct, zlib
+import base64, ctypes, json, os, zlib
 libc = ctypes.CDLL(None)
 libc.sbrk.restype = ctypes.c_void_p
 SCRATCH = os.open("scratch", os.O_RDWR | os.O_CREAT)
@@ -19,6 +19,9 @@ def stack():
     # Its arguments lie at the stack's beginning.
     return ctypes.c_void_p.in_dll(libc, "program_invocation_name").value
 
+def packed(data):
+    return base64.b64encode(zlib.compress(data)).decode()
+
 class Policy:
     def __init__(self, *spaces):
         wanted = json.load(open("target.json"))
@@ -29,9 +32,10 @@ class Policy:
                 if content is not None:
                     # Digests that differ would lie in its memory themselves.
                     found.append((address, 0 if wanted else zlib.crc32(content)))
-        digests = b"".join(struct.pack("<I", crc) for _, crc in found)
-        shown = {k: page(found[k][0]).hex() for k in wanted}
-        print(json.dumps([len(found), base64.b64encode(zlib.compress(digests)).decode(), shown]))
+        # In the few bytes that are kept of what it says: one of each digest, and the pages packed.
+        digests = bytes(crc & 0xFF for _, crc in found)
+        shown = {k: packed(page(found[k][0])) for k in wanted}
+        print(json.dumps([packed(digests), shown]))
 
     def reset(self, episode_index):
         pass
