@@ -7,6 +7,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import structlog
+
 from evopolicy_common import credentials
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.bundles import Bundle
@@ -34,7 +36,10 @@ from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.requests import operator_requests
 from evopolicy_common.transport import Link
 
-WAIT_S = 5.0
+WAIT_S = 3.0
+"""Of a long poll: so often a command hears what it waits for."""
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
 _PATIENCE_S = 10.0
 _SENDER = "operator"
 _UNAVAILABLE_PAUSE_S = 1.0
@@ -50,6 +55,7 @@ class Operations:
     async def create(self, settings: RunSettings, key: str) -> RunCreated:
         """Opens a run; the same key gives the same run."""
         message = CreateRun(token=self._token, key=key, settings=settings)
+        told = ""
         while True:
             try:
                 return await self._requests.until_answered(
@@ -58,6 +64,7 @@ class Operations:
             except RefusedError as error:
                 if error.status != Refusal.UNAVAILABLE:
                     raise _settings_error(error) from error
+                told = _told(error, told)
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
     async def wait(self, run: str) -> AsyncIterator[RunProgress]:
@@ -90,12 +97,14 @@ class Operations:
         message = Claim(
             token=self._token, suite=suite, name=name, holder=holder, ttl_s=ttl_s, run=run, result=result
         )
+        told = ""
         while True:
             try:
                 return await self._requests.until_answered("claim", message, ClaimState)
             except RefusedError as error:
                 if error.status != Refusal.UNAVAILABLE:
                     raise
+                told = _told(error, told)
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
     async def cancel(self, run: str) -> None:
@@ -136,10 +145,10 @@ class Operations:
             if page.finished:
                 return
 
-    async def evaluate(self, message: Evaluate) -> AsyncIterator[tuple[EpisodeOutcome, int, str]]:
-        """Each outcome as it comes, with the number of episodes in all; waiting shows as words in its stead.
+    async def evaluate(self, message: Evaluate) -> AsyncIterator[tuple[EpisodeOutcome | None, int, str]]:
+        """Each outcome as it comes, with the number of episodes in all; every few seconds without one, what it waits for.
 
-        Yields `(outcome, total, "")`. `message.token` may be empty; it is filled in.
+        Yields `(outcome, total, "")` or `(None, total, waits_for)`. `message.token` may be empty; it is filled in.
         """
         asked = Evaluate(
             **{name: getattr(message, name) for name in message.__struct_fields__} | {"token": self._token}
@@ -158,7 +167,9 @@ class Operations:
             page = await self._requests.until_answered("poll", poll, EvaluationPage, wait_s=WAIT_S)
             cursor = page.cursor
             for outcome in page.outcomes:
-                yield outcome, page.total, page.waits_for
+                yield outcome, page.total, ""
+            if not page.outcomes:
+                yield None, page.total, page.waits_for
             if page.finished:
                 return
 
@@ -168,6 +179,13 @@ def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Crede
     operator = credentials.find("operator", connect, file)
     beside = file if file is None or file.is_dir() else file.parent / "gateway.json"
     return operator, credentials.find("gateway", connect, beside)
+
+
+def _told(error: RefusedError, told: str) -> str:
+    """Says once why a request is asked again and again."""
+    if error.message != told:
+        log.warning(error.message)
+    return error.message
 
 
 def _settings_error(error: RefusedError) -> Exception:

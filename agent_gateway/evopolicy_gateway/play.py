@@ -23,6 +23,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.notices import Waiting
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import children, control, harnesses, record
@@ -299,8 +300,12 @@ class RunPlay:
             await self._gateway.tell(self._order)
 
     async def _follow(self) -> None:
-        """Has the agent ended when the run is cancelled at the coordinator, which its gateway may not hear of."""
+        """Says what a run waits for that is not served yet; has the agent ended when the run is cancelled at the
+        coordinator, which its gateway may not hear of."""
+        waiting = Waiting()
         async for progress in self._operations.wait(self.run):
+            if not self._ready.done() and waiting.worth_saying(progress.waits_for):
+                self._watch.note(self._name, f"waiting for {progress.waits_for}")
             finished = progress.finished
             if finished is not None and finished.status == CANCELLED:
                 self._cancelled = True

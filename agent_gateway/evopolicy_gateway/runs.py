@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -15,6 +15,7 @@ from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.local_cluster import local_cluster, unless_failed
+from evopolicy_common.messages.episode import Tier
 from evopolicy_common.run_record import RunRecord
 from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.operations import Operations, find_credentials
@@ -63,9 +64,12 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 
 @contextlib.asynccontextmanager
 async def connected(
-    where: Cluster, env_ids: Sequence[str]
+    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
 ) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
-    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up."""
+    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+
+    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
+    """
     end_on_sigterm()
     async with contextlib.AsyncExitStack() as stack:
         failed: asyncio.Future[None] | None = None
@@ -74,7 +78,7 @@ async def connected(
             cluster = await stack.enter_async_context(
                 local_cluster("local", state=where.state, data=where.data, audit=where.audit)
             )
-            await cluster.start_workers(env_ids, slots=where.local_slots)
+            await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
             file, failed = cluster.operator_file, cluster.failed
         operator, gateway = find_credentials(where.connect, file)
         link = await stack.enter_async_context(transport.connect(operator))
@@ -87,7 +91,10 @@ async def play_all(
     """Plays all plans, so many at once; one that fails does not stop the others."""
     results: dict[int, RunResult] = {}
     with watching(console) as watch:
-        async with connected(where, [plan.settings.env for plan in plans]) as (operations, gateway, failed):
+        settings = [plan.settings for plan in plans]
+        async with connected(
+            where, [one.env for one in settings], {one.sandbox_tier for one in settings}
+        ) as (operations, gateway, failed):
             gate = asyncio.Semaphore(parallel)
 
             async def one(index: int, plan: Plan) -> None:

@@ -19,6 +19,7 @@ from evopolicy_common.local_cluster import unless_failed
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
+from evopolicy_common.notices import Waiting
 from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
 from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_gateway.formatting import cut_text
@@ -103,7 +104,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
         ]
         results.append(_result(trial.env, episodes, where, folder))
 
-    async with connected(where, [trial.env]) as (operations, _, failed):
+    async with connected(where, [trial.env], {trial.tier}) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
     _print(results, as_json, console)
     return int(any(episode.failure for episode in results[0].episodes))
@@ -131,6 +132,8 @@ async def play_random(
                 split=msgspec.convert(split, Split),
                 cases=cases,
                 record="actions",
+                # No policy plays, so nothing needs a sandbox; a worker of another cluster may offer no tier `none`.
+                sandbox_tier="bwrap" if where.local_slots is None else "none",
             )
             outcomes = await _outcomes(operations, message, console)
             ids = range(len(outcomes)) if cases is None else cases
@@ -140,7 +143,7 @@ async def play_random(
             ]
             results.append(_result(env_id, episodes, where))
 
-    async with connected(where, env_ids) as (operations, _, failed):
+    async with connected(where, env_ids, ()) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
     if as_json or len(results) == 1:
         _print(results, as_json, console)
@@ -154,8 +157,13 @@ async def _outcomes(operations: Operations, message: Evaluate, console: Terminal
     outcomes: list[EpisodeOutcome] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(message.env, total=None)
-        async for outcome, total, _ in operations.evaluate(message):
-            outcomes.append(outcome)
+        waiting = Waiting()
+        async for outcome, total, waits_for in operations.evaluate(message):
+            if outcome is not None:
+                outcomes.append(outcome)
+                waiting.goes_on()
+            elif waiting.worth_saying(waits_for):
+                console.print(f"{message.env}: waiting for {waits_for}", soft_wrap=True)
             progress.update(task, completed=len(outcomes), total=total)
     return sorted(outcomes, key=lambda outcome: outcome.index)
 

@@ -15,7 +15,7 @@ import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.terminal import harmless, say
+from evopolicy_common.terminal import harmless, one_line, say
 
 Connect = Annotated[
     list[str] | None,
@@ -87,6 +87,21 @@ def setup_logging(level: str = "info") -> None:
     )
 
 
+def setup_notices() -> None:
+    """For commands of people and scripts: warnings as plain lines on stderr, so that stdout holds results only."""
+
+    def plain(_: Any, __: str, event: Any) -> str:
+        text, error = str(event.pop("event")), event.pop("exc_info", None)
+        details = ", ".join(f"{name} {value}" for name, value in event.items())
+        return one_line(text + (f" ({details})" if details else "") + (f": {error!r}" if error else ""))
+
+    structlog.configure(
+        processors=[plain],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING),
+        logger_factory=structlog.PrintLoggerFactory(file=cast(TextIO, _Stderr())),
+    )
+
+
 def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
     """Ends the command with one line on stderr."""
     say(f"error: {message}", err=True)
@@ -116,6 +131,7 @@ def end_on_sigterm() -> None:
 
 def run_app(app: typer.Typer) -> None:
     """Runs the command that `sys.argv` names, and exits."""
+    setup_notices()
     try:
         code = typer.main.get_command(app).main(standalone_mode=False)
     except _ClickError as error:

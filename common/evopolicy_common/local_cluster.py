@@ -10,12 +10,14 @@ import asyncio
 import contextlib
 import os
 import sys
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from pathlib import Path
 
 from evopolicy_common.child_process import ChildProcess
 from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.notices import told_if_slow
 from evopolicy_common.ready import Ready, read_ready
 from evopolicy_common.scratch import scratch_folder
 
@@ -36,13 +38,20 @@ class LocalCluster:
         self._processes = processes
         self._audited = audited
 
-    async def start_workers(self, env_ids: Sequence[str], *, slots: int) -> None:
-        """A worker that offers these environments; of an audited cluster two, which divide the slots between them."""
+    async def start_workers(
+        self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
+    ) -> None:
+        """A worker that offers these environments; of an audited cluster two, which divide the slots between them.
+
+        `tiers`: sandbox tiers that will be asked for. Where one does not work here the cluster fails with the remedy.
+        """
         # Who starts this cluster is the one who chooses the tiers of what it plays.
         program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed"]
         program += ["--credentials", self._worker_file]
         for env_id in env_ids:
             program += ["--env", env_id]
+        for tier in sorted(tiers):
+            program += ["--need-tier", tier]
         second = max(1, slots // 2) if self._audited else 0
         for name, n in (("worker", max(1, slots - second)), ("worker-2", second)):
             if n:
@@ -77,8 +86,9 @@ async def local_cluster(
         try:
             await processes.keep_up("coordinator", coordinator)
             try:
-                async with asyncio.timeout(START_PATIENCE_S):
-                    ready = await read_ready(ready_file, processes.failed)
+                with told_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
+                    async with asyncio.timeout(START_PATIENCE_S):
+                        ready = await read_ready(ready_file, processes.failed)
             except TimeoutError as error:
                 raise ConfigError(
                     f"the local coordinator did not start within {START_PATIENCE_S:g} s"

@@ -21,6 +21,7 @@ from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
 from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.notices import AFTER_S, told_if_slow
 from evopolicy_common.transport import Link
 
 Reply = TypeVar("Reply")
@@ -33,7 +34,7 @@ LONGEST_PAUSE_S = 0.5
 """So that whoever waits goes on within a second of the coordinator's return."""
 ANSWER_S = 5.0
 """How long one request may go unanswered before it is sent again, beyond the time that a long poll asks for."""
-WARN_AFTER_S = 5.0
+WARN_AFTER_S = 10.0
 """A request that has waited so long is logged, and again each time that it has waited twice as long."""
 
 
@@ -53,7 +54,8 @@ class Requester(Generic[Reply]):
 
         `wait_s` is how long the message itself asks the coordinator to wait. Raises RefusedError, TransportError when no answer came, ProtocolError for another answer.
         """
-        answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
+        with told_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
+            answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
         return expect(codec.decode(self._replies, answer), wanted)
 
     async def until_answered(

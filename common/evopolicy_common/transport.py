@@ -30,6 +30,7 @@ import zenoh
 from evopolicy_common import keys
 from evopolicy_common.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
 from evopolicy_common.errors import TransportError
+from evopolicy_common.notices import told_if_slow
 
 MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8
@@ -218,7 +219,8 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
     Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
     a wrong password looks like: the router does not say.
     """
-    session = await _open_client(credentials, timeout_s)
+    with told_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
+        session = await _open_client(credentials, timeout_s)
     link = Link(session, credentials)
     try:
         yield link

@@ -175,7 +175,8 @@ async def _verify(options: _Options, console: Terminal) -> Report:
                 await verifier.check_fingerprint()
 
             if cluster is not None:
-                await cluster.start_workers([run.record.env], slots=options.slots)
+                tiers = {options.tier or run.record.sandbox_tier}
+                await cluster.start_workers([run.record.env], slots=options.slots, tiers=tiers)
             failed = None if cluster is None else cluster.failed
             await unless_failed(asyncio.create_task(work()), failed)
     return verifier.report

@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import structlog
 import typer
@@ -26,7 +26,7 @@ from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_worker import environments
 from evopolicy_worker.cores import Cores
 from evopolicy_worker.fingerprint import fingerprint
-from evopolicy_worker.sandbox import available_tiers
+from evopolicy_worker.sandbox import available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
@@ -74,6 +74,12 @@ def work(
             help="Also play runs that ask for tier none, whose policies are not locked in: they can do all that you can.",
         ),
     ] = False,
+    need_tier: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--need-tier", hidden=True, help="Sandbox tier without which the worker does not start."
+        ),
+    ] = None,
     grace: Annotated[
         float, typer.Option(min=0.0, help="Seconds that running episodes get on SIGTERM.")
     ] = 10.0,
@@ -108,6 +114,13 @@ def work(
                 "no sandbox works here: `evopolicy-worker doctor` tells why and what to do; --unsandboxed plays runs that"
                 " ask for --tier none"
             )
+        for tier in need_tier or ():
+            if tier not in tiers:
+                raise ConfigError(
+                    f"sandbox tier {tier} does not work here: {why_not(cast(Tier, tier))};"
+                    " `evopolicy-worker doctor` checks this machine. --tier none plays policies unconfined, which run.json"
+                    " then says"
+                )
         with scratch_folder("worker") as scratch:
             asyncio.run(
                 _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)

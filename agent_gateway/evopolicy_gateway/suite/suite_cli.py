@@ -112,7 +112,8 @@ async def _suite(order: Order) -> int:
     with alone(order.root / ".lock", order.root):
         index = suite_index.load(order.root, order.suite.name)
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
-        async with connected(order.where, env_ids) as (operations, gateway, failed):
+        tiers = {run.settings.sandbox_tier for run in order.runs}
+        async with connected(order.where, env_ids, tiers) as (operations, gateway, failed):
             started_in = Path.cwd()
             decided = [
                 decisions.decide(

@@ -332,6 +332,8 @@ def progress(core: Core, run: Run) -> operator.RunProgress:
         group = None if run.open is None else core.groups[train_group(run.id, run.open)]
         done = run.ledger.settled + (0 if group is None else group.done)
         waits_for = "" if group is None else core.waits_for(group)
+        if run.state.description is None:  # its gateway cannot serve yet
+            waits_for = core.waits_for_workers(run.flow)
         return operator.RunProgress(phase="open", done=done, total=run.row.budget, waits_for=waits_for)
     ok = [row for row in _ok(run) if row.ineligible is None]
     n = len(run.row.validation)

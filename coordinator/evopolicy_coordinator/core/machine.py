@@ -391,6 +391,10 @@ class Core:
         """What a group waits for, in words; empty while it runs."""
         return status.waits_for(self, group)
 
+    def waits_for_workers(self, flow: Flow) -> str:
+        """Which workers a flow waits for, in words; empty while some may serve it."""
+        return status.waits_for_workers(self, flow)
+
     def forget_run(self, run: Run) -> None:
         """A run is finished: of it only the last state that its gateway may ask for stays."""
         del self.runs[run.id]

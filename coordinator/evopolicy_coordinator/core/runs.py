@@ -163,9 +163,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
     description = run.state.description
     row, settings = run.row, run.row.settings
     if description is None:
-        text = (
-            f"no worker that offers {settings.env} with sandbox tier {settings.sandbox_tier} is connected yet"
-        )
+        text = f"the run waits for {core.waits_for_workers(run.flow)}"
         turn.refuse(event.request, Refusal.NO_WORKER, text)
         return
     if not event.asks_permit and _without_permit(core, event.request, run, turn):

@@ -68,22 +68,34 @@ def waits_for(core: Core, group: JobGroup) -> str:
     if group.n_leased or group.closed or not group.jobs:
         return ""
     flow = group.flow
-    if flow.lane is None or not flow.lane.profiles:
-        return _a_worker(flow)
-    if (obstacle := core.isolation.obstacle(group)) and flow.lane.slots():
+    if missing := waits_for_workers(core, flow):
+        return missing
+    if obstacle := core.isolation.obstacle(group):
         return obstacle
-    if flow.lane.slots() == 0:
-        return f"{_a_worker(flow)}, of the same versions as the run began with"
     if any(job.lease is None and not job.queued for job in group.jobs.values()):
         waits_to_adopt = any(job in core.adopting for job in group.jobs.values())
         return "workers to report after a restart" if waits_to_adopt else "another try after a fault of ours"
-    if all(("bench", name) in core.timers for profile in flow.lane.profiles for name in profile.workers):
+    profiles = () if flow.lane is None else flow.lane.profiles
+    if all(("bench", name) in core.timers for profile in profiles for name in profile.workers):
         return "workers whose jobs kept failing to be tried again"
     return FREE_SLOT
 
 
-def _a_worker(flow: Flow) -> str:
-    return f"a worker that offers {flow.env} with sandbox tier {flow.tier}"
+def waits_for_workers(core: Core, flow: Flow) -> str:
+    """The workers that a run or an evaluation waits for, in words that an agent may read; empty when some are at work."""
+    if flow.lane is not None and flow.lane.slots():
+        return ""
+    wanted = f"a worker that offers {flow.env} with sandbox tier {flow.tier}"
+    able = [
+        worker
+        for worker in core.fleet.workers.values()
+        if flow.env in worker.profile.descriptions and flow.tier in worker.profile.key[1]
+    ]
+    same = [worker for worker in able if flow.pin in (None, worker.profile.fingerprint_class)]
+    if len(same) < len(able):
+        wanted += ", of the same versions as the run began with"
+    away = sorted({worker.state for worker in same if worker.state != "active"})
+    return f"{wanted}: those that do are {' or '.join(away)}" if away else wanted
 
 
 def status(core: Core, now: float) -> CoreStatus:
@@ -178,7 +190,7 @@ def _run(core: Core, run: Run) -> RunStatus:
         queued=sum(run.flow.n_ready[:AUDIT]),
         running=run.flow.n_leased,
         done=run.ledger.settled + sum(group.done for group in groups),
-        waits_for=waiting[0] if waiting else "",
+        waits_for=waiting[0] if waiting else progress(core, run).waits_for,
         agent_host=core.isolation.agents(run.id),
     )
 

@@ -1,0 +1,150 @@
+"""What cannot start is refused at once with the remedy; what waits for more than three seconds says for what."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import SMALL, agent, command, record_in, run_arguments, run_dir
+from waiting import wait_until
+
+from evopolicy_common import credentials
+from evopolicy_common.credentials import Credentials
+
+POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
+WORKER_IS_PAUSED = (
+    "waiting for a worker that offers toy/line with sandbox tier bwrap: those that do are paused"
+)
+
+
+@pytest.fixture
+def without_bubblewrap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine like this one on which nobody has installed bubblewrap."""
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    for folder in os.environ["PATH"].split(":"):
+        for program in Path(folder).glob("*"):
+            if program.name != "bwrap" and not (programs / program.name).is_symlink():
+                (programs / program.name).symlink_to(program)
+    monkeypatch.setenv("PATH", str(programs))
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> str:
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy/policy.py").write_text(POLICY)
+    return str(tmp_path / "policy")
+
+
+@pytest.mark.usefixtures("without_bubblewrap")
+@pytest.mark.parametrize("name", ["try", "local", "run", "suite"])
+def test_without_bubblewrap_a_command_that_needs_it_says_what_to_do(
+    tmp_path: Path, policy: str, name: str
+) -> None:
+    (tmp_path / "t.toml").write_text(
+        'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
+        '[agents.jail]\nmode = "none"\n'
+    )
+    played = ["--env", "toy/line", "--agent", "evolve", "--jail", "none", *SMALL]
+    arguments = {
+        "try": ["try", policy, "--env", "toy/line"],
+        "local": ["local", *played],
+        "run": ["run", "--local", *played],
+        "suite": ["suite", "t.toml", "--local"],
+    }[name]
+    with command(tmp_path, *arguments) as running:
+        code, _, err = running.finish()
+        assert running.alive() == []
+    assert code == 2, err
+    assert "bubblewrap" in err
+    assert "--tier none" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.usefixtures("without_bubblewrap")
+def test_without_bubblewrap_what_needs_no_sandbox_is_played(tmp_path: Path, policy: str) -> None:
+    for arguments in (
+        ["random", "--env", "toy/line", "--split", "train", "--cases", "0-1"],
+        ["try", policy, "--env", "toy/line", "--cases", "0-1", "--tier", "none"],
+    ):
+        with command(tmp_path, *arguments) as running:
+            code, out, err = running.finish()
+        assert code == 0, err
+        assert "mean return" in out
+
+
+@pytest.fixture
+def paused(operator_file: Path) -> Path:
+    """Credentials of the cluster, whose only worker is paused."""
+    status = [sys.executable, "-m", "evopolicy_gateway.cli", "status", "--json"]
+    words = ("--credentials", str(operator_file))
+
+    def workers() -> list[str]:
+        told = subprocess.run([*status, *words], capture_output=True, check=True).stdout
+        return [worker["worker"] for worker in json.loads(told)["workers"]]
+
+    wait_until(workers)
+    (name,) = workers()
+    subprocess.run(
+        [sys.executable, "-m", "evopolicy_gateway.cli", "workers", "pause", name, *words], check=True
+    )
+    return operator_file
+
+
+def resume(operator_file: Path, cwd: Path) -> None:
+    words = ("--credentials", str(operator_file))
+    with command(cwd, "status", "--json", *words) as asked:
+        (worker,) = json.loads(asked.finish()[1])["workers"]
+    with command(cwd, "workers", "resume", worker["worker"], *words) as done:
+        assert done.wait() == 0
+
+
+def test_a_run_whose_workers_are_paused_says_so_and_so_does_status(paused: Path, tmp_path: Path) -> None:
+    with command(tmp_path, *run_arguments(paused, agent(tmp_path, "submit([0])"))) as running:
+        wait_until(lambda: WORKER_IS_PAUSED in running.text, lambda: running.text)
+        with command(tmp_path, "status", "--credentials", str(paused)) as asked:
+            assert "those that do are paused" in asked.finish()[1]
+        resume(paused, tmp_path)
+        code, _, err = running.finish()
+    assert code == 0, err
+    assert record_in(run_dir(tmp_path)).outcome.status == "completed"
+
+
+@pytest.mark.parametrize("name", ["try", "random"])
+def test_a_trial_whose_workers_are_paused_says_so(
+    paused: Path, tmp_path: Path, policy: str, name: str
+) -> None:
+    arguments = ["try", policy, "--cases", "0"] if name == "try" else ["random", "--split", "train"]
+    more = ("--env", "toy/line", "--json", "--credentials", str(paused))
+    with command(tmp_path, *arguments, *more) as running:
+        wait_until(lambda: WORKER_IS_PAUSED in running.err, lambda: running.text)
+        resume(paused, tmp_path)
+        code, out, err = running.finish()
+    assert code == 0, err
+    assert json.loads(out)
+
+
+@pytest.mark.parametrize("name", ["status", "run", "try"])
+def test_a_command_whose_coordinator_is_away_says_what_it_waits_for(
+    tmp_path: Path, policy: str, name: str
+) -> None:
+    arguments = {
+        "status": ["status", "--json"],
+        "run": ["run", "--env", "toy/line", "--agent", "random"],
+        "try": ["try", policy, "--env", "toy/line"],
+    }[name]
+    for role in ("operator", "gateway"):
+        found = Credentials(
+            cluster="c", role=role, endpoints=("tcp/127.0.0.1:9",), user=role, password="p", token="t"
+        )
+        credentials.write(found, tmp_path / f"{role}.json")
+    with command(tmp_path, *arguments, "--credentials", str(tmp_path / "operator.json")) as running:
+        wait_until(lambda: "waiting for the coordinator at" in running.err, lambda: running.text)
+        code, out, err = running.finish()
+    assert code == 1
+    assert out == ""
+    assert len(err.splitlines()) == 2, err
