@@ -94,7 +94,9 @@ def waits_for_workers(core: Core, flow: Flow) -> str:
     same = [worker for worker in able if flow.pin in (None, worker.profile.fingerprint_class)]
     if len(same) < len(able):
         wanted += ", of the same versions as the run began with"
-    away = sorted({worker.state for worker in same if worker.state != "active"})
+    # Nothing of audits reaches an agent.
+    words = {"quarantined": "out of service"}
+    away = sorted({words.get(worker.state, worker.state) for worker in same if worker.state != "active"})
     return f"{wanted}: those that do are {' or '.join(away)}" if away else wanted
 
 
