@@ -146,6 +146,7 @@ class Answers:
             episodes=tuple(feedback(found.outcome) for found in page.rows),
             done=records.submit_done(row) if page.cursor >= upto else None,
             waits_for=effect.waits_for,
+            held_s=effect.held_s,
         )
 
     def _evaluation(self, effect: ReadEvaluation) -> Message:

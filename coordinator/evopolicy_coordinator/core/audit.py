@@ -11,13 +11,15 @@ Rules that this module owns:
 - Two workers that disagree are in dispute; a third opinion decides. Who stands alone against two is named and gets no
   more leases. What is settled stays, once and for all; the run says that it is in question.
 - Audits come last in the queue and are stopped for any train job. A run that is otherwise done waits for them
-  `CoreSettings.audit_wait_s` at most, and not at all for what no other worker can play.
+  `CoreSettings.audit_wait_s` at most, and not at all for what no other worker can play. Time in which a hidden one is kept
+  from all workers that could play it (`isolation`) does not count.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -47,6 +49,7 @@ FINDINGS_MAX = 100
 ONE_WORKER = "one worker only"
 ONE_MACHINE = "one machine only"
 OTHERS_DIFFER = "the other workers have other versions or processors"
+UNKNOWN_KERNEL = "the other workers' kernels are not known"
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"
 TOO_LATE = "nobody played it again in time"
@@ -315,12 +318,14 @@ def holds_up(core: Core, run: Run, turn: Turn) -> bool:
     if not waiting:
         core.timers.disarm(("audits", run.id))
         return False
-    if run.audits_until is None:
-        run.audits_until = turn.now + core.settings.audit_wait_s
+    if run.audits_looked_at is not None and all(_playable(core, run, row) for row in waiting):
+        run.audits_waited_s += turn.now - run.audits_looked_at
+    run.audits_looked_at = turn.now
+    left_s = core.settings.audit_wait_s - run.audits_waited_s
     # After a start or a standstill workers may not have come back yet.
     in_vain = turn.now >= core.hold_until and all(_obstacle(core, run, row) for row in waiting)
-    if turn.now < run.audits_until and not in_vain:
-        core.timers.arm(("audits", run.id), min(run.audits_until, turn.now + LOOK_AGAIN_S))
+    if left_s > 0.0 and not in_vain:
+        core.timers.arm(("audits", run.id), turn.now + min(left_s, LOOK_AGAIN_S))
         return True
     core.timers.disarm(("audits", run.id))
     for row in waiting:
@@ -342,19 +347,43 @@ def _obstacle(core: Core, run: Run, row: AuditRow) -> str:
     """Why no worker that is known can play the audit's next replay; empty when one can, or the shell is at it."""
     if row.actions is None or len(row.replayed_by) > row.compared:
         return ""
-    reason, fleet = ONE_WORKER, core.fleet
+    reason = ONE_WORKER
+    for _, why in _auditors(core, run, row):
+        if not why:
+            return ""
+        reason = why if reason == ONE_WORKER or why != ONE_MACHINE else reason
+    return reason
+
+
+def _playable(core: Core, run: Run, row: AuditRow) -> bool:
+    """Whether some worker may play the audit's next replay now, or nobody can, or the shell is at it: waiting counts."""
+    if row.actions is None or len(row.replayed_by) > row.compared or row.kind not in HIDDEN_SPLITS:
+        return True
+    able = [worker for worker, why in _auditors(core, run, row) if not why]
+    isolation = core.isolation
+    return (
+        not able
+        or not isolation.on
+        or any(isolation.hidden_bar(run.family, worker.kernel) is None for worker in able)
+    )
+
+
+def _auditors(core: Core, run: Run, row: AuditRow) -> Iterator[tuple[Worker, str]]:
+    """Workers that have not had to do with the episode, each with why it cannot play it again; empty when it can."""
+    fleet, isolation = core.fleet, core.isolation
     for worker in fleet.workers.values():
         had = worker.name == row.player or worker.name in row.replayed_by
         shut_out = worker.name in fleet.quarantined or worker.machine in fleet.quarantined_machines
         if had or shut_out or run.flow.env not in worker.profile.descriptions:
             continue
         if worker.machine in row.machines:
-            reason = ONE_MACHINE if reason == ONE_WORKER else reason
-        elif worker.numerics == row.numerics:
-            return ""
+            yield worker, ONE_MACHINE
+        elif worker.numerics != row.numerics:
+            yield worker, OTHERS_DIFFER
+        elif isolation.on and row.kind in HIDDEN_SPLITS and worker.kernel is isolation.everywhere:
+            yield worker, UNKNOWN_KERNEL
         else:
-            reason = OTHERS_DIFFER
-    return reason
+            yield worker, ""
 
 
 def cancel(core: Core, run: Run, turn: Turn) -> None:

@@ -52,6 +52,7 @@ class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     upto: int | None
     """None for a run that is finished: then the row's `released`. `Refused("unknown_submit")` when there is no row."""
     waits_for: str = ""
+    held_s: float = 0.0
     stimulus_id: str = ""
 
 

@@ -81,7 +81,7 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
 def enter(core: Core, row: EvaluationRow) -> Evaluation:
     """Take an evaluation into the core, with nothing of it queued yet."""
     family = core.isolation.families.join(row.env, row.cases) if _hidden(row) else None
-    evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier, family))
+    evaluation = Evaluation(row, core.add_flow(row.evaluation, row.env, row.tier, family, closed=True))
     core.evaluations[row.evaluation] = evaluation
     core.evaluation_keys[row.key] = row.evaluation
     return evaluation

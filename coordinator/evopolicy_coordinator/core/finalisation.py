@@ -144,6 +144,7 @@ def close(core: Core, event: events.RunClosed, turn: Turn) -> None:
     core.isolation.drop_asks(event.run, Refusal.RUN_CLOSED, f"run {event.run!r} is closed", turn)
     if run is not None and run.state.phase == "open":
         run.change(turn, phase="closed", closed_at=turn.now, close_reason=event.reason, agent=event.agent)
+        core.queue.close(run.flow)
         turn.log("info", "run_closed", run=run.id, reason=event.reason, submits=len(run.submits))
         advance(core, run, turn)
     turn.reply(event.request, gateway.RunClosed())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from .isolation import all_related, related
 from .jobs import N_PRIORITIES, TRAIN
 from .records import train_group
 from .story import InvariantError
@@ -19,6 +20,7 @@ def check(core: Core) -> None:
     _queue(core)
     _workers(core)
     _audits(core)
+    _isolation(core)
     for run in core.runs.values():
         run.ledger.validate()
         want(
@@ -33,6 +35,36 @@ def check(core: Core) -> None:
             len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
         )
         want(core, run.id, settled == run.ledger.settled, "settled is what ended submits took")
+
+
+def _isolation(core: Core) -> None:
+    """Hidden jobs, agents and train jobs of related runs are on different kernels; what is over is forgotten."""
+    isolation = core.isolation
+    for kernel in isolation.kernels.values() if isolation.on else ():
+        for stay in all_related(kernel.hidden, None):
+            if stay.lease is None or not stay.lease.live:
+                continue
+            others = (kernel, isolation.everywhere)
+            apart = not any(
+                related(each.permits, stay.family) or related(each.train, stay.family) for each in others
+            )
+            want(core, stay.id, apart, "a hidden job is apart from related agents and train jobs")
+            want(core, stay.id, kernel is not isolation.everywhere, "a hidden job's kernel is known")
+    for worker in core.fleet.workers.values():
+        for lease in worker.leases.values():
+            group = lease.job.group
+            wanted = group.hidden or group.kind == "train"
+            want(core, lease.id, (lease.stay is not None) == wanted, "what a worker holds is on its kernel")
+    flows = {group.flow for group in core.groups.values()}
+    flows |= {run.flow for run in core.runs.values()} | {each.flow for each in core.evaluations.values()}
+    users = Counter(flow.family for flow in flows if flow.family is not None)
+    for kernel in isolation.kernels.values():
+        for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals):
+            users.update({family: len(there) for family, there in index.items() if family is not None})
+    for family in isolation.families.known():
+        want(core, "", family.users == users[family], "a family is known as long as anything is of it")
+    for group in core.held:
+        want(core, group.id, group.held_since is not None and not group.closed, "an open submit is held")
 
 
 def _audits(core: Core) -> None:
@@ -136,6 +168,19 @@ def _queue(core: Core) -> None:
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
             want(core, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
+        waiting = [job for job in core.jobs.values() if job.queued and job.group.flow.lane is lane]
+        for priority in range(N_PRIORITIES):
+            families = Counter(job.group.flow.family for job in waiting if job.priority == priority)
+            want(
+                core,
+                str(lane.key),
+                dict(families) == lane.waiting[priority],
+                "families that wait are counted",
+            )
+        backlog = Counter(
+            job.group.flow.family for job in waiting if job.group.hidden and job.group.flow.closed
+        )
+        want(core, str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
         for profile in lane.profiles:
             want(
                 core,

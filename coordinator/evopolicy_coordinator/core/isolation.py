@@ -32,7 +32,7 @@ from evopolicy_common.messages.operator import ELSEWHERE, HiddenIsolation
 from evopolicy_common.messages.worker import HeldLease
 from evopolicy_common.refusals import Refusal
 
-from .jobs import HIDDEN, TRAIN, JobGroup, JobState
+from .jobs import EARLY_VALIDATION, HIDDEN, TRAIN, JobGroup, JobState
 from .records import KernelRow, PermitRow, RunRow, RunStateRow
 from .turn import Turn
 
@@ -54,9 +54,6 @@ CANCELLED_S = 30.0
 
 ASK_AGAIN_S = 10.0
 """A request for a permit that was answered with none is kept for so long, until it is sent again."""
-
-LOOK_S = 1.0
-"""How often waiting hidden jobs, and submits that hidden jobs keep waiting, are looked at."""
 
 SCORING = "hidden cases of another run are being scored"
 
@@ -101,6 +98,10 @@ class Families:
                 there[family] = None
         family.users += 1
         return family
+
+    def known(self) -> Iterable[Family]:
+        """All that are in use."""
+        return self._known.values()
 
     def leave(self, family: Family | None) -> None:
         """One use of a family is over."""
@@ -262,12 +263,14 @@ class Isolation:
             return self.train_bar(family, worker.kernel)
         if priority not in HIDDEN:
             return False
-        return self.hidden_bar(family, worker.kernel) is not None or self._train_waits(family, worker)
+        return self.hidden_bar(family, worker.kernel) is not None or self._train_waits(
+            priority, family, worker
+        )
 
-    def _train_waits(self, family: Family | None, worker: Worker) -> bool:
+    def _train_waits(self, priority: int, family: Family | None, worker: Worker) -> bool:
         """Whether related train jobs wait for workers like this one: hidden jobs do not get in their way."""
         assert family is not None
-        if related(worker.kernel.reversals, family):
+        if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):
             return False
         return any(
             not family.relatives.keys().isdisjoint(lane.waiting[TRAIN]) for lane in worker.profile.busy
@@ -688,6 +691,15 @@ class Isolation:
                     (kernel, [stay.lease for stay in stays if stay.lease is not None and stay.lease.live])
                 )
         return sorted(found, key=lambda each: len(each[1]))
+
+    def goes_first(self, lease: Lease) -> bool:
+        """Whether a hidden lease is on a kernel that is turned over to it."""
+        stay = lease.stay
+        return (
+            stay is not None
+            and lease.job.priority != EARLY_VALIDATION
+            and related(stay.kernel.reversals, stay.family) is not None
+        )
 
     def serving(self, lane: Lane) -> dict[Kernel, None]:
         """The kernels of the active workers that may serve a lane."""

@@ -41,6 +41,8 @@ evaluations `REFERENCE`'s, audits of what `HIDDEN` has `HIDDEN_AUDIT`'s."""
 N_PRIORITIES = 6
 RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUDIT))
 """Priorities that get fair shares of what those before them leave."""
+HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,), (AUDIT,))
+"""The same on a kernel that is turned over to hidden jobs (`precedence`)."""
 HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
 """What a policy does, or did, on hidden cases: never on a kernel with an agent who could learn of it (`isolation`)."""
 
@@ -159,6 +161,12 @@ class JobGroup:
     """Leases under which the bundle brought its slot down."""
     first_leased_at: float | None = None
     n_leased: int = 0
+    held_since: float | None = None
+    """Since when none of its episodes runs because hidden ones have its kernels; None while that is not so."""
+    held_s: float = 0.0
+    """How long that was before."""
+    held_counted_s: float = 0.0
+    """How much of it the submit's limit has been put off by."""
     closed: bool = False
     not_on: frozenset[str] = frozenset()
     """Workers that never get it."""
@@ -166,6 +174,10 @@ class JobGroup:
     """Machines whose workers never get it."""
     numerics: str | None = None
     """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
+
+    def held(self, now: float) -> float:
+        """Seconds for which none of its episodes ran because hidden ones had its kernels."""
+        return self.held_s + (0.0 if self.held_since is None else max(0.0, now - self.held_since))
 
     @property
     def hidden(self) -> bool:

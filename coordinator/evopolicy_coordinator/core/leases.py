@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from evopolicy_common.messages import worker as wire
 
+from . import precedence
 from .jobs import TRAIN, JobState, build
 from .retry import Mishap, decide
 
@@ -131,6 +132,7 @@ class LeaseBook:
         group.flow.n_leased += 1
         self.n_live += 1
         self._core.isolation.leased(lease, worker, serial)
+        precedence.let_go(self._core, group, now)
         self.list_hidden(lease, worker, turn)
         if group.first_leased_at is None:
             group.first_leased_at = now

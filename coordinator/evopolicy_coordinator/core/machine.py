@@ -14,7 +14,18 @@ from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
 from evopolicy_common.refusals import Refusal
 
-from . import audit, evaluations, events, finalisation, invariants, membership, permits, runs, status
+from . import (
+    audit,
+    evaluations,
+    events,
+    finalisation,
+    invariants,
+    membership,
+    permits,
+    precedence,
+    runs,
+    status,
+)
 from .effects import Effect
 from .evaluations import Ended, Evaluation
 from .isolation import Family, Isolation
@@ -62,6 +73,8 @@ class Core:
         self.evaluations: dict[str, Evaluation] = {}
         self.groups: dict[str, JobGroup] = {}
         self.jobs: dict[str, JobState] = {}
+        self.held: dict[JobGroup, None] = {}
+        """Submits that hidden jobs keep from all workers."""
         self.unpinned: dict[str, Flow] = {}
         self.adopting: dict[JobState, None] = {}
         """Jobs that may be running somewhere since before the core was loaded."""
@@ -191,6 +204,10 @@ class Core:
             lane = self.queue.lanes.get(cast(LaneKey, what))
             if lane is not None:
                 turn.dirty[lane] = None
+        elif kind == "hidden":
+            lane = self.queue.lanes.get(cast(LaneKey, what))
+            if lane is not None:
+                precedence.look(self, lane, turn)
         elif kind == "bench":
             worker = self.fleet.workers.get(str(what))
             if worker is not None:
@@ -217,7 +234,11 @@ class Core:
         group = self.groups.get(str(key[1]))
         if group is None:
             return
-        if turn.now < self.hold_until:
+        held_s = group.held(turn.now) - group.held_counted_s
+        if held_s > 0.0:
+            group.held_counted_s += held_s
+            self.timers.arm(key, turn.now + held_s)
+        elif turn.now < self.hold_until:
             self.timers.arm(key, self.hold_until)
         else:
             runs.timed_out(self, group, turn)
@@ -242,10 +263,10 @@ class Core:
         run = self.runs.get(group.run)
         return self.evaluations[group.run].row.secret if run is None else run.row.secret
 
-    def add_flow(self, name: str, env: str, tier: Tier, family: Family | None) -> Flow:
-        """A new flow for a run or an evaluation, not pinned to workers yet."""
+    def add_flow(self, name: str, env: str, tier: Tier, family: Family | None, *, closed: bool) -> Flow:
+        """A new flow for a run or an evaluation, not pinned to workers yet; `closed`: no agent is at work for it."""
         self._flows += 1
-        flow = Flow(name, env, tier, self._flows, family)
+        flow = Flow(name, env, tier, self._flows, family, closed=closed)
         self.unpinned[name] = flow
         return flow
 
@@ -300,6 +321,7 @@ class Core:
         for job in list(group.jobs.values()):
             self.close_job(job, turn, why)
         group.closed = True
+        precedence.let_go(self, group, turn.now)
         self.groups.pop(group.id, None)
         self.timers.disarm(("submit", group.id))
         self.chronicle.tell(turn.now, turn.stimulus_id, group.id, f"closed: {why}")

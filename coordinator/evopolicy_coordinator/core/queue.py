@@ -18,18 +18,20 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.worker import Fingerprint
 
-from .jobs import HIDDEN, N_PRIORITIES, RANKS, TRAIN, JobState
+from .jobs import HIDDEN, HIDDEN_FIRST, N_PRIORITIES, RANKS, TRAIN, JobState
 
 if TYPE_CHECKING:
-    from .isolation import Family
+    from .isolation import Family, Reversal
     from .leases import Lease
     from .workers import Worker
+
+T = TypeVar("T")
 
 LaneKey = tuple[str, Tier, str]
 """Environment, sandbox tier, fingerprint class."""
@@ -58,6 +60,8 @@ class Flow:
     """Order of creation: breaks ties."""
     family: Family | None = None
     """Those that share its hidden cases; None where it has none."""
+    closed: bool = False
+    """No agent is at work for it: its hidden jobs wait for agents so long and no longer (`precedence`)."""
     pin: str | None = None
     """Fingerprint class; None until there is a worker for it."""
     description: EnvironmentDescription | None = None
@@ -95,18 +99,22 @@ class Lane:
         default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
     )
     """Jobs that wait, suspects too, by priority and family."""
+    backlog: dict[Family, int] = field(default_factory=dict)
+    """Hidden ones of them that are of closed flows."""
+    kept_s: dict[Family, float] = field(default_factory=dict)
+    """How long such jobs were kept from all kernels, since there were last none."""
+    done_looks: dict[Family, int] = field(default_factory=dict)
+    reversals: dict[Family, Reversal] = field(default_factory=dict)
+    looked_at: float = 0.0
     profiles: dict[Profile, None] = field(default_factory=dict)
     stopping: int = 0
     """Hidden jobs that were stopped for this lane's sake and whose workers have not let go of them yet."""
 
-    def count(self, priority: int, family: Family | None, n: int) -> None:
-        """So many more jobs of a family wait."""
-        there = self.waiting[priority]
-        left = there.get(family, 0) + n
-        if left:
-            there[family] = left
-        else:
-            there.pop(family, None)
+    def count(self, priority: int, flow: Flow, n: int) -> None:
+        """So many more jobs of a flow wait."""
+        _add(self.waiting[priority], flow.family, n)
+        if flow.closed and priority in HIDDEN and flow.family is not None:
+            _add(self.backlog, flow.family, n)
 
     def waits_of(self, family: Family | None) -> bool:
         """Whether jobs wait of the family's relatives, or of any for None."""
@@ -202,7 +210,7 @@ class Queue:
         if old is not None:
             for priority in range(N_PRIORITIES):
                 old.n_ready[priority] -= flow.n_ready[priority]
-                old.count(priority, flow.family, -flow.n_ready[priority] - suspects.count(priority))
+                old.count(priority, flow, -flow.n_ready[priority] - suspects.count(priority))
             self._settle(old)
         key = (flow.env, flow.tier, pin)
         lane = self.lanes.get(key)
@@ -213,12 +221,23 @@ class Queue:
         flow.pin, flow.lane = pin, lane
         for priority in range(N_PRIORITIES):
             flow.in_heap[priority] = False
-            lane.count(priority, flow.family, flow.n_ready[priority] + suspects.count(priority))
+            lane.count(priority, flow, flow.n_ready[priority] + suspects.count(priority))
             if flow.n_ready[priority]:
                 lane.n_ready[priority] += flow.n_ready[priority]
                 self._enter(flow, lane, priority)
         self._settle(lane)
         return lane
+
+    def close(self, flow: Flow) -> None:
+        """A flow's agent is gone."""
+        waiting = {
+            priority: flow.n_ready[priority]
+            + sum(job.group.flow is flow and job.priority == priority for job in self.suspects)
+            for priority in HIDDEN
+        }
+        flow.closed = True
+        if flow.lane is not None and flow.family is not None:
+            _add(flow.lane.backlog, flow.family, sum(waiting.values()))
 
     def drop(self, flow: Flow) -> None:
         """Forget a flow that has nothing waiting any more."""
@@ -253,7 +272,7 @@ class Queue:
         job.ticket += 1
         job.queued = True
         if flow.lane is not None:
-            flow.lane.count(priority, flow.family, 1)
+            flow.lane.count(priority, flow, 1)
         if job.alone:
             self.suspects[job] = None
             return flow.lane
@@ -278,7 +297,7 @@ class Queue:
         job.queued = False
         job.ticket += 1
         if flow.lane is not None:
-            flow.lane.count(priority, flow.family, -1)
+            flow.lane.count(priority, flow, -1)
         if job.alone:
             self.suspects.pop(job, None)
             return
@@ -293,7 +312,7 @@ class Queue:
 
     def take(self, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
         """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
-        for rank in RANKS:
+        for rank in _ranks(worker):
             passed: list[tuple[Flow, int]] = []
             barred = 0
             job: JobState | None = None
@@ -321,7 +340,7 @@ class Queue:
 
     def leading(self, worker: Worker) -> tuple[Flow, int] | None:
         """The flow that goes first of what the worker may be leased, and at which priority; None when nothing waits."""
-        for rank in RANKS:
+        for rank in _ranks(worker):
             found = self._best(worker, rank, ())
             if found is not None:
                 return found
@@ -407,6 +426,18 @@ class Queue:
             if job is not None:
                 return job.group.template.bundle, job.group.template.env
         return None
+
+
+def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
+    return HIDDEN_FIRST if worker.kernel.reversals else RANKS
+
+
+def _add(counts: dict[T, int], key: T, n: int) -> None:
+    left = counts.get(key, 0) + n
+    if left:
+        counts[key] = left
+    else:
+        counts.pop(key, None)
 
 
 def _next(flow: Flow, priority: int) -> JobState:

@@ -114,6 +114,8 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     """Hidden validation mean; None until every validation case is done."""
     ineligible: str | None = None
     """Why the checkpoint cannot be selected, when it brought its slots down while hidden."""
+    held_s: float = 0.0
+    """Seconds for which none of its episodes ran because hidden ones had the machines."""
     refunded: bool = False
     """The run was cancelled while this submit was open: nothing is charged for it."""
 

@@ -58,8 +58,10 @@ class Run:
     """Worker to the run's episodes that it has played."""
     audits: dict[str, AuditRow] = field(default_factory=dict)
     """All that were drawn, by id."""
-    audits_until: float | None = None
-    """When the run, done otherwise, waits for its audits no more."""
+    audits_waited_s: float = 0.0
+    """How long the run, done otherwise, has waited for audits that could be played."""
+    audits_looked_at: float | None = None
+    """When that was last counted; None before."""
 
     @property
     def id(self) -> str:
@@ -128,7 +130,9 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
 def enter(core: Core, row: RunRow, state: RunStateRow) -> Run:
     """Take a run into the core, with its whole budget available."""
     family = core.isolation.families.join(row.settings.env, (*row.validation, *row.heldout))
-    flow = core.add_flow(row.run, row.settings.env, row.settings.sandbox_tier, family)
+    flow = core.add_flow(
+        row.run, row.settings.env, row.settings.sandbox_tier, family, closed=state.phase != "open"
+    )
     run = Run(row, state, Ledger(row.budget), flow)
     core.runs[row.run] = run
     core.run_keys[row.key] = row.run
@@ -184,7 +188,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
             allowed_imports=row.allowed_imports,
             denied_imports=row.denied_imports,
             simulation=settings.simulation,
-            state=run_state(core, run),
+            state=run_state(core, run, turn.now),
         ),
     )
 
@@ -207,7 +211,7 @@ def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> Non
         return
     run = _live(core, event.request, event.run, turn)
     if run is not None:
-        turn.reply(event.request, gateway.StateReply(state=run_state(core, run)))
+        turn.reply(event.request, gateway.StateReply(state=run_state(core, run, turn.now)))
 
 
 def last_state(row: RunStateRow) -> gateway.RunState:
@@ -220,7 +224,13 @@ def last_state(row: RunStateRow) -> gateway.RunState:
     )
 
 
-def run_state(core: Core, run: Run) -> gateway.RunState:
+def held_s(core: Core, run: Run, now: float) -> float:
+    """Seconds for which hidden jobs held a run's submits."""
+    group = None if run.open is None else core.groups.get(train_group(run.id, run.open))
+    return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held(now))
+
+
+def run_state(core: Core, run: Run, now: float) -> gateway.RunState:
     """What the gateway of an unfinished run is told of it."""
     in_flight = None
     if run.open is not None:
@@ -230,12 +240,14 @@ def run_state(core: Core, run: Run) -> gateway.RunState:
             n_episodes=group.n,
             n_done=group.done,
             waits_for=core.waits_for(group),
+            held_s=group.held(now),
         )
     return gateway.RunState(
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
         is_finalized=run.state.phase != "open",
         in_flight=in_flight,
+        held_s=held_s(core, run, now),
     )
 
 
@@ -442,6 +454,7 @@ def end(
         released=group.done if n_kept else 0,
         n_kept=n_kept,
         mean_return=group.mean_return() if status == "ok" else None,
+        held_s=group.held(turn.now),
     )
     started_at = group.first_leased_at or turn.now
     run.queue_s += max(0.0, started_at - row.accepted_at)
@@ -462,7 +475,7 @@ def results(core: Core, event: events.ResultsRequested, turn: Turn) -> None:
     run = core.runs.get(event.run)
     if run is None:
         if event.run in core.capabilities:
-            turn.add(_page(event.request, event.run, event.submit_index, event.cursor, None, "", turn))
+            turn.add(_page(event.request, event.run, event.submit_index, event.cursor, None, "", 0.0, turn))
         else:
             turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
         return
@@ -496,11 +509,19 @@ def answer(core: Core, run: Run, poll: Poll, turn: Turn) -> None:
     row = run.submits[index]
     waits_for = "" if row.status is not None else core.waits_for(core.groups[poll.target])
     upto = row.released if row.status is not None else _released(core, poll.target)
-    turn.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, turn))
+    held = held_s(core, run, turn.now)
+    turn.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, held, turn))
 
 
 def _page(
-    request: events.RequestId, run: str, index: int, cursor: int, upto: int | None, waits_for: str, turn: Turn
+    request: events.RequestId,
+    run: str,
+    index: int,
+    cursor: int,
+    upto: int | None,
+    waits_for: str,
+    held: float,
+    turn: Turn,
 ) -> ReadResults:
     return ReadResults(
         request=request,
@@ -509,6 +530,7 @@ def _page(
         cursor=max(0, cursor),
         upto=upto,
         waits_for=waits_for,
+        held_s=held,
         stimulus_id=turn.stimulus_id,
     )
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from evopolicy_common.messages import worker as wire
 
+from . import precedence
 from .events import LeaseRequested
 from .jobs import AUDIT, EARLY_VALIDATION, HELDOUT, HIDDEN_AUDIT, REFERENCE, TRAIN, JobState
 from .queue import Lane
@@ -210,7 +211,8 @@ class Scheduler:
         self._core.chronicle.tell(turn.now, turn.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
         if job.priority == TRAIN:
             for lease in list(worker.leases.values()):
-                if lease.live and lease.job.priority != TRAIN and self._may_stop(lease.job):
+                first = self._core.isolation.goes_first(lease)
+                if lease.live and lease.job.priority != TRAIN and not first and self._may_stop(lease.job):
                     self._stop_hidden(lease, worker, f"preempted for {job.job_id}", turn)
 
     def unreserve(self, job: JobState) -> None:
@@ -257,6 +259,8 @@ class Scheduler:
             lane = next(iter(turn.dirty))
             del turn.dirty[lane]
             self._feed(lane, turn)
+        for lane in fed:
+            precedence.watch(core, lane, turn)
         for name, stops in turn.stops.items():
             self._tell(name, tuple(stops), turn)
 
@@ -343,7 +347,9 @@ class Scheduler:
                     if wanted <= 0:
                         return
                     worker = core.fleet.workers[lease.worker]
-                    if lease.worker == avoided or not core.queue.may_train(lane, worker):
+                    if lease.worker == avoided or core.isolation.goes_first(lease):
+                        continue
+                    if not core.queue.may_train(lane, worker):
                         continue
                     if not self._may_stop(job):
                         del hidden[lease]

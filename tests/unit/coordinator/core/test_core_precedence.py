@@ -1,0 +1,319 @@
+"""Agents and hidden cases take turns on a kernel, and neither waits for ever."""
+
+from __future__ import annotations
+
+import pytest
+from audit_fleet import WAIT_S as AUDIT_WAIT_S
+from audit_fleet import Fleet
+from core_rig import Rig, split_of
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator.core import events
+
+HERE = "kernel-of-w1"
+WAIT_S = 60.0
+
+
+def closed(rig: Rig, session: str, run: str) -> None:
+    """A run with hidden cases to play, whose agent is gone."""
+    rig.create(run)
+    rig.submit(0, run=run)
+    rig.play(session, *rig.poll(session))
+    rig.close(run)
+
+
+def splits(leases: list[wire.Lease]) -> list[str]:
+    return sorted({split_of(lease.job) for lease in leases})
+
+
+def keep_alive(rig: Rig, session: str, seconds: float, *held: wire.Lease) -> None:
+    for _ in range(int(seconds / 2.0)):
+        rig.pass_time(2.0)
+        rig.beat(session, *held)
+
+
+def waiting(rig: Rig, session: str) -> None:
+    """A closed run `r0` whose hidden cases wait for the agent of `r1`, and have waited for long."""
+    closed(rig, session, "r0")
+    rig.create("r1", agent=HERE)
+    rig.play(session, *rig.poll(session, 8))  # the random reference
+    keep_alive(rig, session, WAIT_S + 4.0)
+
+
+def test_hidden_cases_that_waited_for_long_keep_new_agents_away_and_let_those_at_work_end() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    waiting(rig, session)
+    rig.create("r2", agent=None)
+    assert not rig.permit("r2", HERE).granted
+    assert rig.permit("r2", "another").granted
+    # The agent that is there goes on to its end.
+    rig.submit(0, run="r1")
+    (train,) = rig.poll(session, 8)
+    assert split_of(train.job) == "train"
+    rig.play(session, train)
+    rig.close("r1")
+    hidden = rig.poll(session, 32)
+    assert splits(hidden) == ["random", "validation"]
+
+
+def test_the_order_is_turned_back_when_nothing_hidden_is_left() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    waiting(rig, session)
+    rig.create("r2", agent=None)
+    assert rig.permit("r2", HERE, wait_s=30.0) is None
+    request = rig._requests
+    rig.close("r1")
+    rig.work_off(session)
+    assert rig.finished("r0").status == "completed"
+    keep_alive(rig, session, 6.0)
+    assert rig.replies[request].granted
+
+
+def test_before_that_a_new_agent_stops_hidden_cases_as_often_as_it_takes() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    closed(rig, session, "r0")
+    rig.play(session, *[lease for lease in rig.poll(session, 8) if split_of(lease.job) == "random"])
+    for number in range(1, 8):
+        run = f"r{number}"
+        rig.create(run, agent=None)
+        held = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if lease.live]
+        assert held
+        assert not rig.permit(run, HERE).granted
+        for lease in held:
+            rig.hand_in(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip
+        assert rig.permit(run, HERE).granted
+        rig.close(run)
+        rig.poll(session, 8)
+    assert rig.core.runs["r0"].state.infrastructure_retries == 0
+
+
+def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
+    rig = Rig(hidden_wait_s=20.0)
+    session = rig.register(slots=1)
+    rig.create("r1", agent="remote", budget=64, train=64, most=64)
+    closed(rig, session, "r0")
+    rig.submit(*range(60), run="r1")
+    story: list[str] = []
+    for _ in range(200):
+        leases = rig.poll(session, 1)
+        keep_alive(rig, session, 4.0, *leases)
+        rig.play(session, *leases)
+        story += [split_of(lease.job) for lease in leases]
+        if "r0" not in rig.core.runs:
+            break
+    hidden = [place for place, split in enumerate(story) if split in ("validation", "heldout")]
+    assert len(hidden) == 5
+    assert 20.0 <= 4.0 * hidden[0] <= 20.0 + 4 * 4.0  # after their wait, and what ran then
+    assert hidden == list(range(hidden[0], hidden[0] + 5))  # and then to their end
+    assert story[-1] == "random" or rig.finished("r0").status == "completed"
+
+
+def test_submits_that_wait_for_hidden_cases_say_so() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    closed(rig, session, "r0")
+    rig.create("r1", agent="remote")
+    rig.play(session, *rig.poll(session, 1))
+    rig.core.queue.lanes[next(iter(rig.core.queue.lanes))].kept_s[rig.core.runs["r0"].family] = WAIT_S
+    # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
+    rig.submit(0, 1, run="r1")
+    (train,) = rig.poll(session, 1)
+    while split_of(train.job) != "train":
+        rig.play(session, train)
+        (train,) = rig.poll(session, 1)
+    keep_alive(rig, session, 4.0, train)
+    rig.play(session, train)
+    (hidden,) = rig.poll(session, 1)
+    assert split_of(hidden.job) == "validation"
+    keep_alive(rig, session, 10.0, hidden)
+    state = rig.tell(events.StateRequested(request=rig.request(), run="r1")).state
+    assert state.in_flight.waits_for == "hidden cases of another run are being scored"
+    assert 7.0 <= state.in_flight.held_s <= 11.0
+    assert state.held_s == state.in_flight.held_s
+    page = rig.results(run="r1", cursor=1)
+    assert page.held_s == state.held_s
+    while (leases := rig.poll(session, 1)) or rig.core.fleet.workers["w1"].leases:
+        rig.play(session, *(leases or [hidden]))
+        keep_alive(rig, session, 2.0)
+    assert rig.core.runs["r1"].submits[0].status == "ok"
+    held_s = rig.core.runs["r1"].submits[0].held_s
+    assert held_s >= 7.0
+    rig.load()
+    rig.register(slots=1)
+    assert rig.tell(events.StateRequested(request=rig.request(), run="r1")).state.held_s == held_s
+
+
+def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
+    closed(rig, session, "r0")
+    rig.play(session, *rig.poll(session, 1))
+    lane = next(iter(rig.core.queue.lanes.values()))
+    rig.submit(0, 1, run="r1")
+    (train,) = rig.poll(session, 1)
+    while split_of(train.job) != "train":
+        rig.play(session, train)
+        (train,) = rig.poll(session, 1)
+    lane.kept_s[rig.core.runs["r0"].family] = WAIT_S
+    keep_alive(rig, session, 4.0, train)
+    rig.play(session, train)
+    (hidden,) = rig.poll(session, 1)
+    assert split_of(hidden.job) == "validation"
+    keep_alive(rig, session, 30.0, hidden)  # longer than the limit
+    assert rig.core.runs["r1"].submits[0].status is None
+    rig.play(session, hidden)
+    for _ in range(20):
+        leases = rig.poll(session, 1)
+        if leases and split_of(leases[0].job) == "train":
+            break
+        rig.play(session, *leases)
+        keep_alive(rig, session, 2.0)
+    keep_alive(rig, session, 20.0, *leases)
+    assert rig.core.runs["r1"].submits[0].status == "rollout_timeout"
+
+
+def test_early_validation_never_keeps_an_agent_away() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    rig.create("r0", agent=HERE)
+    rig.submit(0, run="r0")
+    rig.play(session, *rig.poll(session))
+    keep_alive(rig, session, 3 * WAIT_S)
+    rig.create("r1", agent=None)
+    assert rig.permit("r1", HERE).granted
+    assert not rig.core.isolation.kernel(HERE).reversals
+
+
+@pytest.mark.parametrize("why", ["draining", "lost"])
+def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    waiting(rig, session)
+    assert rig.core.isolation.kernel(HERE).reversals
+    if why == "draining":
+        rig.tell(events.WorkerStateSet(request=rig.request(), worker="w1", state="draining"))
+        keep_alive(rig, session, 4.0)
+    else:
+        rig.pass_time(20.0)
+    rig.create("r2", agent=None)
+    assert rig.permit("r2", HERE).granted
+
+
+def test_of_several_kernels_the_one_with_the_fewest_related_agents_is_turned_over() -> None:
+    rig = Rig()
+    sessions = [rig.register(name, slots=8) for name in ("w1", "w2")]
+    closed(rig, sessions[0], "r0")
+    for number, where in enumerate((HERE, HERE, "kernel-of-w2"), 1):
+        rig.create(f"r{number}", agent=where)
+    for session in sessions:
+        rig.play(session, *rig.poll(session, 8))
+    for _ in range(40):
+        rig.pass_time(2.0)
+        for session in sessions:
+            rig.beat(session)
+    turned = [name for name, kernel in rig.core.isolation.kernels.items() if kernel.reversals]
+    assert turned == ["kernel-of-w2"]
+
+
+def test_hidden_cases_of_a_closed_run_go_before_train_jobs_of_others_on_their_kernel() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    waiting(rig, session)
+    rig.create("r2", agent="remote", hidden_from=9000)
+    rig.submit(0, 1, run="r2")
+    rig.close("r1")
+    assert splits(rig.poll(session, 1)) == ["validation"]
+
+
+def test_the_audits_clock_stands_still_while_their_kernels_are_barred() -> None:
+    fleet = Fleet(w1=0.0, w2=0.0)
+    fleet.rig.settings = fleet.rig.core.settings = type(fleet.rig.settings)(
+        audit_share=1.0, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=1e9
+    )
+    rig = fleet.rig
+    fleet.train(0, run="r0")
+    while fleet.turn("w1"):
+        pass
+    rig.close("r0")
+    while fleet.turn("w1"):
+        pass
+    for number, name in enumerate(fleet.sessions):
+        rig.create(f"a{number}", agent=f"kernel-of-{name}")
+    fleet.work_off()
+    _beat_all(rig, fleet.sessions, 3 * AUDIT_WAIT_S)
+    assert "r0" in rig.core.runs
+    for number in range(2):
+        rig.close(f"a{number}")
+    _beat_all(rig, fleet.sessions, AUDIT_WAIT_S + 10.0)  # nobody plays them
+    assert "r0" not in rig.core.runs
+    assert rig.finished("r0").audit is not None
+
+
+def _beat_all(rig: Rig, sessions: dict[str, str], seconds: float) -> None:
+    for _ in range(int(seconds / 2.0)):
+        rig.pass_time(2.0)
+        for session in sessions.values():
+            rig.beat(session)
+
+
+def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
+    rig = Rig(hidden_wait_s=10.0)
+    session = rig.register(slots=1)
+    runs = [f"r{number}" for number in range(8)]
+    pending, alive, left = list(runs), [], {}
+    for _ in range(3000):
+        for run in list(pending):
+            if len(alive) == 4:
+                break
+            if run not in rig.core.runs:
+                rig.create(run, agent=None)
+            if not rig.permit(run, HERE).granted:
+                break
+            pending.remove(run)
+            alive.append(run)
+            left[run] = 3
+        for run in list(alive):
+            if rig.core.runs[run].open is not None:
+                continue
+            if left[run]:
+                left[run] -= 1
+                rig.submit(0, 1, run=run, key=f"k{left[run]}")
+            else:
+                rig.close(run)
+                alive.remove(run)
+        leases = rig.poll(session, 1)
+        rig.pass_time(1.0)
+        rig.beat(session, *leases)
+        rig.play(session, *leases)
+        stopped = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if not lease.live]
+        assert not stopped, "one at a time: nothing is stopped that is not handed in"
+        if not rig.core.runs and not pending:
+            break
+    assert [rig.finished(run).status for run in runs] == ["completed"] * 8
+    assert {rig.finished(run).hidden_isolation for run in runs} == {"exclusive"}
+
+
+def test_a_train_job_and_hidden_ones_of_related_runs_never_share_a_kernel() -> None:
+    rig = Rig()
+    first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
+    closed(rig, first, "r0")
+    rig.play(first, *[lease for lease in rig.poll(first, 8) if split_of(lease.job) == "random"])
+    hidden = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if lease.live]
+    assert hidden
+    rig.create("r1", agent="remote")
+    rig.submit(0, 1, run="r1")
+    assert "train" not in splits(rig.poll(second, 4))
+    told = rig.beat(first)
+    assert told is not None
+    assert not [lease for lease in hidden if lease.live], "they are stopped for it"
+    rig.beat(first)
+    train = rig.poll(second, 4)
+    assert "train" in splits(train)
+    assert "validation" not in splits([*train, *rig.poll(first, 4)])
+    rig.play(second, *train)
+    assert splits(rig.poll(first, 4)) == ["validation"]
