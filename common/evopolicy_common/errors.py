@@ -65,5 +65,9 @@ class SlotDiedError(WorkerError):
     """A slot's processes were ended from outside while its supervisor lives."""
 
 
+class PartFailedError(EvopolicyError):
+    """A part of a process met what it does not know how to go on from: the process ends with this, to be started again."""
+
+
 class StorageError(EvopolicyError):
     """The store could not persist or read back; what was not persisted did not happen."""

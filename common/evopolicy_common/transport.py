@@ -25,12 +25,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import structlog
 import zenoh
 
 from evopolicy_common import keys
 from evopolicy_common.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
 from evopolicy_common.errors import TransportError
 from evopolicy_common.notices import told_if_slow
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8
@@ -463,10 +466,16 @@ def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None],
 def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]) -> None:
     while (item := lane.get()) is not None:
         query, key, payload = item
-        # The answer is sent as the question was: blocking, never dropped. The asker may be gone: it asks again if not.
-        with contextlib.suppress(zenoh.ZError):
+        try:
+            # The answer is sent as the question was: blocking, never dropped.
             query.reply(key, payload)
-        query.drop()  # type: ignore[no-untyped-call]
+        except zenoh.ZError:
+            pass  # the asker may be gone: it asks again if not
+        except Exception:
+            # Whatever is wrong with one answer, those behind it are sent.
+            log.exception("an answer cannot be sent", key=key)
+        with contextlib.suppress(Exception):
+            query.drop()  # type: ignore[no-untyped-call]
         del query, item
 
 

@@ -52,7 +52,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     """Serves until `stop` is set, then makes all durable and returns.
 
     Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
-    TransportError when an endpoint cannot be listened on.
+    TransportError when an endpoint cannot be listened on, PartFailedError when a part of it cannot go on.
     """
     with contextlib.ExitStack() as opened:
         state = StateFolder.open(options.state, options.cluster)
@@ -115,12 +115,25 @@ async def _serve(
                     state=str(state.root),
                 )
             )
-            await stop.wait()
+            await _until(stop, service)
             log.info("stopping")
         finally:
             credentials.withdraw(endpoints)
             # While the sessions are still open: what was handled is answered, everyone else is let go.
             await service.stop()
+
+
+async def _until(stop: asyncio.Event, service: Service) -> None:
+    """Waits for `stop`; PartFailedError as soon as the service cannot go on."""
+    waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.failure())]
+    try:
+        done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
 
 
 def _listen(

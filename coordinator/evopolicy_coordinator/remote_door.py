@@ -70,8 +70,8 @@ async def _keep(
     opened: asyncio.Future[None],
 ) -> None:
     while True:
-        seen = machines.stamp()
         try:
+            seen = machines.stamp()
             tls = machines.tls
             if tls is None:
                 raise ConfigError(

@@ -8,6 +8,8 @@ Rules that this module owns:
 - When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
   the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
   are asked again.
+- What the service does not know how to go on from (a store that cannot be loaded for another reason, a failure in its own
+  machinery) ends the process with the reason: whoever keeps it up starts it again, on what is on disk. See `failure`.
 - `now` is Unix time at the start, and not before what is on disk, advanced by the monotonic clock: a wall clock that is
   set changes nothing.
 """
@@ -25,7 +27,7 @@ import msgspec
 import structlog
 
 from evopolicy_common import bundles
-from evopolicy_common.errors import ProtocolError, RefusedError, StorageError
+from evopolicy_common.errors import PartFailedError, ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
 from evopolicy_common.refusals import Refusal
@@ -92,6 +94,7 @@ class Service:
         self._reload_pause_s = _FIRST_PAUSE_S
         self._storage_error = ""
         self._stopping = False
+        self._failed: asyncio.Future[None] = self._loop.create_future()
         self._unix_offset = time.time() - self._loop.time()
         self._started_at = self.now()
         self._watchdog: LoopWatchdog | None = None
@@ -99,8 +102,14 @@ class Service:
         self.n_events = 0
 
     async def start(self) -> None:
-        """Loads the core from the store; StorageError when that cannot be read or counted up."""
-        await self._load()
+        """Loads the core from the store. StorageError when that cannot be read or counted up; PartFailedError when it can be
+        read and no core comes of it."""
+        try:
+            await self._load()
+        except StorageError:
+            raise
+        except Exception as error:
+            raise self._fail("loading the state", error) from error
         self._watchdog = LoopWatchdog()
         self._sweep()
 
@@ -127,6 +136,20 @@ class Service:
         if self._watchdog is not None:
             self._watchdog.close()
 
+    async def failure(self) -> None:
+        """Waits for ever, but for a part of the service that cannot go on: PartFailedError with the reason then."""
+        await asyncio.shield(self._failed)
+
+    def _fail(self, part: str, error: BaseException) -> PartFailedError:
+        """Serves nothing more: the process is to end. What is on disk stays, and is where the next one begins."""
+        log.error("a part of the coordinator cannot go on", part=part, exc_info=error)
+        failed = PartFailedError(f"{part} failed: {type(error).__name__}: {error}")
+        if not self._failed.done():
+            self._failed.set_exception(failed)
+            self._failed.exception()  # seen: nobody may wait for it, as at the start
+        self._forget_core()
+        return failed
+
     def now(self) -> float:
         """Unix time that never goes back, seconds."""
         return self._unix_offset + self._loop.time()
@@ -136,7 +159,11 @@ class Service:
     def on_queries(self, batch: list[IncomingQuery]) -> None:
         """Handles one tick's queries."""
         for query in batch:
-            self._receive(query)
+            try:
+                self._receive(query)
+            except Exception:
+                log.exception("request failed", key=query.key)
+                query.drop()
         self._flush()
 
     def on_liveliness(self, key: str, alive: bool) -> None:
@@ -200,7 +227,13 @@ class Service:
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = self._loop.create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            log.error("request failed", exc_info=error)
 
     async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
         """For requests whose event is made from files."""
@@ -344,9 +377,12 @@ class Service:
         outbox.put(effects)
 
     def _flush(self) -> None:
-        if self._outbox is not None:
-            self._outbox.flush()
-        self._set_timer()
+        try:
+            if self._outbox is not None:
+                self._outbox.flush()
+            self._set_timer()
+        except Exception as error:
+            self._fail("the outbox", error)
 
     def _set_timer(self) -> None:
         deadline = None if self._core is None or self._stopping else self._core.next_deadline()
@@ -369,9 +405,8 @@ class Service:
 
     def _on_timer(self) -> None:
         self._timer = None
-        deadline = None if self._core is None else self._core.next_deadline()
-        if deadline is not None and self.now() >= deadline:
-            self._advance(lambda core: core.handle_deadline(self.now()))
+        # Too early it does nothing, and is set anew.
+        self._advance(lambda core: core.handle_deadline(self.now()) if _is_due(core, self.now()) else [])
         self._flush()
 
     async def _load(self) -> None:
@@ -380,29 +415,35 @@ class Service:
         # A clock that was set back while no coordinator ran must not make anything end before it began.
         self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self._core, effects = Core.load(self._settings, snapshot, self.now())
-        self._outbox = Outbox(self._writer, self._carry_out, self._on_storage_failure)
+        self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
         self._outbox.put(effects)
         self._storage_error = ""
         log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))
         self._flush()
 
-    def _on_storage_failure(self, error: StorageError) -> None:
+    def _on_write_failure(self, error: BaseException) -> None:
+        if not isinstance(error, StorageError):
+            self._fail("writing the store", error)
+            return
         self._storage_error = str(error)
         self._drop_core()
         log.error("the store refused to write; nothing is taken until it does", error=str(error))
 
     def _drop_core(self) -> None:
         """Forgets all that is not on disk, and begins to load what is."""
+        if self._outbox is not None and self._outbox.commits:
+            self._reload_pause_s = _FIRST_PAUSE_S
+        self._forget_core()
+        if not self._stopping:
+            self._spawn(self._reload())
+
+    def _forget_core(self) -> None:
         if self._outbox is not None:
-            if self._outbox.commits:
-                self._reload_pause_s = _FIRST_PAUSE_S
             self._outbox.discard()
         self._core = None
         self._outbox = None
         self._cancel_timer()
         self._pending.let_go()
-        if not self._stopping:
-            self._spawn(self._reload())
 
     async def _reload(self) -> None:
         while True:
@@ -413,6 +454,9 @@ class Service:
             except StorageError as error:
                 log.error("the store still refuses", error=str(error))
                 self._storage_error = str(error)
+            except Exception as error:
+                self._fail("loading the state", error)
+                return
             else:
                 log.info("the store writes again")
                 return
@@ -420,6 +464,13 @@ class Service:
     # Effects out.
 
     def _carry_out(self, effect: Effect) -> None:
+        try:
+            self._carried_out(effect)
+        except Exception:
+            # Of one asker, who asks again; those behind it are answered.
+            log.exception("cannot carry out", effect=type(effect).__name__)
+
+    def _carried_out(self, effect: Effect) -> None:
         if isinstance(effect, Reply):
             pending = self._pending.take(effect.request)
             if pending is not None:
@@ -451,9 +502,9 @@ class Service:
 
     def _sweep(self) -> None:
         """Lets go of queries that nobody waits for any more: those of lost workers are never answered."""
+        self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
         self._pending.let_go(_FORGET_S)
         self._tell_stalls()
-        self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
 
     def _tell_stalls(self) -> None:
         """Names in the log what waits longer than it should, as `evopolicy status` does."""
@@ -470,6 +521,11 @@ class Service:
             f"{len(self._pending)} requests wait for the disk: it has been writing for {writing_s:.0f} s",
             *of_core,
         )
+
+
+def _is_due(core: Core, now: float) -> bool:
+    deadline = core.next_deadline()
+    return deadline is not None and now >= deadline
 
 
 def _check_session(core: Core, name: str, session: str) -> Worker:

@@ -55,6 +55,13 @@ class LoopWatchdog:
             beat = self._beat
             if time.monotonic() - beat > self._gap_s + _BEAT_S and told != beat:
                 told = beat
-                frame = sys._current_frames().get(self._loop_thread)
-                stack = "".join(traceback.format_stack(frame, limit=12)) if frame is not None else ""
-                log.warning("the event loop stands still", stack=stack)
+                log.warning("the event loop stands still", stack=self._stack())
+
+    def _stack(self) -> str:
+        """Where the loop's thread is; empty where it moves on too fast to tell."""
+        try:
+            frame = sys._current_frames().get(self._loop_thread)
+            return "" if frame is None else "".join(traceback.format_stack(frame, limit=12))
+        except Exception:
+            # Frames and source lines are read while they change. To watch on matters more.
+            return ""

@@ -4,6 +4,7 @@ Rules that this module owns:
 - Work is done in the order in which it was given; its outcome is told on the event loop, in that order too.
 - Group commit: `Outbox` hands over everything that waits as one transaction, and meanwhile collects the next.
 - Effects leave the outbox in the order in which they came in, none before every `Persist` ahead of it is durable.
+- Any exception of the work is told like its outcome: the thread never ends before it is closed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from evopolicy_common.errors import StorageError
 from evopolicy_coordinator.core.effects import Effect, Persist
 from evopolicy_coordinator.core.records import Row
 from evopolicy_coordinator.store import Store
@@ -31,7 +31,10 @@ class _Work(Generic[T]):
     __slots__ = ("do", "failed", "succeeded")
 
     def __init__(
-        self, do: Callable[[Store], T], succeeded: Callable[[T], None], failed: Callable[[StorageError], None]
+        self,
+        do: Callable[[Store], T],
+        succeeded: Callable[[T], None],
+        failed: Callable[[BaseException], None],
     ) -> None:
         self.do = do
         self.succeeded = succeeded
@@ -41,7 +44,7 @@ class _Work(Generic[T]):
         """Does it; returns what is to be called on the event loop."""
         try:
             value = self.do(store)
-        except StorageError as error:
+        except BaseException as error:
             caught = error
             return lambda: self.failed(caught)
         return lambda: self.succeeded(value)
@@ -58,20 +61,23 @@ class Writer:
         self._thread.start()
 
     def submit(
-        self, do: Callable[[Store], T], succeeded: Callable[[T], None], failed: Callable[[StorageError], None]
+        self,
+        do: Callable[[Store], T],
+        succeeded: Callable[[T], None],
+        failed: Callable[[BaseException], None],
     ) -> None:
         """Does `do(store)` after all that was submitted before, then calls back on the event loop."""
         self._work.put(_Work(do, succeeded, failed))  # type: ignore[arg-type]
 
     async def call(self, do: Callable[[Store], T]) -> T:
-        """`do(store)` after all that was submitted before; raises its StorageError."""
+        """`do(store)` after all that was submitted before; raises what it raises."""
         future: asyncio.Future[T] = self._loop.create_future()
 
         def settle(value: T) -> None:
             if not future.done():
                 future.set_result(value)
 
-        def fail(error: StorageError) -> None:
+        def fail(error: BaseException) -> None:
             if not future.done():
                 future.set_exception(error)
 
@@ -98,9 +104,12 @@ class Outbox:
         self,
         writer: Writer,
         carry_out: Callable[[Effect], None],
-        on_failure: Callable[[StorageError], None],
+        on_failure: Callable[[BaseException], None],
     ) -> None:
-        """`carry_out` is given every effect but `Persist`; `on_failure` is called once, and then the outbox is dead."""
+        """`carry_out` is given every effect but `Persist`; `on_failure` is called once, and then the outbox is dead.
+
+        It is told a StorageError when the store refuses, anything else for a bug.
+        """
         self._writer = writer
         self._carry_out = carry_out
         self._on_failure = on_failure
@@ -159,7 +168,7 @@ class Outbox:
         self._n_in_flight = 0
         self.flush()
 
-    def _failed(self, error: StorageError) -> None:
+    def _failed(self, error: BaseException) -> None:
         if not self._dead:
             self.discard()
             self._on_failure(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -74,13 +75,15 @@ class HeartbeatThread:
         worker: str,
         held: HeldLeases,
         on_reply: Callable[[HeartbeatReply | Refused], None],
+        on_failure: Callable[[BaseException], None],
     ) -> None:
-        """`on_reply` is called on the event loop that makes this object."""
+        """Both are called on the event loop that makes this object; `on_failure` when no more beats can be sent."""
         self._link = link
         self._key = keys.worker_key(cluster, "beat")
         self._worker = worker
         self._held = held
         self._on_reply = on_reply
+        self._on_failure = on_failure
         self._loop = asyncio.get_running_loop()
         self._session = ""
         self._every_s = 1.0
@@ -104,6 +107,13 @@ class HeartbeatThread:
         self._stop.set()
 
     def _run(self) -> None:
+        try:
+            self._beat_until_stopped()
+        except Exception as error:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the worker is on its way out
+                self._loop.call_soon_threadsafe(self._on_failure, error)
+
+    def _beat_until_stopped(self) -> None:
         last_sent = time.monotonic()
         pause = self._every_s
         while not self._stop.wait(pause):

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import os
 import select
+import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -174,7 +176,18 @@ class Monitor(threading.Thread):
         os.eventfd_write(self._wake, 1)
 
     def run(self) -> None:
-        """The thread: judges the watched policy and hears commands, until the process ends."""
+        """The thread: judges the watched policy and hears commands, until the process ends.
+
+        Ends the process where it fails itself: a policy that nobody watches has no limits, a slot that hears nothing hangs.
+        """
+        try:
+            self._watch_on()
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+
+    def _watch_on(self) -> None:
         pause_s = 0.0
         while True:
             with self._lock:

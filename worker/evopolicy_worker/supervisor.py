@@ -24,7 +24,13 @@ import msgspec
 import structlog
 
 from evopolicy_common import codec, keys
-from evopolicy_common.errors import EvopolicyError, RefusedError, SlotDiedError, TransportError
+from evopolicy_common.errors import (
+    EvopolicyError,
+    PartFailedError,
+    RefusedError,
+    SlotDiedError,
+    TransportError,
+)
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
@@ -102,7 +108,15 @@ class Supervisor:
             link, lambda verb: keys.worker_key(cluster, verb), codec.worker_replies
         )
         self._held = HeldLeases()
-        self._heartbeat = HeartbeatThread(link, cluster, options.name, self._held, self._on_heartbeat_reply)
+        self._failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._heartbeat = HeartbeatThread(
+            link,
+            cluster,
+            options.name,
+            self._held,
+            self._on_heartbeat_reply,
+            lambda error: self._fail("the heartbeat", error),
+        )
         self._bundles = BundleCache(options.scratch / "bundles", self._fetch_bundle)
         self._queue: OrderedDict[str, Lease] = OrderedDict()
         self._work_arrived = asyncio.Event()
@@ -122,20 +136,43 @@ class Supervisor:
         self.jobs_done = 0
 
     async def run(self) -> None:
-        """Works until drained. Raises RefusedError when the coordinator will not have this worker."""
+        """Works until drained.
+
+        Raises RefusedError when the coordinator will not have this worker, PartFailedError when a part of it cannot go on: a
+        worker that beats no more, or hands nothing in, only holds up what others could play.
+        """
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
         # The hand-in task outlives the others: what was played is handed in before the worker goes.
         hand_in = asyncio.create_task(self._outbox.run())
+        hand_in.add_done_callback(self._hand_in_ended)
+        working = asyncio.create_task(self._work_and_hand_in())
         try:
-            await self._work()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
+            await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
+            if self._failed.done():
+                self._failed.result()
+            await working
         finally:
             self._heartbeat.stop()
-            hand_in.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await hand_in
+            for task in (working, hand_in):
+                task.cancel()
+            await asyncio.gather(working, hand_in, return_exceptions=True)
+            self._failed.cancel()
+
+    async def _work_and_hand_in(self) -> None:
+        await self._work()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
+
+    def _hand_in_ended(self, task: asyncio.Task[None]) -> None:
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._fail("handing in", error)
+
+    def _fail(self, part: str, error: BaseException) -> None:
+        log.error("a part of the worker cannot go on", part=part, exc_info=error)
+        if not self._failed.done():
+            self._failed.set_exception(PartFailedError(f"{part} failed: {type(error).__name__}: {error}"))
 
     async def _work(self) -> None:
         """Leases and plays until drained; what runs here is worth nothing any more once the coordinator refuses us."""

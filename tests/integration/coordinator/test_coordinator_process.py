@@ -8,6 +8,7 @@ import json
 import os
 import resource
 import signal
+import sqlite3
 import stat
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from coordinator_harness import PATIENCE_S, Coordinator, bundle_of, gateway_of, 
 
 from evopolicy_common import credentials
 from evopolicy_common.errors import RefusedError
+from evopolicy_coordinator.core.records import RunRow
 
 
 def run(scenario: Callable[[], Awaitable[None]]) -> None:
@@ -58,6 +60,25 @@ def test_ready_file_tells_where_to_connect_and_goes_with_the_process(coordinator
     assert "workers join with: evopolicy-worker" in coordinator.log.read_text()
     assert coordinator.stop() == 0
     assert not coordinator.ready_file.exists()
+
+
+def test_a_state_of_which_no_core_comes_ends_the_process_with_the_reason(coordinator: Coordinator) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create()
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("policy"), (0, 1), "k")
+
+    run(scenario)
+    assert coordinator.stop() == 0
+    with contextlib.closing(sqlite3.connect(coordinator.state / "coordinator.sqlite")) as database:
+        ((data,),) = database.execute("SELECT data FROM runs")
+        row = msgspec.structs.replace(msgspec.msgpack.decode(data, type=RunRow), budget=1)
+        database.execute("UPDATE runs SET data = ?", (msgspec.msgpack.encode(row),))
+        database.commit()
+    ended = command("--state", coordinator.state)
+    assert ended.returncode == 1
+    assert "error: loading the state failed: InvariantError: cannot reserve 2" in ended.stderr
 
 
 def test_everything_in_the_state_folder_is_private(coordinator: Coordinator) -> None:

@@ -27,7 +27,7 @@ from coordinator_harness import (
 )
 
 from evopolicy_common.blobs import digest_of
-from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.requests import Requester
 from evopolicy_common.transport import connect
@@ -448,3 +448,32 @@ def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
         assert finished.infrastructure_retries == 0
 
     run(scenario)
+
+
+@pytest.mark.parametrize(
+    ("broken", "part"),
+    [
+        ("evopolicy_common.transport.Link.ask_blocking", "the heartbeat"),
+        ("evopolicy_worker.outbox.Outbox._batch", "handing in"),
+    ],
+)
+def test_a_worker_of_which_a_part_cannot_go_on_ends_with_the_reason(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, part: str
+) -> None:
+    """Alive, it would lose its leases one after another, or keep what it played, for ever."""
+
+    def bug(*_: object, **__: object) -> object:
+        raise LookupError("a bug")
+
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create(n_validation=1, n_heldout=1)
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("policy"), (0, 1), "k")
+                async with supervising(coordinator, tmp_path) as worker:
+                    while not worker._failed.done():
+                        await asyncio.sleep(0.02)
+
+    monkeypatch.setattr(broken, bug)
+    with pytest.raises(PartFailedError, match=f"{part} failed: LookupError: a bug"):
+        run(scenario)

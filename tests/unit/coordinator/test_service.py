@@ -15,9 +15,10 @@ from service_world import Asked, World, play, register
 from structlog.testing import capture_logs
 
 from evopolicy_common import keys
+from evopolicy_common.errors import PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_coordinator import service
+from evopolicy_coordinator import process, service
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
 
@@ -221,5 +222,116 @@ def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease
         world.ask(Asked(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
         assert await stale.message() == worker.Leases(leases=())
         assert len((await fresh.message()).leases) == 1
+
+    play(tmp_path, scenario)
+
+
+async def failed(world: World) -> str:
+    """Why the service cannot go on."""
+    with pytest.raises(PartFailedError) as error:
+        await asyncio.wait_for(world.service.failure(), 20)
+    return str(error.value)
+
+
+def test_a_state_that_cannot_be_loaded_again_ends_the_service_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+
+        def broken(*_: Any) -> Any:
+            raise KeyError("a row that is not there")
+
+        monkeypatch.setattr(Core, "load", broken)
+        world.full = True
+        world.ask(world.submit(created, "key"))
+        assert await failed(world) == "loading the state failed: KeyError: 'a row that is not there'"
+        # Who asks meanwhile hears at once, and asks again.
+        asked = world.state(created)
+        world.ask(asked)
+        assert await asked.message() is None
+
+    play(tmp_path, scenario)
+
+
+def test_a_state_that_cannot_be_loaded_at_the_start_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> Any:
+        raise KeyError("a row that is not there")
+
+    async def scenario(world: World) -> None:
+        raise AssertionError("it must not start")
+
+    monkeypatch.setattr(Core, "load", broken)
+    with pytest.raises(PartFailedError, match="loading the state failed: KeyError"):
+        play(tmp_path, scenario)
+
+
+def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        waiting = asyncio.create_task(process._until(asyncio.Event(), world.service))
+        await asyncio.sleep(0)
+        world.service._fail("a test", RuntimeError("why"))
+        with pytest.raises(PartFailedError, match="a test failed: RuntimeError: why"):
+            await asyncio.wait_for(waiting, 20)
+
+    async def stopped(world: World) -> None:
+        stop = asyncio.Event()
+        stop.set()
+        await asyncio.wait_for(process._until(stop, world.service), 20)
+
+    play(tmp_path, scenario)
+    play(tmp_path, stopped)
+
+
+def test_a_bug_in_the_writers_thread_ends_the_service_with_the_reason(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+
+        def broken(rows: Any) -> None:
+            raise TypeError("no such row")
+
+        world.store.write = broken  # type: ignore[method-assign]
+        asked = world.submit(created, "key")
+        world.ask(asked)
+        assert await failed(world) == "writing the store failed: TypeError: no such row"
+        assert await asked.message() is None
+
+    play(tmp_path, scenario)
+
+
+def test_a_timer_that_cannot_be_set_ends_the_service_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+
+        def broken(self: Core) -> float:
+            raise ZeroDivisionError("no deadline")
+
+        monkeypatch.setattr(Core, "next_deadline", broken)
+        world.ask(world.submit(created, "key"))
+        assert await failed(world) == "the outbox failed: ZeroDivisionError: no deadline"
+
+    play(tmp_path, scenario)
+
+
+def test_an_answer_that_cannot_be_made_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        real = service.answer_bytes
+
+        def broken(message: Any) -> bytes:
+            if isinstance(message, gateway.StateReply):
+                raise ValueError("cannot be made")
+            return real(message)
+
+        monkeypatch.setattr(service, "answer_bytes", broken)
+        asked = world.submit(created, "key")
+        world.ask(world.state(created), asked)
+        assert isinstance(await asked.message(), gateway.SubmitAccepted)
 
     play(tmp_path, scenario)

@@ -36,3 +36,22 @@ def test_loop_that_runs_is_not_spoken_of() -> None:
         return watching.gaps
 
     assert asyncio.run(scenario()) == 0
+
+
+def test_a_place_that_cannot_be_named_does_not_end_the_watch(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> list[str]:
+        raise RuntimeError("the frame has changed")
+
+    async def scenario() -> bool:
+        watching = watchdog.LoopWatchdog(gap_s=0.1)
+        await asyncio.sleep(0.3)
+        time.sleep(1.2)
+        alive = watching._thread.is_alive()
+        watching.close()
+        return alive
+
+    monkeypatch.setattr("traceback.format_stack", broken)
+    with capture_logs() as logs:
+        monkeypatch.setattr(watchdog, "log", structlog.get_logger())
+        assert asyncio.run(scenario())
+    assert {"event": "the event loop stands still", "log_level": "warning", "stack": ""} in logs

@@ -35,7 +35,7 @@ class World:
         self.gate.set()
         self.writer = Writer(self.store)
         self.out: list[Effect] = []
-        self.failures: list[StorageError] = []
+        self.failures: list[BaseException] = []
         self.durable_when_out: list[set[str]] = []
         self.outbox = Outbox(self.writer, self._carry_out, self.failures.append)
 
@@ -117,6 +117,24 @@ def test_failed_write_stops_everything_behind_it(tmp_path: Path) -> None:
         assert world.out == [tell(0)]
         assert len(world.failures) == 1
         assert world.runs() == {"r-0"}
+
+    play(tmp_path / "db", scenario)
+
+
+def test_a_bug_in_a_write_is_told_and_the_thread_goes_on(tmp_path: Path) -> None:
+    def breaks(store: Store) -> None:
+        raise LookupError("a bug")
+
+    async def scenario(world: World) -> None:
+        world.outbox.put([Persist(rows=(object(),)), tell(0)])  # type: ignore[arg-type]
+        world.outbox.flush()
+        await world.settle()
+        assert world.out == []
+        assert len(world.failures) == 1
+        assert not isinstance(world.failures[0], StorageError)
+        with pytest.raises(LookupError, match="a bug"):
+            await world.writer.call(breaks)
+        assert await world.writer.call(lambda store: 7) == 7
 
     play(tmp_path / "db", scenario)
 

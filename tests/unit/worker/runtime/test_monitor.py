@@ -1,0 +1,26 @@
+"""The monitor of a policy's limits: without it nothing is played on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+_PROGRAM = """
+import os, time
+from evopolicy_worker.monitor import Monitor
+
+def bug():
+    raise LookupError("a bug")
+
+commands, told = os.pipe()
+monitor = Monitor(commands, bug, lambda: None)
+monitor.start()
+os.write(told, b"x")
+time.sleep(60)
+"""
+
+
+def test_a_monitor_that_fails_ends_its_process_with_the_reason() -> None:
+    ended = subprocess.run([sys.executable, "-c", _PROGRAM], capture_output=True, text=True, timeout=50)
+    assert ended.returncode == 1
+    assert "LookupError: a bug" in ended.stderr
