@@ -196,7 +196,7 @@ def agent_gone(
     doubt resume the run, or start the machine anew.
     """
     _asking(connect, file, lambda operator: operator.agent_gone(run))
-    typer.echo(f"{run} has no agent any more")
+    say(f"{run} has no agent any more")
 
 
 @runs_app.command(
