@@ -106,7 +106,8 @@ def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
     """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
     if ticket.error is not None:
         raise ticket.error
-    if ticket.summary is None:
+    summary = ticket.summary()
+    if summary is None:
         return _json(202, progress_document(ticket))
     last = desk.spent and ticket is desk.tickets[-1]
     head = orjson.dumps(
@@ -117,7 +118,7 @@ def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
             "feedback": f"feedback/{ticket.submit_id}",
         }
     )
-    body = head[:-1] + b',"summary":' + ticket.summary + b"}"
+    body = head[:-1] + b',"summary":' + summary + b"}"
     return Response(body, media_type="application/json")
 
 

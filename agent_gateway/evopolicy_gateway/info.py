@@ -62,7 +62,7 @@ def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str
     return {
         "submit_id": ticket.index,
         "status": "running",
-        "n_episodes": len(ticket.request.env_instances),
+        "n_episodes": ticket.n_episodes,
         "n_done": n_done,
         "waits_for": waits_for,
     }

@@ -154,7 +154,9 @@ class Journal:
         self.at_work = AtWork(path.with_name("at-work"))
         """The episodes whose files are being made."""
         self.entries: list[AnyEntry] = []
-        """All lines, oldest first."""
+        """The lines that were there when it was opened, oldest first."""
+        self.places: list[int] = []
+        """Where each of these begins, for `read`."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._file = os.fdopen(fd, "r+b", buffering=0)
         try:
@@ -164,8 +166,11 @@ class Journal:
             self.close()
             raise
 
-    def append(self, entry: AnyEntry) -> None:
-        """Durable when it returns; StorageError when the disk refuses, and then nothing was added."""
+    def append(self, entry: AnyEntry) -> int:
+        """Durable when it returns its place, for `read`; StorageError when the disk refuses, and then nothing was added.
+
+        It is not kept in memory: a run has thousands of episodes, and the answers name each.
+        """
         start = self._file.seek(0, os.SEEK_END)
         try:
             _write_all(self._file.fileno(), msgspec.json.encode(entry) + b"\n")
@@ -173,7 +178,18 @@ class Journal:
         except OSError as error:
             os.ftruncate(self._file.fileno(), start)
             raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
-        self.entries.append(entry)
+        return start
+
+    def read(self, place: int) -> AnyEntry:
+        """The line that begins there."""
+        with self._path.open("rb") as file:
+            file.seek(place)
+            entry: AnyEntry = _decoder.decode(file.readline())
+            return entry
+
+    def forget(self) -> None:
+        """Lets go of the lines that were there when it was opened."""
+        self.entries, self.places = [], []
 
     def close(self) -> None:
         self._file.close()
@@ -182,9 +198,12 @@ class Journal:
     def _load(self) -> None:
         data = self._file.read() or b""
         whole = data.rfind(b"\n") + 1
-        for number, line in enumerate(data[:whole].splitlines(), start=1):
+        place = 0
+        for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
             try:
                 self.entries.append(_decoder.decode(line))
+                self.places.append(place)
+                place += len(line)
             except DECODE_ERRORS as error:
                 raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error
         if whole != len(data):

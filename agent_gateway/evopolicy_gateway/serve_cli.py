@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import signal
 import sys
@@ -12,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import orjson
 import structlog
 import typer
@@ -151,8 +149,8 @@ async def _listen(gateway: Gateway) -> None:
 
 def progress_of(desk: Desk) -> Progress:
     """What the operator's live view shows of a run."""
-    settled = [ticket for ticket in desk.tickets if ticket.summary is not None]
-    means = [mean for ticket in settled if (mean := _mean_of(ticket.summary)) is not None]
+    settled = [ticket for ticket in desk.tickets if ticket.status is not None]
+    means = [ticket.mean for ticket in settled if ticket.mean is not None]
     running = desk.in_flight
     return Progress(
         episode_budget=desk.run.episode_budget,
@@ -160,29 +158,18 @@ def progress_of(desk: Desk) -> Progress:
         n_submits=desk.state.n_submits,
         n_rejected=desk.n_rejected,
         submit_id=None if running is None else running.submit_id,
-        n_episodes=0 if running is None else len(running.request.env_instances),
+        n_episodes=0 if running is None else running.n_episodes,
         n_done=0 if running is None else running.n_done,
         waits_for="" if running is None else running.waits_for,
         last_submit_id=settled[-1].submit_id if settled else None,
         last_status=settled[-1].status if settled else None,
-        last_mean=_mean_of(settled[-1].summary) if settled else None,
+        last_mean=settled[-1].mean if settled else None,
         best_mean=max(means, default=None),
         in_flight_s=round(desk.in_flight_s, 3),
         feedback_s=round(desk.feedback_s, 3),
         spent=desk.spent,
         cancelled=desk.cancelled,
     )
-
-
-class _Mean(msgspec.Struct):
-    mean_return: float | str | None
-
-
-def _mean_of(summary: bytes | None) -> float | None:
-    if summary is None:
-        return None
-    mean = msgspec.json.decode(summary, type=_Mean).mean_return
-    return mean if isinstance(mean, float | int) and math.isfinite(mean) else None
 
 
 def main() -> None:

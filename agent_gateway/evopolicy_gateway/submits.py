@@ -224,14 +224,14 @@ class Desk:
     def _recover(self) -> None:
         """Rebuilds the tickets from the journal and goes on with the one that has no end."""
         by_key: dict[str, Ticket] = {}
-        for entry in self._journal.entries:
+        for place, entry in zip(self._journal.places, self._journal.entries, strict=True):
             if isinstance(entry, Requested):
                 by_key[entry.key] = ticket = Ticket(entry, len(self.tickets), self.run.episode_budget)
                 self.tickets.append(ticket)
             elif isinstance(entry, Accepted):
                 by_key[entry.key].accept(entry)
             elif isinstance(entry, Settled):
-                by_key[entry.key].settle(entry.status, entry.summary.encode())
+                by_key[entry.key].settle(entry.status, entry.summary.encode(), self._summary_at(place))
             elif isinstance(entry, Refused):
                 self.tickets.remove(by_key.pop(entry.key))
             elif isinstance(entry, Rejected):
@@ -245,6 +245,7 @@ class Desk:
                     self.tickets.remove(ticket)
             elif isinstance(entry, Closed):
                 self.closed = True
+        self._journal.forget()
         for ticket in list(self.tickets):
             if not ticket.done.is_set():
                 self.tickets.remove(ticket)
@@ -370,8 +371,8 @@ class Desk:
                 log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
                 self._on_change()
                 await asyncio.sleep(DISK_PAUSE_S)
-        await self._note(Settled(key=ticket.request.key, status=status, summary=summary.decode()))
-        ticket.settle(status, summary)
+        place = await self._note(Settled(key=ticket.request.key, status=status, summary=summary.decode()))
+        ticket.settle(status, summary, self._summary_at(place))
         log.info("submit committed", submit=ticket.submit_id, status=status)
 
     async def _write_feedback(self, ticket: Ticket) -> tuple[str, bytes]:
@@ -482,8 +483,18 @@ class Desk:
         why = "the run is closed" if self.closed else "the episode budget is spent"
         return RequestError(status, f"{why}: no more submits are taken")
 
-    async def _note(self, entry: AnyEntry) -> None:
-        """Appends to the journal off the event loop, in order; waits while the disk refuses."""
+    def _summary_at(self, place: int) -> Callable[[], bytes]:
+        """Reads the summary that was written down there; not from the feedback, which is the agent's to lose."""
+
+        def load() -> bytes:
+            entry = self._journal.read(place)
+            assert isinstance(entry, Settled)
+            return entry.summary.encode()
+
+        return load
+
+    async def _note(self, entry: AnyEntry) -> int:
+        """Appends to the journal off the event loop, in order, and returns the place; waits while the disk refuses."""
         async with self._journal_lock:
             while True:
                 try:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import math
+from collections.abc import Callable
 
 import msgspec
 
@@ -21,6 +23,10 @@ class ConflictError(RequestError):
         """Of the submit that it contradicts."""
 
 
+class _Mean(msgspec.Struct):
+    mean_return: float | str | None
+
+
 class Ticket:
     """A submit that passed the checks."""
 
@@ -37,13 +43,15 @@ class Ticket:
         self.decided = asyncio.Event()
         """Set once it is accepted, or never will be."""
         self.done = asyncio.Event()
-        """Set once `status` and `summary`, or `error`, are there."""
+        """Set once `status` and the summary, or `error`, are there."""
         self.status: str | None = None
-        self.summary: bytes | None = None
-        """The bytes of `summary.json`."""
+        self.mean: float | None = None
+        """Of its returns, once it is settled and has some."""
         self.error: RequestError | None = None
         """Why it was not taken after all."""
+        self.n_episodes = len(request.env_instances)
         self._episode_budget = episode_budget
+        self._load: Callable[[], bytes] | None = None
 
     def attach(self, taken: Snapshot) -> None:
         """The bundle, or why there is none."""
@@ -56,13 +64,23 @@ class Ticket:
         self.submit_id = submit_id(accepted.submit_index, self._episode_budget)
         self.decided.set()
 
-    def settle(self, status: str, summary: bytes) -> None:
-        """It is answered: its feedback is written."""
-        self.status, self.summary = status, summary
-        self.n_done = len(self.request.env_instances)
+    def settle(self, status: str, summary: bytes, load: Callable[[], bytes]) -> None:
+        """It is answered: its feedback is written. `load` gives the summary's bytes again.
+
+        What it has of its single episodes is let go of: a run has thousands.
+        """
+        self.status, self._load = status, load
+        mean = msgspec.json.decode(summary, type=_Mean).mean_return
+        self.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
+        self.request = msgspec.structs.replace(self.request, env_instances=())
+        self.n_done = self.n_episodes
         self.waits_for = ""
         self.decided.set()
         self.done.set()
+
+    def summary(self) -> bytes | None:
+        """The bytes of `summary.json`, read from the disk; None while there is none."""
+        return None if self._load is None else self._load()
 
     def fail(self, error: RequestError) -> None:
         """It came to nothing."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import shutil
 import socket
+import tracemalloc
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -13,7 +15,7 @@ import pytest
 from gateway_double import Double, answering, gateway_on, opened, prepare, served
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.gateway import CloseRun, Submit
+from evopolicy_common.messages.gateway import CloseRun, RunState, Submit
 from evopolicy_common.messages.worker import Refused
 from evopolicy_gateway import server, submits
 from evopolicy_gateway.feedback import SubmitTree
@@ -262,3 +264,39 @@ def test_a_gateway_that_stops_with_a_submit_open_tells_so_without_a_traceback(
 
     asyncio.run(main())
     assert [record.message for record in caplog.records if record.exc_info] == []
+
+
+def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: Path) -> None:
+    n, cases = 200, tuple(range(1001, 1401, 2))
+
+    async def main() -> None:
+        budget = 30 * n
+        run = opened(
+            n_env_instances=2000,
+            episode_budget=budget,
+            max_episodes_per_submit=n,
+            state=RunState(remaining_budget=budget, n_submits=0, is_finalized=False),
+        )
+        double = Double(run)
+        async with served(tmp_path, double) as s:
+
+            async def play(submits: int) -> int:
+                """Bytes that the gateway's modules hold afterwards."""
+                for _ in range(submits):
+                    body = {"env_instances": cases}
+                    assert (await s.http.post(s.urls.submit, json=body)).status_code == 200
+                gc.collect()
+                found = tracemalloc.take_snapshot().statistics("filename")
+                return sum(each.size for each in found if "evopolicy_gateway" in each.traceback[0].filename)
+
+            tracemalloc.start()
+            try:
+                before = await play(4)
+                after = await play(12)
+            finally:
+                tracemalloc.stop()
+            first = await s.http.get(f"{s.urls.submit}/submit_0000")
+            assert len(first.json()["summary"]["returns"]) == n
+        assert (after - before) / (12 * n) < 20.0, "bytes for each episode"
+
+    asyncio.run(main())

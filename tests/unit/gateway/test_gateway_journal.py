@@ -61,6 +61,18 @@ def test_a_journal_cut_anywhere_keeps_its_whole_lines_and_goes_on(tmp_path: Path
     check()
 
 
+def test_a_line_is_read_again_from_its_place(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j")
+    places = [journal.append(entry) for entry in ENTRIES]
+    journal.close()
+    journal = Journal(tmp_path / "j")
+    assert journal.places == places
+    assert [journal.read(place) for place in places] == ENTRIES
+    journal.forget()
+    assert [journal.read(place) for place in places] == ENTRIES
+    journal.close()
+
+
 def test_a_damaged_line_in_the_middle_is_told(tmp_path: Path) -> None:
     data = written(tmp_path / "j")
     (tmp_path / "j").write_bytes(b"junk\n" + data)
