@@ -392,7 +392,9 @@ class RunPlay:
             if self._spent.is_set():
                 break
             self._watch.note(self._name, "the agent's keeper died; starting it again, and the agent with it")
-        return AgentEnded(reason="agent_failed", detail="its keeper died")
+        plan = self._plan
+        known = harnesses.make(plan.agent, plan.started_in, plan.config).known()
+        return AgentEnded(reason="agent_failed", detail="its keeper died", facts=known)
 
     async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
         """How the agent ended; None when its keeper died."""

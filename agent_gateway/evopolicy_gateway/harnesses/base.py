@@ -129,6 +129,10 @@ class Harness(ABC):
     resumable = False
     """It goes on from `Stage.session_file` after everything of it was killed."""
 
+    def known(self) -> dict[str, Any]:
+        """Facts for `run.json` that do not depend on how it ends: where nobody is left who could tell the others."""
+        return {}
+
     def check(self) -> None:  # noqa: B027
         """ConfigError where the agent cannot be started on this machine; to be asked before a run is opened."""
 

@@ -248,24 +248,26 @@ class CliAgent(Harness):
         except (OSError, subprocess.TimeoutExpired) as error:
             raise AgentError(f"{self._program[0]} does not answer {' '.join(arguments)}: {error}") from error
 
+    def known(self) -> dict[str, Any]:
+        return {
+            "harness": self.name,
+            "model_string": self._config.model,
+            "settings": self._config.settings() | {"program": self._program},
+        }
+
     def _ending(
         self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
     ) -> Ending:
         state, config = self._state, self._config
-        settings: dict[str, Any] = config.settings() | {
-            "program": self._program,
+        known = self.known()
+        settings: dict[str, Any] = known["settings"] | {
             "reprompted": state.reprompts,
             "paused_s": round(state.paused_s, 1),
             "requests_failed": state.requests_failed,
         }
         if self._dialect.tested_version not in ("", self._version):
             settings["tested_version"] = self._dialect.tested_version
-        facts: dict[str, Any] = {
-            "harness": self.name,
-            "cli_version": self._version,
-            "model_string": config.model,
-            "settings": settings,
-        }
+        facts: dict[str, Any] = known | {"cli_version": self._version, "settings": settings}
         if state.usage.total:
             facts["tokens"] = state.usage.recorded(config.prices)
         return Ending(reason=reason, detail=detail, turns=state.turns, retries=state.retries, facts=facts)

@@ -49,8 +49,11 @@ class CommandHarness(Harness):
             await asyncio.gather(talk, return_exceptions=True)
             await process.close()
 
+    def known(self) -> dict[str, Any]:
+        return {"settings": self._settings | {"program": self._program}}
+
     def _ending(self, exit_code: int, turns: int) -> Ending:
-        facts: dict[str, Any] = {"settings": self._settings | {"program": self._program}}
+        facts = self.known()
         if exit_code == 0:
             return Ending(reason="agent_stopped", turns=turns, facts=facts)
         how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"

@@ -71,8 +71,9 @@ def test_an_agent_whose_keeper_dies_again_and_again_has_failed(operator_file: Pa
     code = "submit([0])\nos.kill(os.getppid(), 9)\ntime.sleep(1000)"
     exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
     assert exit_code == 4, err
-    outcome = record_in(run_dir(tmp_path)).outcome
-    assert (outcome.closed_reason, outcome.budget_used) == ("agent_failed", 5)
+    record = record_in(run_dir(tmp_path))
+    assert (record.outcome.closed_reason, record.outcome.budget_used) == ("agent_failed", 5)
+    assert record.agent.settings["program"], "what was known beforehand does not depend on who is left to tell"
 
 
 def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_told(
