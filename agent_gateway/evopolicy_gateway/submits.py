@@ -218,8 +218,13 @@ class Desk:
         for key in dict.fromkeys(key for key, _ in left.died_over):
             episodes = tuple(index for of, index in left.died_over if of == key)
             log.warning("the last gateway ended over the files of an episode", submit=key, episodes=episodes)
-            self._journal.append(Died(key=key, episodes=episodes))
+            died = Died(key=key, episodes=episodes)
+            self._journal.append(died)
+            self._count_deaths(died)
         left.clear()
+
+    def _count_deaths(self, died: Died) -> None:
+        self._deaths.update((died.key, index) for index in died.episodes or (None,))
 
     def _recover(self) -> None:
         """Rebuilds the tickets from the journal and goes on with the one that has no end."""
@@ -237,7 +242,7 @@ class Desk:
             elif isinstance(entry, Rejected):
                 self.n_rejected += 1
             elif isinstance(entry, Died):
-                self._deaths.update((entry.key, index) for index in entry.episodes or (None,))
+                self._count_deaths(entry)
             elif isinstance(entry, SetAside):
                 ticket = by_key[entry.key]
                 ticket.fail(RequestError("gateway_failed", entry.message))

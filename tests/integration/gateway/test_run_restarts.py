@@ -73,7 +73,9 @@ def test_an_agent_whose_keeper_dies_again_and_again_has_failed(operator_file: Pa
     assert exit_code == 4, err
     record = record_in(run_dir(tmp_path))
     assert (record.outcome.closed_reason, record.outcome.budget_used) == ("agent_failed", 5)
-    assert record.agent.settings["program"], "what was known beforehand does not depend on who is left to tell"
+    assert record.agent.settings["program"], (
+        "what was known beforehand does not depend on who is left to tell"
+    )
 
 
 def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_told(
