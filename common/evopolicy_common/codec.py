@@ -1,17 +1,20 @@
 """Messages to bytes and back: msgpack by msgspec, one decoder for each speaker's union.
 
-A decoder checks types and required fields; it does not check ranges, and NaN decodes: whoever acts on a number refuses
-what is not finite. Unknown fields are skipped, so an older peer may be told more than it knows.
+A decoder checks types, required fields and the bounds of `messages.bounds`: how long texts and lists are, how deep plain
+values nest, that numbers are finite. `encode` holds what it makes to the same. Unknown fields are skipped, so an older peer
+may be told more than it knows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import TypeVar
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages import bounds
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import GatewayReply, GatewayRequest
 from evopolicy_common.messages.operator import OperatorReply, OperatorRequest
@@ -45,8 +48,13 @@ T = TypeVar("T")
 
 
 def encode(message: Message) -> bytes:
-    """The message's bytes; ProtocolError when they are too many for the transport."""
-    data = _encoder.encode(message)
+    """The message's bytes; ProtocolError when its peer would refuse them, or the transport drop them."""
+    try:
+        data = _encoder.encode(message)
+        _decoder_of(type(message)).decode(data)
+        _check_plain(message)
+    except (*DECODE_ERRORS, OverflowError, TypeError, ValueError) as error:
+        raise ProtocolError(f"a {type(message).__name__} cannot be sent: {error}") from error
     if len(data) > MAX_MESSAGE_BYTES:
         raise ProtocolError(
             f"a {type(message).__name__} of {len(data):,} bytes cannot be sent; {MAX_MESSAGE_BYTES:,} are the limit"
@@ -59,11 +67,24 @@ def decode(decoder: msgspec.msgpack.Decoder[T], data: bytes) -> T:
     if len(data) > MAX_MESSAGE_BYTES:
         raise ProtocolError(f"a message of {len(data):,} bytes; {MAX_MESSAGE_BYTES:,} are the limit")
     try:
-        return decoder.decode(data)
-    except DECODE_ERRORS as error:
+        message = decoder.decode(data)
+        _check_plain(message)
+        return message
+    except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(
             f"{len(data)} bytes are not a message of wire version {WIRE_VERSION}: {error}"
         ) from error
+
+
+def _check_plain(message: object) -> None:
+    if isinstance(message, msgspec.Struct):
+        for part in bounds.plain_parts(message):
+            bounds.check_plain(part)
+
+
+@cache
+def _decoder_of(kind: type[Message]) -> msgspec.msgpack.Decoder[Message]:
+    return msgspec.msgpack.Decoder(kind)
 
 
 def pack_outcomes(outcomes: Sequence[EpisodeOutcome]) -> bytes:

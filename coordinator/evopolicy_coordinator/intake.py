@@ -29,8 +29,12 @@ from evopolicy_coordinator.core.events import AnyEvent
 from evopolicy_coordinator.machines import Machines
 from evopolicy_coordinator.request_checks import (
     MAX_COUNT,
+    MAX_EPISODES_PER_SUBMIT,
+    bounded_agent,
+    check_counts,
     check_idempotency_key,
     check_inline,
+    check_job,
     check_key,
     check_limits,
     check_place,
@@ -297,7 +301,7 @@ class Intake:
 
     def run_closed(self, m: gateway.CloseRun, request: int, stimulus: str) -> AnyEvent:
         return events.RunClosed(
-            stimulus_id=stimulus, request=request, run=m.run, reason=m.reason, agent=m.agent
+            stimulus_id=stimulus, request=request, run=m.run, reason=m.reason, agent=bounded_agent(m.agent)
         )
 
     # Operators.
@@ -308,19 +312,17 @@ class Intake:
         check_limits(wanted.limits)
         try:
             suite = catalogue.suite_of(wanted.env)
+            budget = suite.budget if wanted.budget is None else wanted.budget
+            least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
+            most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
+            check_counts(budget, least, most, wanted.n_validation, wanted.n_heldout)
             cases = self._source.splits(
                 suite.name, wanted.env, self._counts(suite, wanted.n_validation, wanted.n_heldout)
             )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
-        budget = suite.budget if wanted.budget is None else wanted.budget
-        least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
-        most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
-        if not 1 <= least <= most:
-            raise RefusedError(
-                Refusal.INVALID_SETTINGS,
-                f"budget {budget} and {least} to {most} episodes a submit do not go together; all are at least 1",
-            )
+        if wanted.policy_scope == "submit":
+            check_job((*cases.train, *cases.validation, *cases.heldout), most)
         return events.RunCreated(
             stimulus_id=stimulus,
             request=request,
@@ -351,6 +353,11 @@ class Intake:
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
+        if len(ids) > MAX_EPISODES_PER_SUBMIT:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"{len(ids):,} cases; {MAX_EPISODES_PER_SUBMIT:,} are played at once at most",
+            )
         self._check_again(m, len(ids))
         wrong = next((case_id for case_id in ids if not 0 <= case_id < len(cases)), None)
         if wrong is not None or not ids:

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import hmac
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
 
 from evopolicy_common import codec, keys
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import worker
+from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits
 from evopolicy_common.refusals import Refusal
 
 MAX_COUNT = 2**31 - 1
+MAX_BUDGET = 20_000
+MAX_EPISODES_PER_SUBMIT = 10_000
+MAX_HIDDEN = 10_000
+"""Validation or held-out cases of a run. What is told of a run once it is finished has to fit into one message."""
+MAX_JOB_BYTES = 8 << 20
+MAX_AGENT_BYTES = 256 << 10
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
 
@@ -35,6 +46,42 @@ def check_limits(limits: ResourceLimits) -> None:
             raise RefusedError(
                 Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and at most {most:,}"
             )
+
+
+def check_counts(budget: int, least: int, most: int, n_validation: int | None, n_heldout: int | None) -> None:
+    """How many episodes a run may have."""
+    if not 1 <= least <= most:
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS,
+            f"budget {budget} and {least} to {most} episodes a submit do not go together; all are at least 1",
+        )
+    for what, n, limit in (
+        ("a budget", budget, MAX_BUDGET),
+        ("submits", most, MAX_EPISODES_PER_SUBMIT),
+        ("validation", n_validation or 0, MAX_HIDDEN),
+        ("held-out", n_heldout or 0, MAX_HIDDEN),
+    ):
+        if n > limit:
+            raise RefusedError(Refusal.INVALID_SETTINGS, f"{what} of {n:,} episodes; {limit:,} are the limit")
+
+
+def check_job(cases: Sequence[Case], n: int) -> None:
+    """`n` episodes on these cases fit into one lease, as they have to with policy scope `submit`."""
+    longest = max((len(msgspec.msgpack.encode(case)) for case in cases), default=0)
+    if n * (longest + 200) > MAX_JOB_BYTES:
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS,
+            f"with policy scope submit {n} episodes go to a worker at once, here {n * (longest + 200):,} bytes;"
+            f" {MAX_JOB_BYTES:,} are the limit: allow fewer episodes a submit, or shorten the cases' options",
+        )
+
+
+def bounded_agent(agent: dict[str, Any]) -> dict[str, Any]:
+    """What a gateway says of its agent; no more than can be told of a finished run. A run is closed in any case."""
+    size = len(msgspec.msgpack.encode(agent))
+    if size <= MAX_AGENT_BYTES:
+        return agent
+    return {"left_out": f"{size:,} bytes; {MAX_AGENT_BYTES:,} are the limit"}
 
 
 def check_token(expected: str, given: str) -> None:

@@ -9,43 +9,45 @@ from typing import Literal
 
 import msgspec
 
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Word
+
 
 class AuditFinding(msgspec.Struct, frozen=True, kw_only=True):
     """An audited episode over which workers did not agree."""
 
     split: Literal["train", "validation", "heldout", "random"]
-    submit_index: int
+    submit_index: Int
     """-1 for the random reference."""
-    episode: int
+    episode: Int
     """Position in the submit's list, or in the split."""
-    player: str
+    player: Word
     """The worker whose result stands."""
-    auditors: tuple[str, ...]
+    auditors: Many[Text]
     """Those that played it again, in order."""
-    difference: str
+    difference: Text
     """Where player and first auditor part, such as `step 3: reward 1.0 and 2.0`."""
-    forger: str = ""
+    forger: Word = ""
     """Who was alone against the two others; empty where that could not be told."""
 
 
 class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The audits of one run. Counts are of episodes."""
 
-    share: float
+    share: Number
     """Of the run's episodes that were drawn, 0 to 1."""
-    sampled: int = 0
+    sampled: Int = 0
     """Drawn."""
-    audited: int = 0
+    audited: Int = 0
     """Played again and judged."""
-    agreed: int = 0
+    agreed: Int = 0
     """Of the audited: the result was confirmed."""
-    disputed: int = 0
+    disputed: Int = 0
     """Of the audited: the result was refuted, or workers disagree and nobody could tell who is right."""
-    not_audited: dict[str, int] = {}
+    not_audited: Named[Int] = {}
     """Of the sampled: why they were not, such as `one worker only`."""
-    forgers: dict[str, int] = {}
+    forgers: Named[Int] = {}
     """Workers that were found to hand in what did not happen, to the episodes of this run that each of them played."""
-    findings: tuple[AuditFinding, ...] = ()
+    findings: Many[AuditFinding] = ()
     """The first of what workers did not agree on."""
 
     @property

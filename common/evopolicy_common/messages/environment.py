@@ -5,11 +5,13 @@ In all messages unknown fields are skipped, and every field added later has a de
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
-SpaceSchema = dict[str, Any]
+from evopolicy_common.messages.bounds import Int, Many, Named, Plain, Text, Word
+
+SpaceSchema = Plain
 """A space as a plain dict: `{"type": "Box", "shape": [2], "dtype": "float32", "low": …, "high": …}` and so on."""
 
 Split = Literal["train", "validation", "heldout"]
@@ -21,29 +23,29 @@ ObsStorage = Literal["inline", "npy", "npz"]
 class Case(msgspec.Struct, frozen=True, kw_only=True):
     """One initial condition of an environment: what its `reset` is given."""
 
-    seed: int
+    seed: Int
     """Seed of the environment's own generator, 0 ≤ seed < 2**31."""
-    options: dict[str, Any] | None = None
+    options: Plain | None = None
     """`reset(options=…)`; None for environments that take none."""
 
 
 class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """All that anyone without the simulator knows of an environment; made by the worker that offers it."""
 
-    env: str
+    env: Word
     """Suite id, such as `gym/acrobot`."""
-    env_version: str
+    env_version: Word
     """Name and version of what is played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
     obs_space: SpaceSchema
     action_space: SpaceSchema
     obs_storage: ObsStorage = "inline"
     """Where feedback keeps observations: in the trajectory's rows, or in `observations.npy` / `.npz` beside it."""
-    max_episode_steps: int
-    reward_components: tuple[str, ...] = ()
+    max_episode_steps: Int
+    reward_components: Many[Text] = ()
     """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
-    reward_texts: dict[str, str] = {}
+    reward_texts: Named[Text] = {}
     """What each of them stands for; empty from workers of older versions."""
-    task_text: str
+    task_text: Text
     """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
     deterministic: bool = True
     """False when even a fresh environment does not repeat an episode from its seed and actions."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
+from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
 from evopolicy_common.messages.environment import Case, ObservationForm, PolicyScope
 
 FailureCategory = Literal[
@@ -41,32 +42,32 @@ Tier = Literal["bwrap", "landlock", "none"]
 class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """What one episode's policy may use. All are visible in `/info.resource_limits`."""
 
-    episode_wall_s: float = 600.0
+    episode_wall_s: Number = 600.0
     """Wall time of the policy's own work in one episode (import, init, reset, acts), seconds."""
-    act_wall_s: float = 20.0
+    act_wall_s: Number = 20.0
     """Wall time of one `act` or `reset`, seconds."""
-    init_wall_s: float = 60.0
+    init_wall_s: Number = 60.0
     """Wall time of importing the bundle and building the Policy, seconds."""
-    cpu_s: float = 300.0
+    cpu_s: Number = 300.0
     """CPU time of the policy process in one episode, seconds."""
-    memory_bytes: int = 1 << 30
+    memory_bytes: Int = 1 << 30
     """Address space that the policy may add to what Python and the allowed packages take, bytes."""
-    processes: int = 16
+    processes: Int = 16
     """Threads of the policy process; it may start no process."""
-    file_bytes: int = 64 << 20
+    file_bytes: Int = 64 << 20
     """What it may write to its copy of `system/` and `/tmp`, bytes together."""
-    files: int = 4096
+    files: Int = 4096
     """Files and folders that it may make there, beside its bundle's."""
-    open_files: int = 256
+    open_files: Int = 256
     """Its open file descriptors, the five that it starts with among them."""
-    output_bytes: int = 64 << 10
+    output_bytes: Int = 64 << 10
     """What is kept of each of stdout and stderr of an episode, bytes."""
-    action_bytes: int = 16 << 10
+    action_bytes: Int = 16 << 10
     """What one action may take beyond 16 bytes for each number or character that the action space has, bytes; it may be
     made of as many values as there are 16 bytes in that."""
-    episode_action_bytes: int = 4 << 20
+    episode_action_bytes: Int = 4 << 20
     """What the actions of an episode may take together beyond what the action space needs, bytes."""
-    submit_wall_s: float | None = None
+    submit_wall_s: Number | None = None
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 
 
@@ -84,22 +85,22 @@ LARGEST_LIMIT = 1 << 53
 class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
     """Names bytes in a content-addressed store, or carries them where they are few."""
 
-    digest: str
+    digest: Word
     """SHA-256 of the bytes, lowercase hex."""
-    size: int
-    inline: bytes | None = None
+    size: Int
+    inline: Bytes | None = None
     """The bytes themselves; None when they must be fetched by digest."""
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """One episode to play."""
 
-    index: int
+    index: Int
     """Request index: position in the submit's (or split's) list."""
-    episode_index: int
+    episode_index: Int
     """What the policy's `reset` is given."""
     case: Case
-    policy_seed: bytes
+    policy_seed: Bytes
     """16 bytes that seed the policy process's generators and the random actions that replace a failed policy."""
     replay: BlobRef | None = None
     """A trajectory (of either record) whose actions are played in place of a policy's, to see whether the environment
@@ -109,21 +110,21 @@ class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
 class Job(msgspec.Struct, frozen=True, kw_only=True):
     """Work that is leased as one piece: one episode, or with policy scope `submit` a submit's episodes in order."""
 
-    job_id: str
-    env: str
-    bundle: str | None
+    job_id: Word
+    env: Word
+    bundle: Word | None
     """Digest of the policy's bundle; None for keyed uniform random actions without a policy process."""
-    episodes: tuple[EpisodeSpec, ...]
+    episodes: Many[EpisodeSpec]
     policy_scope: PolicyScope = "episode"
-    policy_every: int = 0
+    policy_every: Int = 0
     """With scope `submit`: a new Policy every that many episodes; 0 for one Policy through all."""
-    env_meta: dict[str, Any] = {}
+    env_meta: Plain = {}
     """Handed to `Policy.__init__` without the spaces, which the worker adds."""
     observations: ObservationForm = "arrays"
     record: Record = "full"
     video: bool = False
     """Also record a video of each episode (a rendered frame a row)."""
-    video_episodes: int = 0
+    video_episodes: Int = 0
     """With `video`: only of the job's first so many episodes; 0 for all."""
     tier: Tier = "bwrap"
     """The sandbox tier that the run demands."""
@@ -134,35 +135,35 @@ class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
     """How a policy failed in one episode. A result, never a fault of ours."""
 
     category: FailureCategory
-    step_index: int | None
+    step_index: Int | None
     """Step at which `act` failed, counted from 0; None before the first step."""
-    message: str
-    traceback: str = ""
-    limit: float | None = None
+    message: Text
+    traceback: Text = ""
+    limit: Number | None = None
     """Value of the limit that was hit, in its own unit; None when no limit was."""
-    used: float | None = None
+    used: Number | None = None
     """What the policy had used of it."""
 
 
 class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
     """What one episode came to."""
 
-    index: int
-    episode_return: float
+    index: Int
+    episode_return: Number
     """Sum of the rewards; always finite."""
-    length: int
+    length: Int
     """Steps played."""
     terminated: bool
     truncated: bool
     failure: PolicyFailure | None = None
-    reward_components: dict[str, float] = {}
+    reward_components: Named[Number] = {}
     """Per-episode sum of each of the environment's reward components."""
     trajectory: BlobRef | None = None
     """`trajectory` codec bytes: the whole episode, or with record `actions` the action log."""
     video: BlobRef | None = None
     """MP4 bytes."""
-    stdout: bytes = b""
-    stderr: bytes = b""
-    wall_s: float = 0.0
+    stdout: Bytes = b""
+    stderr: Bytes = b""
+    wall_s: Number = 0.0
     """Wall time from the policy's start to the last step, seconds."""
-    policy_cpu_s: float = 0.0
+    policy_cpu_s: Number = 0.0

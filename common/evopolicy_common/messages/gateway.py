@@ -6,10 +6,11 @@ be told, an agent cannot steal from it. A test walks every type in `GatewayReply
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
+from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
 from evopolicy_common.messages.environment import (
     EnvironmentDescription,
     ObservationForm,
@@ -40,8 +41,8 @@ SimulationRule = Literal["forbidden", "allowed"]
 class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     """The gateway's first word, after every start of either side."""
 
-    run: str
-    token: str
+    run: Word
+    token: Word
     """The run's capability; sent with every request and checked on each."""
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Without it the agent may be on any machine already."""
@@ -53,15 +54,15 @@ class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):
     The permit lasts until the run is closed or cancelled, or its machine has another boot id.
     """
 
-    run: str
-    token: str
-    boot_id: str
+    run: Word
+    token: Word
+    boot_id: Word
     """Of the kernel that the agent runs on (`host.boot_id`); empty: unknown, which counts as every kernel."""
-    machine_id: str = ""
+    machine_id: Word = ""
     """Of that machine (`host.machine_id`), the same over reboots; empty: unknown."""
-    host: str = ""
+    host: Word = ""
     """Its name, for people."""
-    wait_s: float = 0.0
+    wait_s: Number = 0.0
 
 
 class Permit(Message, frozen=True, kw_only=True, tag="permit"):
@@ -69,7 +70,7 @@ class Permit(Message, frozen=True, kw_only=True, tag="permit"):
 
     granted: bool
     """False: not within `wait_s`; the agent must not start, and the gateway asks again."""
-    waits_for: str = ""
+    waits_for: Text = ""
     """What it waits for, in words that tell nothing of other runs' results."""
 
 
@@ -80,27 +81,27 @@ FREE_SLOT = "a free slot"
 class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
     """The submit that runs now."""
 
-    submit_index: int
-    n_episodes: int
-    n_done: int
-    waits_for: str = ""
+    submit_index: Int
+    n_episodes: Int
+    n_done: Int
+    waits_for: Text = ""
     """What it waits for when nothing of it runs, in words for the agent; empty while episodes run."""
-    held_s: float = 0.0
+    held_s: Number = 0.0
     """Seconds for which none of its episodes ran because hidden work had the machines; they count against no limit."""
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """What changes of a run, as its gateway may know it."""
 
-    remaining_budget: int
-    n_submits: int
+    remaining_budget: Int
+    n_submits: Int
     """Accepted submits so far."""
     is_finalized: bool
     """True when no more submits are taken."""
     in_flight: SubmitInFlight | None = None
     cancelled: bool = False
     """The operator ended the run."""
-    held_s: float = 0.0
+    held_s: Number = 0.0
     """The same seconds of all the run's submits so far."""
 
 
@@ -108,18 +109,18 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     """All that is fixed for the run, and its state now."""
 
     env: EnvironmentDescription
-    n_env_instances: int
+    n_env_instances: Int
     """Train cases: the agent's ids are 0 … n − 1."""
-    episode_budget: int
-    min_episodes_per_submit: int
-    max_episodes_per_submit: int
+    episode_budget: Int
+    min_episodes_per_submit: Int
+    max_episodes_per_submit: Int
     policy_scope: PolicyScope
     observations: ObservationForm
     sandbox_tier: Tier
     video: VideoOption
     limits: ResourceLimits
-    allowed_imports: tuple[str, ...]
-    denied_imports: tuple[str, ...]
+    allowed_imports: Many[Text]
+    denied_imports: Many[Text]
     state: RunState
     simulation: SimulationRule = "forbidden"
 
@@ -127,8 +128,8 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
 class StateRequest(Message, frozen=True, kw_only=True, tag="state"):
     """How the run stands; answered at once."""
 
-    run: str
-    token: str
+    run: Word
+    token: Word
 
 
 class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
@@ -140,12 +141,12 @@ class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
 class Submit(Message, frozen=True, kw_only=True, tag="submit"):
     """Evaluate a bundle on train cases. Safe to send again with the same key."""
 
-    run: str
-    token: str
-    key: str
+    run: Word
+    token: Word
+    key: Word
     """Idempotency key: one accepted submit for each."""
-    env_instances: tuple[int, ...]
-    bundle: str | None
+    env_instances: Many[Int]
+    bundle: Word | None
     """Digest of the snapshot, uploaded before; None when `system/` could not be snapshot."""
     bundle_error: PolicyFailure | None = None
     """Why there is no bundle: becomes the verdict, charged as `protocol.md` says of a bundle without a Policy."""
@@ -154,76 +155,76 @@ class Submit(Message, frozen=True, kw_only=True, tag="submit"):
 class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):
     """The submit is durable and its episodes are charged; also the answer to a repeated key."""
 
-    submit_index: int
+    submit_index: Int
     """Counts accepted submits from 0."""
-    first_global_episode: int
-    remaining_budget: int
+    first_global_episode: Int
+    remaining_budget: Int
     """After this submit."""
 
 
 class ResultsRequest(Message, frozen=True, kw_only=True, tag="results"):
     """A long poll for what has happened to a submit since `cursor`."""
 
-    run: str
-    token: str
-    submit_index: int
-    cursor: int
+    run: Word
+    token: Word
+    submit_index: Int
+    cursor: Int
     """0 at first, then the last page's."""
-    wait_s: float
+    wait_s: Number
 
 
 class EpisodeFeedback(msgspec.Struct, frozen=True, kw_only=True):
     """One train episode as the agent may see it."""
 
-    index: int
+    index: Int
     """Request index."""
-    episode_return: float
-    length: int
+    episode_return: Number
+    length: Int
     failure: PolicyFailure | None
-    reward_components: dict[str, float]
+    reward_components: Named[Number]
     trajectory: BlobRef
     video: BlobRef | None
-    stdout: bytes
-    stderr: bytes
+    stdout: Bytes
+    stderr: Bytes
 
 
 class SubmitDone(msgspec.Struct, frozen=True, kw_only=True):
     """A submit's end."""
 
     status: SubmitStatus
-    n_episodes: int
-    env_instances: tuple[int, ...]
-    first_global_episode: int
-    remaining_budget: int
-    started_at: float
+    n_episodes: Int
+    env_instances: Many[Int]
+    first_global_episode: Int
+    remaining_budget: Int
+    started_at: Number
     """When it was accepted, Unix time, seconds."""
-    completed_at: float
+    completed_at: Number
     failure: PolicyFailure | None
     """Why the status is not ok; None when it is."""
-    n_kept: int
+    n_kept: Int
     """Episodes whose feedback is kept: all when ok; with `rollout_timeout` those before the first unfinished."""
 
 
 class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):
     """Episodes in order of arrival; none before the submit is known to yield a Policy."""
 
-    cursor: int
-    episodes: tuple[EpisodeFeedback, ...]
+    cursor: Int
+    episodes: Many[EpisodeFeedback]
     done: SubmitDone | None
     """Set on the page after which nothing more comes."""
-    waits_for: str = ""
-    held_s: float = 0.0
+    waits_for: Text = ""
+    held_s: Number = 0.0
     """As in `RunState`."""
 
 
 class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
     """No more submits: sent once the agent and all its children are gone, which finalisation waits for."""
 
-    run: str
-    token: str
-    reason: str
+    run: Word
+    token: Word
+    reason: Text
     """`budget_spent`, `agent_stopped`, `agent_failed`, `wall_limit`, `cancelled`."""
-    agent: dict[str, Any] = {}
+    agent: Plain = {}
     """What the gateway has to say of the agent for `run.json`: turns, retries, tokens, version."""
 
 

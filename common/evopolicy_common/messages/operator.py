@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
 from evopolicy_common.messages.audit import AuditRecord
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Numbered, Plain, Text, Word
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
@@ -34,18 +35,18 @@ ELSEWHERE = "elsewhere"
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is opened with. None means the suite's own number."""
 
-    env: str
-    entry: str
+    env: Word
+    entry: Word
     """Name of the agent in tables, such as `evolve` or `GPT-5.5 (Codex)`."""
-    model: str
-    exp_id: str
-    repeat: int = 0
-    attempt: int = 1
-    budget: int | None = None
-    min_episodes_per_submit: int | None = None
-    max_episodes_per_submit: int | None = None
-    n_validation: int | None = None
-    n_heldout: int | None = None
+    model: Word
+    exp_id: Word
+    repeat: Int = 0
+    attempt: Int = 1
+    budget: Int | None = None
+    min_episodes_per_submit: Int | None = None
+    max_episodes_per_submit: Int | None = None
+    n_validation: Int | None = None
+    n_heldout: Int | None = None
     policy_scope: PolicyScope = "episode"
     observations: ObservationForm = "arrays"
     sandbox_tier: Tier = "bwrap"
@@ -53,11 +54,11 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     replays: VideoOption | None = None
     """Which held-out episodes of the selected checkpoint are recorded for people to watch; None: as `video`."""
     limits: ResourceLimits = ResourceLimits()
-    notes: dict[str, str] = {}
+    notes: Named[Text] = {}
     """The operator's own labels; kept in `run.json`."""
     hidden_cases: HiddenCases = "shared"
     simulation: SimulationRule = "forbidden"
-    agent_host: str = ""
+    agent_host: Word = ""
     """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
 
     @property
@@ -69,8 +70,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
 class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
     """Open a run. Safe to send again with the same key."""
 
-    token: str
-    key: str
+    token: Word
+    key: Word
     """Idempotency key: creating twice with one key gives the same run."""
     settings: RunSettings
 
@@ -78,53 +79,53 @@ class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
 class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
     """The run is durable, and its gateway may open it."""
 
-    run: str
-    capability: str
+    run: Word
+    capability: Word
     """Token of this run's gateway."""
 
 
 class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """A finalised run as the coordinator knows it: the source of `run.json`."""
 
-    run: str
+    run: Word
     settings: RunSettings
     status: Literal["completed", "no_ok_submit", "error", "cancelled"]
-    error: str | None
-    close_reason: str
-    agent: dict[str, Any]
-    final_score: float | None
+    error: Text | None
+    close_reason: Text
+    agent: Plain
+    final_score: Number | None
     """Held-out mean return of the selected checkpoint."""
-    best_submit_index: int | None
-    val_scores: dict[int, float]
-    heldout_returns: tuple[float, ...]
-    validation_ineligible: dict[int, str]
+    best_submit_index: Int | None
+    val_scores: Numbered[Number]
+    heldout_returns: Many[Number]
+    validation_ineligible: Numbered[Text]
     """Checkpoints that were quarantined while hidden, with the reason."""
-    policy_failures: dict[str, int]
+    policy_failures: Named[Int]
     """Hidden episodes in which the selected policy failed, by split."""
-    random_heldout_returns: tuple[float, ...]
+    random_heldout_returns: Many[Number]
     """Uniform random actions on the same held-out cases."""
-    episode_budget: int
-    budget_used: int
-    split_hashes: dict[str, str]
+    episode_budget: Int
+    budget_used: Int
+    split_hashes: Named[Text]
     """SHA-256 by split name."""
     split_secret: bool
-    env_version: str
+    env_version: Word
     deterministic: bool
     fingerprint: Fingerprint | None
     """Of the worker that the run was pinned by."""
-    created_at: float
-    closed_at: float
-    finished_at: float
-    submits: tuple[SubmitRecord, ...]
-    wall_s: dict[str, float]
+    created_at: Number
+    closed_at: Number
+    finished_at: Number
+    submits: Many[SubmitRecord]
+    wall_s: Named[Number]
     """Seconds by phase: `queue`, `rollout`, `finalise`."""
-    infrastructure_retries: int = 0
-    nondeterministic_results: int = 0
+    infrastructure_retries: Int = 0
+    nondeterministic_results: Int = 0
     """Repeated attempts of one job whose results differed."""
     audit: AuditRecord | None = None
     """None where nothing was to be audited and no forger is known."""
     hidden_isolation: HiddenIsolation = "unknown"
-    fingerprint_overrides: tuple[str, ...] = ()
+    fingerprint_overrides: Many[Text] = ()
     """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
     reference_by_case: bool = False
     """The random actions follow from split and case; False for runs that an earlier version created."""
@@ -133,51 +134,51 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One accepted submit, for checkpoints and `metrics.json`."""
 
-    submit_index: int
+    submit_index: Int
     status: SubmitStatus
-    bundle: str | None
-    env_instances: tuple[int, ...]
-    remaining_budget: int
-    mean_return: float | None
+    bundle: Word | None
+    env_instances: Many[Int]
+    remaining_budget: Int
+    mean_return: Number | None
     """Visible mean over the train episodes; None unless ok."""
-    val_mean: float | None
-    started_at: float
-    completed_at: float
+    val_mean: Number | None
+    started_at: Number
+    completed_at: Number
 
 
 class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
     """A long poll until the run is finished; answered with `RunProgress` while it is not."""
 
-    token: str
-    run: str
-    wait_s: float
+    token: Word
+    run: Word
+    wait_s: Number
 
 
 class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
     """Where a run stands, and once it is finished all of it."""
 
     phase: Literal["open", "validation", "heldout", "random", "finished"]
-    done: int
+    done: Int
     """Episodes done of this phase."""
-    total: int
-    waits_for: str = ""
+    total: Int
+    waits_for: Text = ""
     finished: RunFinished | None = None
 
 
 class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     """Where episodes that are played again stood when a run played them: the policy is told the same."""
 
-    run: str
+    run: Word
     """The coordinator's id of the run; its policy seeds are used where the coordinator knows it. May be empty."""
-    submit_index: int
+    submit_index: Int
     """-1 for the random reference."""
-    env_instances: tuple[int, ...]
+    env_instances: Many[Int]
     """The whole list of cases that they were part of, in order."""
-    indexes: tuple[int, ...]
+    indexes: Many[Int]
     """Their positions in that list."""
-    modulo: int
+    modulo: Int
     """Episodes of the checkpoint's own submit: episode indexes count modulo this."""
-    remaining_budget_after: int
+    remaining_budget_after: Int
     policy_scope: PolicyScope = "episode"
     """With `submit`, `indexes` must be the whole list."""
     observations: ObservationForm = "arrays"
@@ -186,18 +187,18 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
 class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     """Play cases outside any run: `evopolicy try`, `evopolicy random`."""
 
-    token: str
-    key: str
-    env: str
-    bundle: str | None
+    token: Word
+    key: Word
+    env: Word
+    bundle: Word | None
     """None for uniform random actions."""
     split: Split
-    cases: tuple[int, ...] | None
+    cases: Many[Int] | None
     """Ids in the split; None for all of it."""
     record: Record = "full"
     sandbox_tier: Tier = "bwrap"
     limits: ResourceLimits = ResourceLimits()
-    replays: tuple[BlobRef, ...] = ()
+    replays: Many[BlobRef] = ()
     """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded before, `bundle` None."""
     as_in: PlayedAs | None = None
     """None for what was not played in a run before."""
@@ -206,90 +207,90 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
 class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):
     """What a cluster has for playing a finished run's episodes again."""
 
-    token: str
-    env: str
-    run: str = ""
-    n_validation: int | None = None
-    n_heldout: int | None = None
+    token: Word
+    env: Word
+    run: Word = ""
+    n_validation: Int | None = None
+    n_heldout: Int | None = None
     """Of the run, where they were not the suite's own."""
 
 
 class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_state"):
     """The answer to `DescribeEnvironment`."""
 
-    split_hashes: dict[str, str]
+    split_hashes: Named[Text]
     """SHA-256 by split name: equal to a run's where the cases are the same."""
     knows_run: bool
     """The run is finished here, and its episodes' records may still be stored."""
-    fingerprints: tuple[Fingerprint, ...]
+    fingerprints: Many[Fingerprint]
     """Of the connected workers that offer the environment, each once."""
 
 
 class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
     """Outcomes of a finished run's episodes as they were stored; answered with an `EvaluationPage`."""
 
-    token: str
-    run: str
+    token: Word
+    run: Word
     split: Split
-    submit_index: int
+    submit_index: Int
     """-1 for the random reference."""
-    cursor: int
+    cursor: Int
 
 
 class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_started"):
     """The evaluation is queued; also the answer to a repeated key."""
 
-    evaluation: str
+    evaluation: Word
 
 
 class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
     """A long poll for outcomes of an evaluation from a cursor on."""
 
-    token: str
-    evaluation: str
-    cursor: int
-    wait_s: float
+    token: Word
+    evaluation: Word
+    cursor: Int
+    wait_s: Number
 
 
 class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
     """Outcomes in order of arrival; `cursor` is where the next page begins."""
 
-    cursor: int
-    total: int
-    outcomes: tuple[EpisodeOutcome, ...]
+    cursor: Int
+    total: Int
+    outcomes: Many[EpisodeOutcome]
     finished: bool
-    waits_for: str = ""
+    waits_for: Text = ""
 
 
 class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
     """End a run or an evaluation without a score."""
 
-    token: str
-    run: str
+    token: Word
+    run: Word
 
 
 class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
     """The operator's word that a run's agent is no longer alive: ends its permit. For machines that are lost for good."""
 
-    token: str
-    run: str
+    token: Word
+    run: Word
 
 
 class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
     """Let a run go on with the workers of another fingerprint class; the reason is recorded in the run."""
 
-    token: str
-    run: str
-    fingerprint_class: str
+    token: Word
+    run: Word
+    fingerprint_class: Word
     """As `WorkerStatus.fingerprint` shows it."""
-    reason: str
+    reason: Text
 
 
 class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
     """Take a worker out of service, or back."""
 
-    token: str
-    worker: str
+    token: Word
+    worker: Word
     state: Literal["active", "paused", "draining"]
     """paused: it gets no more work and stays. draining: it gets no more, and ends once what it plays is done."""
 
@@ -301,18 +302,18 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
 class Claim(Message, frozen=True, kw_only=True, tag="claim"):
     """One run of a sweep, for this host to play: taken, renewed, given back or settled, so that none is played twice."""
 
-    token: str
-    suite: str
+    token: Word
+    suite: Word
     """The sweep's name."""
-    name: str
+    name: Word
     """The run's name in the sweep."""
-    holder: str
+    holder: Word
     """The host that asks; the same after its restart."""
-    ttl_s: float
+    ttl_s: Number
     """Asked for again before this many seconds are over; 0.0 gives it back."""
-    run: str = ""
+    run: Word = ""
     """The cluster's id of what is played for it, once there is one."""
-    result: dict[str, Any] | None = None
+    result: Plain | None = None
     """What it came to: settles the claim for good."""
 
 
@@ -321,98 +322,98 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
 
     granted: bool
     """The asker holds it, or may not and need not because it is settled."""
-    holder: str
+    holder: Word
     """Who holds or held it last; empty: nobody."""
-    run: str
+    run: Word
     """What the last holder played for it; empty: nothing yet."""
-    previous: str = ""
+    previous: Word = ""
     """The holder from whom it has just been taken over, because its time was up."""
-    result: dict[str, Any] | None = None
+    result: Plain | None = None
     """What it came to, once it is settled."""
 
 
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
     """What the cluster is doing."""
 
-    token: str
+    token: Word
 
 
 class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One worker that is connected, or was lately."""
 
-    worker: str
-    host: str
-    slots: int
+    worker: Word
+    host: Word
+    slots: Int
     state: Literal["active", "paused", "draining", "lost", "quarantined"]
-    tiers: tuple[Tier, ...]
-    environments: tuple[str, ...]
-    fingerprint: str
+    tiers: Many[Tier]
+    environments: Many[Text]
+    fingerprint: Text
     """Short class of the worker's fingerprint: equal for workers that may share a run."""
-    versions: dict[str, str]
+    versions: Named[Text]
     """What the class is made of: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
-    held: int
-    running: int
-    last_seen_s: float
+    held: Int
+    running: Int
+    last_seen_s: Number
     """Seconds since its last heartbeat."""
-    refused: dict[str, str] = {}
+    refused: Named[Text] = {}
     """Run id to why this worker gets no work of it."""
-    boot_id: str = ""
-    hidden_bar: str = ""
+    boot_id: Word = ""
+    hidden_bar: Text = ""
     """Why it plays no hidden episodes now; empty when it may."""
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One unfinished run."""
 
-    run: str
-    entry: str
-    env: str
-    phase: str
-    budget: int
-    remaining_budget: int
-    n_submits: int
-    queued: int
-    running: int
-    done: int
+    run: Word
+    entry: Word
+    env: Word
+    phase: Text
+    budget: Int
+    remaining_budget: Int
+    n_submits: Int
+    queued: Int
+    running: Int
+    done: Int
     """Episode jobs finished, train and hidden together."""
-    waits_for: str = ""
-    agent_host: str = ""
+    waits_for: Text = ""
+    agent_host: Word = ""
     """Where its agent may be alive: a host's name, a boot id, or `everywhere`; empty: nowhere."""
 
 
 class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
     """A worker whose registration was refused."""
 
-    worker: str
+    worker: Word
     """As it called itself."""
-    host: str
-    why: str
-    ago_s: float
+    host: Word
+    why: Text
+    ago_s: Number
     """Seconds since the last time."""
 
 
 class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """The answer to `StatusRequest`."""
 
-    cluster: str
-    version: str
-    uptime_s: float
-    episodes_done: int
-    episodes_per_s: float
+    cluster: Word
+    version: Word
+    uptime_s: Number
+    episodes_done: Int
+    episodes_per_s: Number
     """Over the last minute."""
-    workers: tuple[WorkerStatus, ...]
-    runs: tuple[RunStatus, ...]
-    stalls: tuple[str, ...] = ()
+    workers: Many[WorkerStatus]
+    runs: Many[RunStatus]
+    stalls: Many[Text] = ()
     """What waits longer than it should, and for what."""
-    audit_share: float = 0.0
+    audit_share: Number = 0.0
     """Share of the episodes of new runs that is played again elsewhere."""
-    audits: dict[str, int] = {}
+    audits: Named[Int] = {}
     """Of the unfinished runs: audited episodes by where they stand (`open`, `agreed`, `disputed`, `not_audited`)."""
-    disputes: tuple[str, ...] = ()
+    disputes: Many[Text] = ()
     """What workers disagree on, the latest last."""
-    quarantined: dict[str, str] = {}
+    quarantined: Named[Text] = {}
     """Workers that get no more leases, and why."""
-    turned_away: tuple[TurnedAway, ...] = ()
+    turned_away: Many[TurnedAway] = ()
 
 
 OperatorRequest = (

@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Text, Word
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.refusals import Refusal
@@ -19,76 +20,76 @@ class Refused(Message, frozen=True, kw_only=True, tag="refused"):
     """The request was understood and is not served; nothing was changed by it."""
 
     status: Refusal
-    message: str
+    message: Text
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
     """What a worker's numbers depend on, beside the seed."""
 
-    code_version: str
+    code_version: Word
     """Version and source digest of the worker's own code."""
-    python: str
-    packages: dict[str, str]
+    python: Word
+    packages: Named[Text]
     """Name to exact version of the packages that environments are made of."""
-    cpu: str
+    cpu: Text
     """CPU model and the features that numerical libraries choose their code by."""
 
 
 class Register(Message, frozen=True, kw_only=True, tag="register"):
     """The first thing a worker says, and again whenever the coordinator does not know its session."""
 
-    worker: str
+    worker: Word
     """The worker's name, unique in the cluster, such as `host-3f2a`."""
-    token: str
+    token: Word
     """The cluster's join token."""
-    protocol: int
+    protocol: Int
     """Wire protocol version; see `codec.WIRE_VERSION`."""
-    slots: int
-    tiers: tuple[Tier, ...]
-    environments: tuple[EnvironmentDescription, ...]
+    slots: Int
+    tiers: Many[Tier]
+    environments: Many[EnvironmentDescription]
     fingerprint: Fingerprint
-    host: str = ""
-    boot_id: str = ""
+    host: Word = ""
+    boot_id: Word = ""
     """Of the worker's kernel (`host.boot_id`); a worker without one plays no hidden episodes."""
-    machine_id: str = ""
+    machine_id: Word = ""
     """Of its machine (`host.machine_id`)."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):
     """The worker is known from now on, and may ask for leases."""
 
-    session: str
+    session: Word
     """To be sent with every later request; ends with the coordinator's or the worker's process."""
-    lease_ttl_s: float
+    lease_ttl_s: Number
     """A lease that no heartbeat renews for so long is taken away."""
-    heartbeat_s: float
-    refused: dict[str, str] = {}
+    heartbeat_s: Number
+    refused: Named[Text] = {}
     """Run id to why this worker gets no work of it, such as other versions than the run began with."""
-    hidden_bar: str = ""
+    hidden_bar: Text = ""
     """Why this worker gets no hidden work of any run; empty when it may."""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
     """A long poll for work: answered as soon as there is some, or empty after `wait_s`."""
 
-    worker: str
-    session: str
-    n: int
+    worker: Word
+    session: Word
+    n: Int
     """How many leases the worker can take; 0 takes back the poll that waits, and is answered at once with none."""
-    wait_s: float
-    warm_bundles: tuple[str, ...] = ()
-    warm_environments: tuple[str, ...] = ()
-    serial: int = 0
+    wait_s: Number
+    warm_bundles: Many[Text] = ()
+    warm_environments: Many[Text] = ()
+    serial: Int = 0
     """The worker's own number of this sending; grows, over its starts too. 0: it does not count."""
 
 
 class Lease(msgspec.Struct, frozen=True, kw_only=True):
     """The right, for a time, to play one job and hand in its result."""
 
-    lease_id: str
-    attempt: int
+    lease_id: Word
+    attempt: Int
     """Counts from 1 per job: fences off the results of attempts that were given up."""
-    stimulus_id: str
+    stimulus_id: Word
     """Runs from the event that made the job through every log line about it."""
     job: Job
     stop_in_silence: bool = False
@@ -98,33 +99,33 @@ class Lease(msgspec.Struct, frozen=True, kw_only=True):
 class Leases(Message, frozen=True, kw_only=True, tag="leases"):
     """The answer to a poll; empty when there was nothing in time."""
 
-    leases: tuple[Lease, ...]
-    cancelled: tuple[str, ...] = ()
+    leases: Many[Lease]
+    cancelled: Many[Text] = ()
     """Leases to stop at once, told here because the poll happened to wait; heartbeats tell them too."""
 
 
 class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
     """One lease in a worker's hands, as its heartbeat tells."""
 
-    lease_id: str
-    job_id: str
-    attempt: int
+    lease_id: Word
+    job_id: Word
+    attempt: Int
     running: bool
     """False while it waits in the worker's prefetch queue."""
-    episodes_done: int = 0
-    steps: int = 0
+    episodes_done: Int = 0
+    steps: Int = 0
     """Environment steps done in the running job: a sign of progress."""
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
     """Every lease that the worker holds, renewed by being listed."""
 
-    worker: str
-    session: str
-    held: tuple[HeldLease, ...]
-    wait_s: float = 0.0
+    worker: Word
+    session: Word
+    held: Many[HeldLease]
+    wait_s: Number = 0.0
     """The answer may be held back for so long, and then comes at once when there is a lease to stop."""
-    settled: int = 0
+    settled: Int = 0
     """All polls up to this number were over when `held` was put down: what they brought is in it, or was let go of. 0: the
     worker does not count its polls."""
 
@@ -132,7 +133,7 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
     """What the worker is to stop."""
 
-    cancelled: tuple[str, ...] = ()
+    cancelled: Many[Text] = ()
     """Leases to stop at once: expired, cancelled or preempted."""
     drain: bool = False
     """Ask for no more work; finish what runs."""
@@ -146,66 +147,66 @@ down, the supervisor lives (a strike); failed: infrastructure (environment crash
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     """What came of one lease."""
 
-    lease_id: str
-    job_id: str
-    attempt: int
+    lease_id: Word
+    job_id: Word
+    attempt: Int
     kind: ResultKind
-    episodes: tuple[EpisodeOutcome, ...] = ()
+    episodes: Many[EpisodeOutcome] = ()
     """In the job's order; empty unless `done`."""
     packed: BlobRef | None = None
     """`codec.pack_outcomes` of the episodes, uploaded before, where they are too large for a message."""
-    error: str = ""
+    error: Text = ""
     """For operators; never shown to an agent."""
 
 
 class HandIn(Message, frozen=True, kw_only=True, tag="done"):
     """Results. Answered once they are durable; sending the same again is safe."""
 
-    worker: str
-    session: str
-    results: tuple[JobResult, ...]
+    worker: Word
+    session: Word
+    results: Many[JobResult]
 
 
 class HandInReply(Message, frozen=True, kw_only=True, tag="done_reply"):
     """Every result of the request was taken (committed, compared, or found to be of a closed job)."""
 
-    n: int
+    n: Int
 
 
 class BlobPut(Message, frozen=True, kw_only=True, tag="blob_put"):
     """One chunk; chunks of a blob go in order, each answered before the next."""
 
-    sender: str
+    sender: Word
     """Worker's session or run id: whose right to write is checked."""
-    token: str
-    digest: str
-    size: int
+    token: Word
+    digest: Word
+    size: Int
     """Bytes of the whole blob."""
-    offset: int
-    data: bytes
+    offset: Int
+    data: Bytes
 
 
 class BlobAck(Message, frozen=True, kw_only=True, tag="blob_ack"):
     """How far a blob has come: the next chunk begins there."""
 
-    have: int
+    have: Int
     """Bytes that the receiver has; equal to `size` when it is stored (also when it was already there)."""
 
 
 class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
     """One chunk of a stored blob."""
 
-    sender: str
-    token: str
-    digest: str
-    offset: int
+    sender: Word
+    token: Word
+    digest: Word
+    offset: Int
 
 
 class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
     """The answer to `BlobGet`: the bytes from its offset on, and the size of the whole."""
 
-    size: int
-    data: bytes
+    size: Int
+    data: Bytes
 
 
 WorkerRequest = Register | LeaseRequest | Heartbeat | HandIn | BlobPut | BlobGet

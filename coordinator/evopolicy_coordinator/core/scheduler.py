@@ -47,6 +47,15 @@ LOOKS_MAX = 64
 VICTIMS_MAX = 256
 """Hidden leases looked at for a lane in one step."""
 
+LEASES_MAX = 256
+"""Most leases in one answer: it has to fit into a message."""
+
+EPISODES_MAX = 2048
+"""Of jobs with many episodes fewer are leased at once, but at least one."""
+
+HELD_MAX = 16_384
+"""Most leases that a worker may hold: its heartbeats name them all."""
+
 SUSPECTS_MAX = 16
 """Suspects looked at in one step."""
 
@@ -142,12 +151,14 @@ class Scheduler:
             return []
         free = worker.slots - worker.n_live
         leases: list[wire.Lease] = []
-        limit = self._limit(worker, poll.n, free)
-        while len(leases) < limit:
+        limit = min(self._limit(worker, poll.n, free), LEASES_MAX, HELD_MAX - len(worker.leases))
+        n_episodes = 0
+        while len(leases) < limit and n_episodes < EPISODES_MAX:
             job = core.queue.take(worker, poll.warm, turn.now)
             if job is None:
                 break
             leases.append(core.book.grant(job, worker, turn))
+            n_episodes += job.n
         return leases
 
     def _limit(self, worker: Worker, n: int, free: int) -> int:

@@ -138,6 +138,8 @@ def described(kind: inspect.Type) -> str:
     match kind:
         case inspect.UnionType(types=types):
             return " | ".join(described(one) for one in types)
+        case inspect.Metadata(type=plain):
+            return described(plain)
         case inspect.StructType(cls=cls):
             return cls.__name__
         case inspect.LiteralType(values=values):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,11 @@ from evopolicy_common import codec, keys
 from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.messages.worker import Message
+from evopolicy_coordinator import request_checks
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.intake import Intake
 from evopolicy_coordinator.splits import SplitSource
@@ -128,9 +129,16 @@ def test_run_may_ask_for_other_numbers(intake: Intake) -> None:
         ({"budget": 4, "min_episodes_per_submit": 5}, "5 to 4"),
         ({"min_episodes_per_submit": 0}, "0 to 128"),
         ({"n_heldout": 0}, "at least one"),
-        ({"limits": ResourceLimits(act_wall_s=math.nan)}, "limit act_wall_s is nan"),
+        ({"budget": 20_001}, "20,000"),
+        ({"budget": 20_000, "max_episodes_per_submit": 10_001}, "10,000"),
+        ({"n_heldout": 10_001}, "10,000"),
+        ({"n_validation": 10_001}, "10,000"),
+        ({"limits": ResourceLimits(act_wall_s=-1.0)}, "limit act_wall_s is -1.0"),
         ({"limits": ResourceLimits(memory_bytes=0)}, "limit memory_bytes is 0"),
-        ({"limits": ResourceLimits(submit_wall_s=math.inf)}, "limit submit_wall_s is inf"),
+        ({"limits": ResourceLimits(submit_wall_s=1e300)}, "limit submit_wall_s is 1e+300"),
+        ({"limits": ResourceLimits(output_bytes=65537)}, "at most 65,536"),
+        ({"limits": ResourceLimits(action_bytes=1 << 30)}, "at most 1,048,576"),
+        ({"limits": ResourceLimits(memory_bytes=1 << 60)}, "limit memory_bytes"),
     ],
 )
 def test_run_with_impossible_settings_is_refused(
@@ -139,6 +147,26 @@ def test_run_with_impossible_settings_is_refused(
     error = refused(intake, OPS, create(**settings))
     assert error.status == "invalid_settings"
     assert message in error.message
+
+
+def test_what_an_agent_is_said_to_have_done_is_bounded_and_closes_its_run_all_the_same(
+    intake: Intake,
+) -> None:
+    key = keys.gateway_key("c", "r", "close")
+    for facts in ({"turns": 3}, {"turns": 3, "notes": ["x" * 1000] * 300}):
+        made = event(
+            intake, key, gateway.CloseRun(run="r", token="capable", reason="agent_stopped", agent=facts)
+        )
+        assert made.agent == (
+            facts if len(facts) == 1 else {"left_out": "300,917 bytes; 262,144 are the limit"}
+        )
+
+
+def test_a_submits_episodes_fit_into_one_lease_with_policy_scope_submit() -> None:
+    cases = [Case(seed=k, options={"map": "x" * 4000}) for k in range(5)]
+    request_checks.check_job(cases, 1000)
+    with pytest.raises(RefusedError, match="4000 episodes"):
+        request_checks.check_job(cases, 4000)
 
 
 def test_evaluation_plays_the_cases_named(intake: Intake) -> None:
@@ -227,7 +255,7 @@ def test_wrong_registration_is_refused(intake: Intake, changes: dict[str, Any], 
     assert refused(intake, key, worker.Register(**{**values, **changes})).status == status
 
 
-@given(wait=st.floats(), cursor=st.integers(-(2**63), 2**64 - 1))
+@given(wait=st.floats(allow_nan=False, allow_infinity=False), cursor=st.integers(-(2**63), 2**63 - 1))
 def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
     tmp_path_factory: pytest.TempPathFactory, wait: float, cursor: int
 ) -> None:
@@ -238,7 +266,7 @@ def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
     assert 0 <= made.cursor < 2**31
 
 
-@pytest.mark.parametrize("index", [-1, 2**63])
+@pytest.mark.parametrize("index", [-1, 2**31, 2**63 - 1])
 def test_submit_index_that_cannot_be_is_unknown(intake: Intake, index: int) -> None:
     message = gateway.ResultsRequest(run="r", token="capable", submit_index=index, cursor=0, wait_s=0)
     assert refused(intake, keys.gateway_key("c", "r", "results"), message).status == "unknown_submit"

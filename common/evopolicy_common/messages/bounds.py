@@ -1,0 +1,93 @@
+"""How large a part of a message may be: refused by the decoder, and by `codec.encode` before it is sent.
+
+Wide enough for whatever earlier versions have stored; what a message may be as a whole is `codec.MAX_MESSAGE_BYTES`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from functools import cache
+from typing import Annotated, Any, TypeVar
+
+from msgspec import Meta, Struct, inspect
+
+T = TypeVar("T")
+
+MAX_DEPTH = 32
+"""How deep a `Plain` value may nest."""
+MAX_VALUES = 1 << 20
+"""How many values it may be made of."""
+
+Word = Annotated[str, Meta(max_length=1024)]
+"""A name, an id, a token, a digest."""
+Text = Annotated[str, Meta(max_length=1 << 18)]
+Bytes = Annotated[bytes, Meta(max_length=16 << 20)]
+Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+"""Finite."""
+Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
+Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
+Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
+Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True})]
+"""What JSON can say; `check_plain` bounds what is in it."""
+
+
+def plain_parts(message: Struct) -> Iterator[object]:
+    """The `Plain` parts of a message, and of the structs in it."""
+    for name, plain in _fields(type(message)):
+        value = getattr(message, name)
+        if value is None:
+            continue
+        if plain:
+            yield value
+        else:
+            for item in value if isinstance(value, tuple) else (value,):
+                yield from plain_parts(item)
+
+
+@cache
+def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
+    """The fields of a struct that are `Plain` (True), or that are or list structs in which there are some."""
+    found = inspect.type_info(kind)
+    assert isinstance(found, inspect.StructType)
+    fields = []
+    for field in found.fields:
+        kinds = list(_alternatives(field.type))
+        if any(isinstance(each, inspect.Metadata) and (each.extra or {}).get("plain") for each in kinds):
+            fields.append((field.name, True))
+        elif any(isinstance(each, inspect.StructType) and _fields(each.cls) for each in kinds):
+            fields.append((field.name, False))
+    return tuple(fields)
+
+
+def _alternatives(found: inspect.Type) -> Iterator[inspect.Type]:
+    """What a field may be, and of a list what is in it."""
+    if isinstance(found, inspect.UnionType):
+        for each in found.types:
+            yield from _alternatives(each)
+    elif isinstance(found, inspect.VarTupleType):
+        yield from _alternatives(found.item_type)
+    else:
+        yield found
+        if isinstance(found, inspect.Metadata):
+            yield from _alternatives(found.type)
+
+
+def check_plain(value: object) -> None:
+    """ValueError for a value that nests too deep or is made of too many."""
+    n = 0
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        n += len(level)
+        if n > MAX_VALUES:
+            raise ValueError(f"it is made of more than {MAX_VALUES:,} values")
+        level = [
+            item
+            for part in level
+            if isinstance(part, dict | list | tuple)
+            for item in (part.values() if isinstance(part, dict) else part)
+        ]
+        if not level:
+            return
+    raise ValueError(f"it nests deeper than {MAX_DEPTH}")
