@@ -68,6 +68,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "is_finalized": "bool",
         "in_flight": "SubmitInFlight | none",
         "held_s": "float",
+        "cancelled": "bool",
     },
     "SubmitInFlight": {
         "submit_index": "int",
@@ -113,7 +114,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     "BlobRef": {"digest": "str", "size": "int", "inline": "bytes | none"},
     "SubmitDone": {
         "status": (
-            "'denied_import' | 'import_error' | 'init_error' | 'missing_policy' | 'ok' | 'quarantined'"
+            "'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'missing_policy' | 'ok' | 'quarantined'"
             " | 'rollout_timeout'"
         ),
         "n_episodes": "int",
@@ -128,7 +129,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     "RunClosed": {},
     "BlobAck": {"have": "int"},
     "BlobChunk": {"size": "int", "data": "bytes"},
-    "Refused": {"status": "str", "message": "str"},
+    "Refused": {"status": "enum", "message": "str"},
 }
 """Type to field to what the field may hold."""
 
