@@ -2,7 +2,8 @@
 
 Rules: the episode loop never waits for this thread and pays nothing for it per step. Whoever touches a policy's output
 descriptors holds the lock. A limit that is passed ends the policy by SIGKILL; the loop then finds its pipe closed and
-the verdict here.
+the verdict here. Wall time in which the policy was not let run counts for no limit: it was stopped from outside, it waited for a
+processor that its own threads did not use, or this process stood still itself.
 """
 
 from __future__ import annotations
@@ -22,6 +23,14 @@ from evopolicy_worker.sandbox.zygote import Child
 TICK_S = 0.1
 """How often limits are looked at while a policy works, seconds; sooner when one is near."""
 _SHORTEST_TICK_S = 0.005
+_SLOW_S = 0.05
+"""How long a policy owes an answer before it is looked at whether it runs."""
+LATE_S = 0.5
+"""A look that comes so much later than planned means that this process was not let run, seconds."""
+STOPPED_S = 10.0
+"""A policy that is stopped from outside for so long is ended, and started again."""
+STOPPED = ("T", "t")
+"""States of a process that is stopped, or held by a debugger."""
 _PIECE = 65536
 
 
@@ -68,7 +77,10 @@ class Output:
 class Watch:
     """What is watched of one policy process. The episode loop writes the times, the monitor reads them."""
 
-    def __init__(self, child: Child, limits: ResourceLimits, *, count_threads: bool) -> None:
+    def __init__(
+        self, child: Child, limits: ResourceLimits, *, count_threads: bool, held: bool = False
+    ) -> None:
+        """`held`: whether only others can stop it."""
         self.child = child
         self.limits = limits
         self.stdout = Output(limits.output_bytes)
@@ -82,6 +94,18 @@ class Watch:
         """Its earlier wall time in this episode."""
         self.cpu_start_s = 0.0
         self.verdict: Verdict | None = None
+        self.stopped = False
+        """Whether it was ended because it stood stopped."""
+        self._held = held
+        self._looked = self._next = time.monotonic()
+        # What is excused, seconds: in the episode; in the answer that was owed at the last look, since when; the waits for a
+        # processor apart, which the kernel counts.
+        self._excused_s = self._in_episode_s = 0.0
+        self._answer = self._answer_excused_s = self._in_answer_s = 0.0
+        self._episode_waited = 0.0
+        self._answer_waited: float | None = None
+        # How long it has been stopped, and waiting, up to the last look.
+        self._stood_s = self._waiting_s = self._cpu_s = 0.0
         self._cpu_clock = (~child.host_pid << 3) | 2 if child.host_pid else 0
         self._count_threads = count_threads
         for fd in (child.stdout, child.stderr):
@@ -89,8 +113,9 @@ class Watch:
 
     def begin_episode(self) -> None:
         """Wall and CPU time count from here."""
-        self.spent_s = 0.0
+        self.spent_s = self._excused_s = self._in_episode_s = 0.0
         self.cpu_start_s = self.cpu_s()
+        self._episode_waited = self._waited_s(self.cpu_start_s)
 
     def cpu_s(self) -> float:
         """CPU time of the process so far, seconds; 0.0 when it is gone."""
@@ -106,13 +131,27 @@ class Watch:
 
     def judge(self, now: float) -> float:
         """Ends the policy if it passed a limit; seconds until it is worth looking again."""
+        self._excuse(now)
+        pause_s = self._judge(now)
+        self._next = now + pause_s
+        return pause_s
+
+    def _judge(self, now: float) -> float:
         since = self.since
         if not since or self.verdict is not None:
             return TICK_S
+        if self._stood_s > STOPPED_S and self.since == since:
+            self.stopped = True
+            self.child.kill()
+            return TICK_S
         limits = self.limits
-        running = now - since
+        running, in_episode = self._used(since, now)
+        if running >= self.answer_limit_s or in_episode >= limits.episode_wall_s:
+            # Answers of late may have waited, too, and it was not looked.
+            self._count_waits(self.cpu_s())
+            running, in_episode = self._used(since, now)
         left_answer = self.answer_limit_s - running
-        left_episode = limits.episode_wall_s - self.spent_s - running
+        left_episode = limits.episode_wall_s - in_episode
         cpu = self.cpu_s() - self.cpu_start_s
         verdict: Verdict | None = None
         if left_answer <= 0:
@@ -123,12 +162,11 @@ class Watch:
                 running,
             )
         elif left_episode <= 0:
-            used = self.spent_s + running
             verdict = Verdict(
                 "episode_timeout",
                 f"the policy worked for longer than {limits.episode_wall_s:g} s in this episode",
                 limits.episode_wall_s,
-                used,
+                in_episode,
             )
         elif cpu > limits.cpu_s:
             verdict = Verdict(
@@ -148,6 +186,55 @@ class Watch:
             self.verdict = verdict
             self.child.kill()
         return max(_SHORTEST_TICK_S, min(TICK_S, left_answer, left_episode))
+
+    def _excuse(self, now: float) -> None:
+        """Count the time from the last look on in which the policy was not let run."""
+        since, looked, self._looked = self.since, self._looked, now
+        if self._answer != since:
+            self._answer, self._answer_waited = since, None
+            self._answer_excused_s = self._stood_s = self._waiting_s = self._in_answer_s = 0.0
+        owed_s = now - max(since, looked) if since else 0.0
+        if now - self._next > LATE_S:
+            # The episode loop stood still, too, whether or not it has its answer by now.
+            self._excused_s += now - looked
+            self._answer_excused_s += owed_s
+        elif owed_s and now - since > _SLOW_S:
+            cpu_s, state = self.cpu_s(), _state(self.child.host_pid)
+            if self._held and state in STOPPED:
+                self._stood_s += owed_s
+                self._excused_s += owed_s
+                self._answer_excused_s += owed_s
+            else:
+                self._stood_s = 0.0
+            # The kernel counts a wait when it is over.
+            self._waiting_s = self._waiting_s + owed_s if state == "R" and cpu_s == self._cpu_s else 0.0
+            self._cpu_s = cpu_s
+            self._count_waits(cpu_s)
+
+    def _count_waits(self, cpu_s: float) -> None:
+        waited = self._waited_s(cpu_s)
+        self._answer_waited = waited if self._answer_waited is None else self._answer_waited
+        self._in_episode_s = max(0.0, waited - self._episode_waited)
+        self._in_answer_s = max(0.0, waited - self._answer_waited)
+
+    def _used(self, since: float, now: float) -> tuple[float, float]:
+        """Wall time of the answer that is owed and of the episode, without what is excused, seconds."""
+        owed_s = now - since - self._waiting_s
+        in_answer = owed_s - self._answer_excused_s - self._in_answer_s
+        return in_answer, self.spent_s + owed_s - self._excused_s - self._in_episode_s
+
+    def _waited_s(self, cpu_s: float) -> float:
+        """How long the process's first thread has waited so far for a processor that its other threads did not have, seconds.
+
+        0.0 where the kernel does not tell.
+        """
+        pid = self.child.host_pid
+        try:
+            with open(f"/proc/{pid}/task/{pid}/schedstat") as file:
+                ran, waited = file.read().split()[:2]
+            return int(waited) / 1e9 - (cpu_s - int(ran) / 1e9)
+        except (OSError, ValueError):
+            return 0.0
 
 
 class Monitor(threading.Thread):
@@ -212,6 +299,20 @@ class Monitor(threading.Thread):
                     pause_s = watch.judge(time.monotonic())
             if busy:
                 self._on_tick()
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether the process is stopped, or held by a debugger."""
+    return _state(pid) in STOPPED
+
+
+def _state(pid: int) -> str:
+    """The letter of the state of the process's first thread; empty when there is none."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return ""
 
 
 def _threads(pid: int) -> int:

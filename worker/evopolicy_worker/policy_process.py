@@ -21,7 +21,7 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, Re
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_worker import endings, frames
 from evopolicy_worker.endings import EndedFromOutsideError, Ending
-from evopolicy_worker.monitor import Monitor, Verdict, Watch
+from evopolicy_worker.monitor import STOPPED_S, Monitor, Verdict, Watch
 from evopolicy_worker.sandbox import zygote as zygotes
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
@@ -104,11 +104,11 @@ class PolicyProcess:
         self._limits = limits
         self._home = jail.home or folder
         self._enclosed = jail.home is not None
-        self._watch = Watch(child, limits, count_threads=not self._enclosed)
-        self._base_bytes, self._base_resident = _memory(child.host_pid)
-        self._oom_kills = oom_kills
         # A CPU limit of the worker's own is the policy's too, and ends it by SIGKILL.
         self._held = bool(jail.config["seals"]) and resource.getrlimit(resource.RLIMIT_CPU) == (-1, -1)
+        self._watch = Watch(child, limits, count_threads=not self._enclosed, held=self._held)
+        self._base_bytes, self._base_resident = _memory(child.host_pid)
+        self._oom_kills = oom_kills
         self._write: frames.Writer = list
         self._action_bytes = 0
         self._usual_bytes = 0
@@ -400,10 +400,12 @@ class PolicyProcess:
             alive = not wait_dead(self._child.pidfd, _EXIT_S)
         self._bury()
         exit_, found = self._exit, watch.verdict
-        if found is None and exit_ is not None and not alive:
+        if found is None and exit_ is not None and not alive and not watch.stopped:
             found = self._limit_of(exit_)
         if found is not None:
             ending, text = Ending("policy", "SIGKILL", found.category), found.message
+        elif watch.stopped:
+            ending, text = Ending("policy", "stop"), f"the policy's process was stopped for {STOPPED_S:g} s"
         elif alive:
             ending, text = Ending("policy", "pipe"), "the policy closed the pipe that it answers on"
         elif exit_ is None:

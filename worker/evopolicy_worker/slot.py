@@ -24,6 +24,7 @@ from evopolicy_common.scratch import remove_tree
 from evopolicy_worker import endings
 from evopolicy_worker import slot_messages as messages
 from evopolicy_worker.endings import Ending, How
+from evopolicy_worker.monitor import is_stopped
 from evopolicy_worker.sandbox import env_jail, jail
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -32,6 +33,9 @@ START_TIMEOUT_S = 120.0
 CANCEL_TIMEOUT_S = 20.0
 LAST_WORDS_S = 5.0
 """A cancelled job that has not stopped by then takes its processes with it."""
+STOPPED_S = 30.0
+"""Processes that are stopped from outside for so long are ended, and their job is played elsewhere."""
+_LOOK_S = 5.0
 MAX_ANSWER_BYTES = 1 << 31
 
 
@@ -116,6 +120,7 @@ class Slot:
             raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
         self._idle.clear()
         self._cancelled = False
+        watcher = asyncio.create_task(self._end_what_is_stopped())
         outcomes: list[EpisodeOutcome] = []
         try:
             if job.video and not self._draws and env_jail.graphics_devices():
@@ -155,6 +160,7 @@ class Slot:
             self._end_process()
             raise
         finally:
+            watcher.cancel()
             self._idle.set()
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
@@ -228,6 +234,18 @@ class Slot:
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             raise SlotDiedError(await self._last_words()) from error
 
+    async def _end_what_is_stopped(self) -> None:
+        """Ends the processes when the environment's has been stopped from outside for long."""
+        stood_s = 0.0
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            process = self._process
+            pids = [] if process is None else [process.pid, *_children(process.pid, self._start.tier)]
+            stood_s = stood_s + _LOOK_S if any(map(is_stopped, pids)) else 0.0
+            if stood_s >= STOPPED_S:
+                log.warning("slot was stopped from outside", for_s=stood_s)
+                self._end_process()
+
     def _how_it_ended(self) -> How:
         code = None if self._process is None else self._process.returncode
         if code is None:
@@ -262,6 +280,16 @@ class Slot:
                 log.warning("slot notes", text=text.removeprefix(messages.NOTE))
             else:
                 log.debug("slot says", text=text)
+
+
+def _children(pid: int, tier: Tier) -> list[int]:
+    """The environment's process inside its jail, and what stands between; of tier bwrap, below which the policies' is."""
+    found: list[int] = []
+    with contextlib.suppress(OSError, ValueError):
+        for _ in range(2 if tier == "bwrap" else 0):
+            pid = int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
+            found.append(pid)
+    return found
 
 
 def bundle_files(folder: Path, sent: str = "") -> messages.Files:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import os
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +21,7 @@ from slots import HONEST, QUICK, Slots, begun, family, make_job, misbehaving, pi
 
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_worker import endings
+from evopolicy_worker import endings, monitor
 from evopolicy_worker.endings import FAULTS, FIRSTS, HOWS, TABLE, Ending
 from evopolicy_worker.slot import Slot
 
@@ -112,7 +116,7 @@ class Policy:
 """
 
 
-def stateful(pause_s: float = 3.0, at: int = 31) -> str:
+def stateful(pause_s: float = 5.0, at: int = 31) -> str:
     return STATEFUL.replace("PAUSE_AT", str(at)).replace("PAUSE_S", str(pause_s))
 
 
@@ -134,7 +138,7 @@ async def in_its_pause(slot: Slot, pid: int) -> None:
 
 
 def played(
-    slots: Slots, slot: Slot, signals: list[int], pause_s: float = 3.0, **options: object
+    slots: Slots, slot: Slot, signals: list[int], pause_s: float = 5.0, **options: object
 ) -> EpisodeOutcome:
     """One episode in which the policy's process gets these signals in its pause."""
 
@@ -299,6 +303,160 @@ def test_an_environment_that_crashes_before_a_policys_first_action_is_ours(slots
     slots.run(slot.close())
 
 
+def removed(group: Path) -> None:
+    """Removes a cgroup, once its last process is gone."""
+    for _ in range(500):
+        with contextlib.suppress(OSError):
+            group.rmdir()
+            return
+        time.sleep(0.02)
+    group.rmdir()
+
+
+# Stops, and processors that are not given.
+
+LESS_TIGHT = msgspec.structs.replace(QUICK, act_wall_s=3.0, episode_wall_s=4.0)
+TIGHT = msgspec.structs.replace(QUICK, act_wall_s=1.0, episode_wall_s=4.0)
+
+
+def stopped(
+    slots: Slots, slot: Slot, which: str, stop_s: float, source: str, **options: object
+) -> EpisodeOutcome:
+    """One episode in which processes of the slot are stopped for a while in the policy's pause."""
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, source, **options)
+        pids = family(pid_of(slot))
+        await asyncio.sleep(0.3)
+        env = place_of_env(pids)
+        chosen = {
+            "policy": pids[-1:],
+            "environment": pids[env : env + 1],
+            "all": pids,
+            "sandbox": pids[env + 1 : -1],
+        }
+        for pid in chosen[which]:
+            os.kill(pid, signal.SIGSTOP)
+        await asyncio.sleep(stop_s)
+        for pid in chosen[which]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+        return await asyncio.wait_for(task, 100)
+
+    (outcome,) = slots.run(work())
+    return outcome
+
+
+@pytest.mark.parametrize("which", ["policy", "environment", "sandbox", "all"])
+def test_no_wall_limit_counts_the_time_of_a_stop(slots: Slots, which: str) -> None:
+    source = stateful(0.7)
+    undisturbed = slots.play(stateful(0.0), limits=PATIENT)
+    # Longer than an answer, and an episode, may take.
+    outcome = stopped(slots, slots.slot(), which, 6.0, source, limits=TIGHT)
+    assert outcome.failure is None
+    assert essence(outcome) == essence(undisturbed)
+
+
+def test_a_policy_that_is_stopped_for_good_is_started_again(slots: Slots) -> None:
+    slot = slots.slot()
+    undisturbed = slots.play(stateful(0.0), limits=PATIENT)
+    slot._said.clear()
+    outcome = stopped(slots, slot, "policy", 2 * monitor.STOPPED_S, stateful(0.7), limits=TIGHT)
+    assert essence(outcome) == essence(undisturbed)
+    assert any("was stopped for 10 s" in line for line in slot._said)
+
+
+def test_a_slot_whose_environment_is_stopped_for_good_is_given_up(
+    slots: Slots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evopolicy_worker.slot.STOPPED_S", 1.0)
+    monkeypatch.setattr("evopolicy_worker.slot._LOOK_S", 0.2)
+    slot = slots.new()
+    slots.run(slot.start())
+    with pytest.raises(SlotDiedError):
+        stopped(slots, slot, "environment", 5.0, stateful(0.7), limits=TIGHT)
+    slots.run(slot.close())
+
+
+def test_where_a_policy_may_stop_itself_the_time_counts(slots: Slots) -> None:
+    source = misbehaving(act="os.kill(os.getpid(), signal.SIGSTOP)")
+    failure = slots.play(source, tier="none", limits=TIGHT).failure
+    assert failure is not None
+    assert failure.category == "act_timeout"
+
+
+@pytest.fixture
+def cpu_group(tmp_path: Path) -> Iterator[Path]:
+    """A cgroup of one's own whose processes get next to nothing of a processor that others want."""
+    group = Path("/sys/fs/cgroup/cpu") / f"evopolicy-{os.getpid()}-{tmp_path.name}"
+    try:
+        group.mkdir()
+        (group / "cpu.shares").write_text("5")
+    except OSError as error:
+        pytest.skip(f"no cpu cgroup can be made ({error}): run as root where the cpu controller is writable")
+    yield group
+    removed(group)
+
+
+COMPUTES = """
+import time, threading
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+
+    def reset(self, episode_index):
+        pass
+
+    def act(self, obs):
+        self.n += 1
+        if self.n == 4:
+            time.sleep(0.3)
+            OTHERS
+            end = time.thread_time() + MINE
+            while time.thread_time() < end:
+                pass
+        return [0.0]
+"""
+
+
+def test_no_wall_limit_counts_the_time_for_which_a_policy_waits_for_a_processor(
+    slots: Slots, cpu_group: Path
+) -> None:
+    slot = slots.slot()
+    source = COMPUTES.replace("OTHERS", "pass").replace("MINE", "0.02")
+
+    async def work() -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, source, limits=LESS_TIGHT)
+        await asyncio.sleep(0.2)
+        pid = family(pid_of(slot))[-1]
+        (cpu_group / "cgroup.procs").write_text(str(pid))
+        os.sched_setaffinity(pid, {0})
+        return await asyncio.wait_for(task, 100)
+
+    hog = subprocess.Popen(
+        [sys.executable, "-c", "import os; os.sched_setaffinity(0, {0})\nwhile True: pass"]
+    )
+    try:
+        (outcome,) = slots.run(work())
+    finally:
+        hog.kill()
+        hog.wait()
+    # Its fiftieth of a second took longer than an answer may.
+    assert outcome.wall_s > 0.3 + LESS_TIGHT.act_wall_s
+    assert outcome.failure is None
+
+
+def test_a_policy_that_waits_for_its_own_threads_is_not_excused(slots: Slots) -> None:
+    threads = "[threading.Thread(target=lambda: [None for _ in iter(int, 1)], daemon=True).start() for _ in range(6)]"
+    source = COMPUTES.replace("OTHERS", threads).replace("MINE", "30")
+    failure = slots.play(source, limits=TIGHT).failure
+    assert failure is not None
+    assert failure.category in ("act_timeout", "cpu_limit")
+    assert failure.used is not None
+    assert failure.used < 10
+
+
 # What a policy can do to itself. Each is its failure, or has no effect; none gives it another throw of its dice.
 
 SELF_MADE = {
@@ -452,7 +610,7 @@ def memory_group(tmp_path: Path) -> Iterator[Path]:
             f"no memory cgroup can be made ({error}): run as root where the memory controller is writable"
         )
     yield group
-    group.rmdir()
+    removed(group)
 
 
 def eats(n_bytes: int) -> str:
