@@ -155,6 +155,7 @@ class Load:
                 split_secret=True,
             )
         )
+        self.tell(events.PermitRequested(request=self.request(), run=run, boot_id=f"agent-of-{run}"))
         self._submit(run)
 
     def _submit(self, run: str) -> None:

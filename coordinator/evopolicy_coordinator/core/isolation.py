@@ -69,6 +69,10 @@ class Family:
     relatives: dict[Family, None] = field(default_factory=dict)
     """Those that share a case with it, itself included."""
     users: int = 0
+    hidden_on: dict[Kernel, int] = field(default_factory=dict)
+    """Kernels to how many of its hidden jobs are there."""
+    lanes: dict[Lane, None] = field(default_factory=dict)
+    """Where its jobs wait, or have waited."""
 
 
 class Families:
@@ -148,6 +152,7 @@ class Ask:
 
     row: PermitRow
     family: Family
+    kernel: Kernel
 
 
 @dataclass(slots=True, eq=False)
@@ -230,6 +235,10 @@ class Isolation:
         """By run."""
         self._known: dict[str, KernelRow] = {}
         """By worker: as stored."""
+        self._asks: dict[tuple[str, str], Ask] = {}
+        """By run and boot id."""
+        self._boots: dict[str, dict[str, None]] = {}
+        """By machine: the boot ids under which something of it is known."""
         self._grantable = False
         """A permit that is asked for may have become possible in this step."""
 
@@ -240,7 +249,7 @@ class Isolation:
             found = self.kernels[boot_id] = Kernel(boot_id)
         return found
 
-    def _tidy(self, kernel: Kernel) -> None:
+    def tidy(self, kernel: Kernel) -> None:
         """Forget a kernel on which nothing is."""
         parts = (
             kernel.workers,
@@ -254,6 +263,14 @@ class Isolation:
             self.kernels.pop(kernel.boot_id, None)
 
     # ---- what is barred ----
+
+    def concerns(self, priority: int, worker: Worker) -> bool:
+        """Whether `bar` may hold for any family."""
+        if priority == TRAIN:
+            kernel = worker.kernel
+            there = kernel.hidden or kernel.reversals or self.everywhere.hidden
+            return self.on and (bool(there) or kernel is self.everywhere)
+        return self.on and priority in HIDDEN
 
     def bar(self, priority: int, family: Family | None, worker: Worker) -> bool:
         """Whether a job of that priority and family must not be leased to a worker now."""
@@ -272,8 +289,9 @@ class Isolation:
         assert family is not None
         if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):
             return False
+        busy = worker.profile.busy
         return any(
-            not family.relatives.keys().isdisjoint(lane.waiting[TRAIN]) for lane in worker.profile.busy
+            lane in busy and each in lane.waiting[TRAIN] for each in family.relatives for lane in each.lanes
         )
 
     def train_bar(self, family: Family | None, kernel: Kernel) -> bool:
@@ -355,8 +373,11 @@ class Isolation:
         self._enter(stay)
 
     def _enter(self, stay: Stay) -> None:
-        if stay.family is not None:
-            stay.family.users += 1
+        family = stay.family
+        if family is not None:
+            family.users += 1
+            if stay.hidden:
+                family.hidden_on[stay.kernel] = family.hidden_on.get(stay.kernel, 0) + 1
         _put(stay.kernel.hidden if stay.hidden else stay.kernel.train, stay.family, stay.id, stay)
 
     def left(self, lease: Lease, worker: Worker, turn: Turn, *, sure: bool) -> None:
@@ -375,17 +396,27 @@ class Isolation:
     def _gone(self, stay: Stay, turn: Turn) -> None:
         """A stay has ended: what it barred may go on."""
         index = stay.kernel.hidden if stay.hidden else stay.kernel.train
-        _take(index, stay.family, stay.id)
-        if not related(index, stay.family):
-            self.freed(stay.family, turn)
-        self._tidy(stay.kernel)
-        self.families.leave(stay.family)
+        family = stay.family
+        _take(index, family, stay.id)
+        if stay.hidden and family is not None:
+            left = family.hidden_on[stay.kernel] - 1
+            if left:
+                family.hidden_on[stay.kernel] = left
+            else:
+                del family.hidden_on[stay.kernel]
+        if not related(index, family):
+            self.freed(family, turn, train_too=stay.hidden)
+        self.tidy(stay.kernel)
+        self.families.leave(family)
 
-    def freed(self, family: Family | None, turn: Turn) -> None:
-        """Something of a family is barred no more, somewhere."""
-        self._grantable = True
-        for lane in self._core.queue.lanes.values():
-            if lane not in turn.dirty and lane.waits_of(family):
+    def freed(self, family: Family | None, turn: Turn, *, train_too: bool = True) -> None:
+        """Something of a family is barred no more, somewhere: hidden jobs, or train jobs and permits too."""
+        self._grantable = self._grantable or train_too
+        lanes: Iterable[Lane] = self._core.queue.lanes.values()
+        if family is not None:
+            lanes = [lane for each in family.relatives for lane in each.lanes]
+        for lane in lanes:
+            if lane not in turn.dirty and lane.waits_of(family, train_too=train_too):
                 turn.dirty[lane] = None
 
     def _forget(self, stay: Stay, turn: Turn) -> None:
@@ -469,14 +500,16 @@ class Isolation:
         """A worker is not on its kernel any more."""
         if self._core.fleet.workers.get(worker.name) is not worker:
             worker.kernel.workers.pop(worker.name, None)
-            self._tidy(worker.kernel)
+            self.tidy(worker.kernel)
 
     def booted(self, machine_id: str, boot_id: str, turn: Turn) -> None:
         """A machine has this boot id now: whatever was on it under another one has ended."""
         if not machine_id or not boot_id:
             return
-        for kernel in list(self.kernels.values()):
-            if kernel.boot_id in (boot_id, EVERYWHERE):
+        before, self._boots[machine_id] = self._boots.get(machine_id, {}), {boot_id: None}
+        for old in before:
+            kernel = self.kernels.get(old)
+            if kernel is None or old == boot_id:
                 continue
             for row in all_related(kernel.permits, None):
                 if row.machine_id == machine_id:
@@ -503,7 +536,8 @@ class Isolation:
             return ""
         if run.id not in kernel.asks.get(family, ()):
             family.users += 1
-            _put(kernel.asks, family, run.id, Ask(row, family))
+            ask = self._asks[run.id, kernel.boot_id] = Ask(row, family, kernel)
+            _put(kernel.asks, family, run.id, ask)
         self._preempt(family, kernel, turn)
         return self._grant(run.id, kernel, family, turn)
 
@@ -543,6 +577,7 @@ class Isolation:
     def _withdraw(self, run: str, kernel: Kernel, family: Family) -> Ask | None:
         """A permit is asked for no more."""
         ask = _take(kernel.asks, family, run)
+        self._asks.pop((run, kernel.boot_id), None)
         if ask is not None:
             self._core.timers.disarm(("ask", (run, kernel.boot_id)))
             self.families.leave(family)
@@ -550,24 +585,20 @@ class Isolation:
 
     def forget_ask(self, run: str, boot_id: str, turn: Turn) -> None:
         """A permit was not asked for again."""
-        kernel = self.kernels.get(boot_id)
-        families = [] if kernel is None else [each for each, there in kernel.asks.items() if run in there]
-        for family in families:
-            assert kernel is not None
-            assert family is not None
-            self._withdraw(run, kernel, family)
-            self.freed(family, turn)
-            self._tidy(kernel)
+        ask = self._asks.get((run, boot_id))
+        if ask is not None:
+            self.freed(ask.family, turn, train_too=False)
+            self._withdraw(run, ask.kernel, ask.family)
+            self.tidy(ask.kernel)
 
     def settle(self, turn: Turn) -> None:
         """At the end of a step: grant what has become possible."""
         if not self._grantable:
             return
         self._grantable = False
-        for kernel in list(self.kernels.values()):
-            for ask in all_related(kernel.asks, None):
-                self._preempt(ask.family, kernel, turn)
-                self._grant(ask.row.run, kernel, ask.family, turn)
+        for ask in list(self._asks.values()):
+            self._preempt(ask.family, ask.kernel, turn)
+            self._grant(ask.row.run, ask.kernel, ask.family, turn)
 
     def end(self, run: str, turn: Turn, why: str) -> None:
         """A run's agent is gone, wherever it was."""
@@ -577,9 +608,9 @@ class Isolation:
 
     def drop_asks(self, run: str, refusal: Refusal, text: str, turn: Turn) -> None:
         """Nothing more is granted to a run."""
-        for kernel in list(self.kernels.values()):
-            self.forget_ask(run, kernel.boot_id, turn)
-            for poll in self._core.polls.take_all(poll_target(run, kernel.boot_id)):
+        for name, boot_id in [key for key in self._asks if key[0] == run]:
+            self.forget_ask(name, boot_id, turn)
+            for poll in self._core.polls.take_all(poll_target(name, boot_id)):
                 turn.refuse(poll.request, refusal, text)
 
     def _end(self, kernel: Kernel, row: PermitRow, turn: Turn, why: str) -> None:
@@ -591,7 +622,7 @@ class Isolation:
         turn.persist(msgspec.structs.replace(row, ended_at=turn.now))
         turn.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)
         self.freed(family, turn)
-        self._tidy(kernel)
+        self.tidy(kernel)
         self.families.leave(family)
 
     def cancelled(self, run: str, turn: Turn, at: float | None = None) -> None:
@@ -618,12 +649,14 @@ class Isolation:
             self.restore(row, family)
             self.families.leave(family)
             state = states.get(row.run)
+            self._boots.setdefault(row.machine_id, {})[row.boot_id] = None
             if state is not None and state.phase == "finished":
                 at = turn.now if state.closed_at is None else min(state.closed_at, turn.now)
                 self._core.timers.arm_once(("cancelled", row.run), at + CANCELLED_S)
         for known in kernels:
             self._known[known.worker] = known
             kernel = self.kernel(known.boot_id)
+            self._boots.setdefault(known.machine_id, {})[known.boot_id] = None
             for hidden in (True, False):
                 if hidden and not known.boot_id:
                     continue
@@ -680,11 +713,14 @@ class Isolation:
             return "train episodes of runs with the same hidden cases to end"
         return f"a worker that tells its kernel's boot id: {NO_BOOT_ID}"
 
-    def to_clear(self, lane: Lane, family: Family | None) -> list[tuple[Kernel, list[Lease]]]:
-        """The kernels that related hidden jobs keep the lane's train jobs from, with what is to be stopped there; those
+    def to_clear(self, family: Family | None) -> list[tuple[Kernel, list[Lease]]]:
+        """The kernels that related hidden jobs keep a family's train jobs from, with what is to be stopped there; those
         with least to stop first. Nothing is to be stopped where it was already, but for what has not been let go of."""
         found = []
-        for kernel in self.serving(lane):
+        kernels = (
+            {} if family is None else {kernel: None for each in family.relatives for kernel in each.hidden_on}
+        )
+        for kernel in kernels:
             stays = all_related(kernel.hidden, family)
             if stays and not self._reversed(kernel, family):
                 found.append(

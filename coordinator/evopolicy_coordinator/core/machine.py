@@ -63,7 +63,7 @@ class Core:
         self.timers = Timers()
         self.chronicle = Story()
         self.isolation = Isolation(self)
-        self.queue = Queue(settings.warm_bonus_s, self.isolation.bar)
+        self.queue = Queue(settings.warm_bonus_s, self.isolation)
         self.fleet = Fleet(settings, self.queue, self.timers)
         self.book = LeaseBook(self)
         self.scheduler = Scheduler(self)

@@ -108,6 +108,7 @@ def turn_back(core: Core, reversal: Reversal, turn: Turn, why: str) -> None:
         del kernel.reversals[family]
     turn.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
     core.isolation.freed(family, turn)
+    core.isolation.tidy(kernel)
     core.isolation.families.leave(family)
 
 

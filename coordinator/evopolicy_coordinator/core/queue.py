@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
@@ -27,7 +27,7 @@ from evopolicy_common.messages.worker import Fingerprint
 from .jobs import HIDDEN, HIDDEN_FIRST, N_PRIORITIES, RANKS, TRAIN, JobState
 
 if TYPE_CHECKING:
-    from .isolation import Family, Reversal
+    from .isolation import Family, Isolation, Reversal
     from .leases import Lease
     from .workers import Worker
 
@@ -116,13 +116,12 @@ class Lane:
         if flow.closed and priority in HIDDEN and flow.family is not None:
             _add(self.backlog, flow.family, n)
 
-    def waits_of(self, family: Family | None) -> bool:
-        """Whether jobs wait of the family's relatives, or of any for None."""
-        for priority in (TRAIN, *HIDDEN):
-            there = self.waiting[priority]
-            if there and (family is None or not family.relatives.keys().isdisjoint(there)):
-                return True
-        return False
+    def waits_of(self, family: Family | None, *, train_too: bool) -> bool:
+        """Whether hidden jobs wait of the family's relatives, or of any for None, and no train jobs that they leave the
+        kernel to; with `train_too` whether any of both do."""
+        if _of(self.waiting[TRAIN], family):
+            return train_too
+        return any(_of(self.waiting[priority], family) for priority in HIDDEN)
 
     def slots(self) -> int:
         """Slots of the workers that may serve it."""
@@ -185,9 +184,8 @@ class Profile:
 class Queue:
     """All lanes, the flows in them and the profiles that serve them."""
 
-    def __init__(self, warm_bonus_s: float, bar: Callable[[int, Family | None, Worker], bool]) -> None:
-        """`bar` tells whether jobs of a priority and family must not be leased to a worker now."""
-        self._bar = bar
+    def __init__(self, warm_bonus_s: float, isolation: Isolation) -> None:
+        self._isolation = isolation
         self.lanes: dict[LaneKey, Lane] = {}
         self.profiles: dict[tuple[frozenset[str], frozenset[Tier], str], Profile] = {}
         self.suspects: dict[JobState, None] = {}
@@ -219,6 +217,8 @@ class Queue:
             for profile in self.profiles.values():
                 self._join(profile, lane)
         flow.pin, flow.lane = pin, lane
+        if flow.family is not None:
+            flow.family.lanes[lane] = None
         for priority in range(N_PRIORITIES):
             flow.in_heap[priority] = False
             lane.count(priority, flow, flow.n_ready[priority] + suspects.count(priority))
@@ -322,7 +322,7 @@ class Queue:
                     break
                 flow, priority = found
                 lane = found[0].lane
-                if self._bar(priority, flow.family, worker):
+                if self._isolation.bar(priority, flow.family, worker):
                     barred += 1
                 else:
                     job = self._first(flow, priority, worker, now, sole=lane.workers() <= 1)
@@ -358,10 +358,12 @@ class Queue:
 
     def _open(self, lane: Lane, priority: int, worker: Worker) -> bool:
         """Whether some family that waits in the lane may be leased on the worker's kernel."""
-        there = lane.waiting[priority]
-        if len(there) > BARRED_MAX:
+        there, isolation = lane.waiting[priority], self._isolation
+        if not there:
+            return False
+        if len(there) > BARRED_MAX or not isolation.concerns(priority, worker):
             return True
-        return any(not self._bar(priority, family, worker) for family in there)
+        return any(not isolation.bar(priority, family, worker) for family in there)
 
     def _serve(self, job: JobState) -> None:
         flow, priority = job.group.flow, job.priority
@@ -372,10 +374,13 @@ class Queue:
     def _best(self, worker: Worker, rank: tuple[int, ...], warm: Collection[str]) -> tuple[Flow, int] | None:
         best: tuple[Flow, int] | None = None
         best_score = 0.0
+        concerned = [priority for priority in rank if self._isolation.concerns(priority, worker)]
         for lane in worker.profile.busy:
             for priority in rank:
                 heap = lane.heaps[priority]
-                if not heap or not lane.n_ready[priority] or not self._open(lane, priority, worker):
+                if not heap or not lane.n_ready[priority]:
+                    continue
+                if priority in concerned and not self._open(lane, priority, worker):
                     continue
                 score, _, flow = heap[0]
                 if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
@@ -430,6 +435,10 @@ class Queue:
 
 def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
     return HIDDEN_FIRST if worker.kernel.reversals else RANKS
+
+
+def _of(there: dict[Family | None, int], family: Family | None) -> bool:
+    return bool(there) and (family is None or not family.relatives.keys().isdisjoint(there))
 
 
 def _add(counts: dict[T, int], key: T, n: int) -> None:

@@ -377,7 +377,7 @@ class Scheduler:
         them: one that stays bars its whole kernel. Gives the slots that come free."""
         core, slots = self._core, 0
         wanted = lane.waiting[TRAIN].get(family, 0)
-        for kernel, leases in core.isolation.to_clear(lane, family):
+        for kernel, leases in core.isolation.to_clear(family):
             if slots >= wanted:
                 break
             there = [core.fleet.workers[name] for name in kernel.workers if name != avoided]
