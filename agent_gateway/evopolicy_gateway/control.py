@@ -6,6 +6,7 @@ The child's stdout holds nothing else. When its stdin ends, its parent is gone, 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import sys
 import threading
@@ -180,11 +181,15 @@ class Orders:
         self._queue.put_nowait(None)
 
     def _read(self, loop: asyncio.AbstractEventLoop) -> None:
-        with open(sys.stdin.fileno(), "rb", closefd=False) as stdin:
-            for data in stdin:
-                try:
-                    order = _orders.decode(data)
-                except DECODE_ERRORS:
-                    continue
-                loop.call_soon_threadsafe(self._queue.put_nowait, order)
-        loop.call_soon_threadsafe(self._queue.put_nowait, None)
+        try:
+            with open(sys.stdin.fileno(), "rb", closefd=False) as stdin:
+                for data in stdin:
+                    try:
+                        order = _orders.decode(data)
+                    except DECODE_ERRORS:
+                        continue
+                    loop.call_soon_threadsafe(self._queue.put_nowait, order)
+        finally:
+            # Who hears no more orders, for whatever reason, ends as when its parent is gone.
+            with contextlib.suppress(RuntimeError):  # the loop is closed already
+                loop.call_soon_threadsafe(self._queue.put_nowait, None)

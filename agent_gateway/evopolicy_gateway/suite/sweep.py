@@ -88,6 +88,9 @@ class Sweep:
         renewing = asyncio.create_task(self._renew(by_name))
         try:
             while todo or self._active:
+                if renewing.done():
+                    # Claims that nobody renews go to another host while their runs go on here.
+                    renewing.result()
                 for decision in self._startable(todo, by_name):
                     if await self._begin(decision, by_name):
                         todo.remove(decision)

@@ -357,3 +357,24 @@ def test_our_own_failure_gives_the_claim_back_and_is_told(
     (entry,) = index.runs.values()
     assert (entry.state, entry.error, entry.tokens) == ("error", "the gateway cannot serve", TOKENS)
     assert stage.cluster.told[-1][2] is None
+
+
+def test_a_sweep_that_renews_no_claims_ends_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + CODEX.format("a"), monkeypatch)
+    asked: list[str] = []
+
+    def answer(name: str) -> ClaimState | None:
+        asked.append(name)
+        if len(asked) > 1:
+            raise LookupError("a bug")
+        return None
+
+    async def never(_: str) -> None:
+        await asyncio.Event().wait()
+
+    stage.cluster.answer, stage.act = answer, never
+    with pytest.raises(LookupError, match="a bug"):
+        stage.play()
+    assert not stage.going
