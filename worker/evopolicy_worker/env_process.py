@@ -84,11 +84,11 @@ class EnvProcess:
         scratch = Path(start.scratch)
         # Without its parents: a worker that has gone meanwhile has taken them with it.
         scratch.mkdir(exist_ok=True)
-        env_jail.enclose(start.tier, scratch)
+        env_jail.enclose(start.tier, scratch, draws=start.draws)
         plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed, user=start.user)
         with env_jail.expendable():
             zygote = Zygote(plan, scratch)
-        env_jail.seal(start.tier, scratch, plan.user)
+        env_jail.seal(start.tier, scratch, plan.user, draws=start.draws)
         player = Player(zygote, plan, self._monitor, scratch)
         for command in early:
             self._take(command)

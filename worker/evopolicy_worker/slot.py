@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import msgspec
 import structlog
 
 from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
@@ -64,7 +65,6 @@ class Slot:
             sealed=sealed,
         )
         self._scratch = scratch
-        self._draws = False
         self._cancelled = False
         self._sent = ""
         self._process: asyncio.subprocess.Process | None = None
@@ -82,7 +82,7 @@ class Slot:
         self._scratch.mkdir(parents=True, exist_ok=True)
         self._sent = ""
         self._process = await asyncio.create_subprocess_exec(
-            *env_jail.command(self._start.tier, self._scratch, draws=self._draws),
+            *env_jail.command(self._start.tier, self._scratch, draws=self._start.draws),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -123,8 +123,8 @@ class Slot:
         watcher = asyncio.create_task(self._end_what_is_stopped())
         outcomes: list[EpisodeOutcome] = []
         try:
-            if job.video and not self._draws and env_jail.graphics_devices():
-                self._draws = True
+            if job.video and not self._start.draws and env_jail.graphics_devices():
+                self._start = msgspec.structs.replace(self._start, draws=True)
                 await self.start()
             files = None if bundle is None else await asyncio.to_thread(bundle_files, bundle, self._sent)
             if self._cancelled:

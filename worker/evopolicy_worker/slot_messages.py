@@ -27,6 +27,8 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
     allowed_packages: tuple[str, ...]
     user: int | None
     """As root: who policies, and the process once it is sealed, are outside the jail."""
+    draws: bool = False
+    """With the graphics devices of this machine."""
     sealed: bool = True
 
 

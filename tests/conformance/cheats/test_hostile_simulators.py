@@ -21,6 +21,7 @@ from slots import Slots, make_job
 import evopolicy_worker
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_worker.sandbox import env_jail
 from evopolicy_worker.slot import Slot
 
 SIMULATORS = Path(__file__).with_name("simulators")
@@ -165,3 +166,26 @@ def test_what_a_simulator_prints_or_sends_out_of_turn_ends_its_slot_alone(
         await slot.close()
 
     slots.run(play())
+
+
+def test_graphics_devices_are_there_for_videos_only(
+    slots: Slots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In place of a graphics card's, which few machines of ours have.
+    monkeypatch.setattr(env_jail, "_GRAPHICS", ("/dev/ptm[x]", "/dev/nvidia*"))
+    package = tmp_path / "simulators" / "minigrid"
+    package.mkdir(parents=True)
+    monkeypatch.setenv("PYTHONPATH", str(package.parent))
+    (package / "__init__.py").write_text("import os; os.stat('/dev/ptmx'); raise RuntimeError('it draws')")
+
+    async def play(slot: Slot, video: bool) -> str:
+        job = make_job(env=ENV, bundle=None, video=video)
+        with pytest.raises(WorkerError) as told:
+            await slot.play(job, None, lambda episodes, steps: None)
+        return str(told.value)
+
+    slot = slots.new()
+    slots.run(slot.start())
+    assert "it draws" not in slots.run(play(slot, False))
+    assert "it draws" in slots.run(play(slot, True))
+    slots.run(slot.close())

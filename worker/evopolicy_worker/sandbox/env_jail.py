@@ -18,7 +18,7 @@ import platform
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -79,14 +79,13 @@ def variables(scratch: Path) -> dict[str, str]:
     return {**passed_on, **own, **process_environment()}
 
 
-def command(tier: Tier, scratch: Path, *, draws: bool = False, shown: Sequence[Path] = ()) -> tuple[str, ...]:
+def command(tier: Tier, scratch: Path, *, draws: bool = False) -> tuple[str, ...]:
     """The arguments that start an environment process of that tier.
 
-    `draws`: with the graphics devices of this machine. `shown`: further folders of code, which stay read-only.
-    SandboxError when bubblewrap is not installed.
+    `draws`: with the graphics devices of this machine. SandboxError when bubblewrap is not installed.
     """
     python = (sys.executable, "-P", "-m", "evopolicy_worker.env_process")
-    return (*_bubblewrap(scratch, draws, shown), *python) if tier == "bwrap" else python
+    return (*_bubblewrap(scratch, draws), *python) if tier == "bwrap" else python
 
 
 def graphics_devices() -> tuple[str, ...]:
@@ -99,29 +98,24 @@ def graphics_devices() -> tuple[str, ...]:
 # In the process itself, before anything of a simulator's is imported.
 
 
-def enclose(tier: Tier, scratch: Path) -> None:
+def enclose(tier: Tier, scratch: Path, *, draws: bool) -> None:
     """The first half of the seal, before the policies' sandbox is started: tier landlock sees few files from here on.
 
-    SandboxError when it cannot be done.
+    `draws`: graphics devices are among them. SandboxError when it cannot be done.
     """
     for name in ("home", "tmp"):
         (scratch / name).mkdir(exist_ok=True)
     os.chdir(scratch / "home")
     if tier == "landlock":
-        shown = [
-            *_code(),
-            *_etc(),
-            *_SYSTEM,
-            "/proc",
-            *(path for path in graphics_devices() if path[:4] == "/sys"),
-        ]
-        devices = [path for path in graphics_devices() if path[:4] == "/dev"]
+        drawn_with = graphics_devices() if draws else ()
+        devices = [path for path in drawn_with if path.startswith("/dev/")]
+        shown = [*_code(), *_etc(), *_SYSTEM, "/proc", *(path for path in drawn_with if path not in devices)]
         with _told("be closed in by Landlock"):
             inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
             inside.landlock({"read": shown, "write": [*_DEVICES, *devices]}, str(scratch))
 
 
-def seal(tier: Tier, scratch: Path, user: int | None) -> None:
+def seal(tier: Tier, scratch: Path, user: int | None, *, draws: bool) -> None:
     """The second half, once the policies' sandbox runs: no capability, no namespace, few system calls. Only from here on
     modules are found in the folders of the operator's PYTHONPATH.
 
@@ -129,15 +123,15 @@ def seal(tier: Tier, scratch: Path, user: int | None) -> None:
     SandboxError when it cannot be done.
     """
     if tier != "none":
-        _seal(tier, scratch, user)
+        _seal(tier, scratch, user, graphics_devices() if draws else ())
     path = os.environ["PYTHONPATH"] = os.environ.get(_LATER_PATH, "")
     sys.path[:0] = [entry for entry in path.split(os.pathsep) if entry]
 
 
-def _seal(tier: Tier, scratch: Path, user: int | None) -> None:
+def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ...]) -> None:
     with _told("seal itself"):
         if user is not None:
-            groups = sorted({os.stat(path).st_gid for path in graphics_devices()})
+            groups = sorted({os.stat(path).st_gid for path in drawn_with})
             for path in (scratch, *scratch.iterdir()):
                 os.chown(path, user, user)
             os.setgroups(groups)
@@ -188,7 +182,7 @@ def _told(what: str) -> Iterator[None]:
 # What it is shown.
 
 
-def _bubblewrap(scratch: Path, draws: bool, shown: Sequence[Path]) -> list[str]:
+def _bubblewrap(scratch: Path, draws: bool) -> list[str]:
     arguments = [jail.bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "slot"]
     arguments += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
     if os.geteuid() == 0:
@@ -207,7 +201,7 @@ def _bubblewrap(scratch: Path, draws: bool, shown: Sequence[Path]) -> list[str]:
     for path in _DEVICES:
         if os.path.exists(path):
             arguments += ["--dev-bind", path, path]
-    read = (*_etc(), *_code(), *map(str, shown))
+    read = (*_etc(), *_code())
     drawn_with = graphics_devices() if draws else ()
     for path in jail.parents([*read, *drawn_with, *_DEVICES, str(scratch)]):
         arguments += ["--perms", "0755", "--dir", path]
