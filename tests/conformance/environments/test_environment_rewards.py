@@ -1,4 +1,4 @@
-"""The formulas that the task texts state are the rewards that the environments give."""
+"""The rewards that the task texts describe in words are those that the environments give."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def parking(obs: Any, action: Any, step: Step) -> float:
 
 
 def roundabout(obs: Any, action: Any, step: Step) -> float:
-    info = step.info
+    info = step.info["rewards"]
     assert info["lane_change_reward"] == (action in (0, 2))
     terms = 1 - info["collision_reward"] + 0.2 * info["high_speed_reward"] - 0.05 * info["lane_change_reward"]
     return float(terms / 1.2 * info["on_road_reward"])
@@ -100,7 +100,7 @@ def toy_line(obs: Any, action: Any, step: Step) -> float:
         ("toy/line", toy_line, 1e-5),
     ],
 )
-def test_the_formula_of_the_text_is_the_reward(
+def test_reward_is_made_of_the_terms_that_the_text_names(
     env_id: str, formula: Formula, tolerance: float, warm: Warm
 ) -> None:
     environment = warm(env_id)

@@ -155,7 +155,7 @@ def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path
             said.append(out.decode())
         assert said[0].startswith("# A line")
         assert json.loads(said[2])["status"] == "ok"
-        assert said[-1].startswith("submit_001 ok")
+        assert said[-1].startswith("feedback/submit_001 ok")
 
     play(tmp_path, script)
 
