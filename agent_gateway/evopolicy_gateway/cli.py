@@ -106,7 +106,13 @@ def local(
 def try_policy(
     policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
-    cases: Annotated[str, typer.Option(help="Train ids and ranges.")] = "0-3",
+    cases: Annotated[
+        str,
+        typer.Option(
+            help="Train ids and ranges. The same ids are the same cases with --state, --data or --connect; a cluster that is "
+            "thrown away has cases of its own."
+        ),
+    ] = "0-3",
     out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
         "tries"
     ),
