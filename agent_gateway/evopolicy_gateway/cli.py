@@ -21,7 +21,6 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_difference import differences, left_out
 from evopolicy_common.terminal import say_json, say_lines, terminal
 from evopolicy_gateway import door, options, processes, trials
-from evopolicy_gateway.door import Door
 from evopolicy_gateway.gateway import folder_of
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.option_groups import spread
@@ -58,6 +57,7 @@ def run(
     jail: JailOptions,
     served: DoorOptions,
     slots: options.Slots = 2,
+    hidden_isolation: options.Isolation = None,
     as_json: options.Json = False,
 ) -> None:
     """Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json."""
@@ -66,11 +66,12 @@ def run(
             raise ConfigError(
                 "--local brings up a cluster of its own; it does not go with --connect or --credentials"
             )
+        isolation = options.isolation_of(hidden_isolation, local=local)
         held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
-        plans = _plans(given, [options.one_environment(env)], held, served.door())
+        plans = _plans(given, [options.one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots)
+            where = Cluster(local_slots=slots, hidden_isolation=isolation)
         _play(plans, where, 1, as_json)
 
 
@@ -91,12 +92,14 @@ def local(
     state: options.StateFolder = None,
     data: options.DataFolder = None,
     audit: options.Audit = 0.0,
+    hidden_isolation: options.Isolation = None,
     as_json: options.Json = False,
 ) -> None:
     """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
     with fail_on_our_errors():
         plans = _plans(given, catalogue.resolve(env), jail.settings())
-        where = Cluster(local_slots=slots, state=state, data=data, audit=audit)
+        isolation = options.isolation_of(hidden_isolation, local=True)
+        where = Cluster(local_slots=slots, state=state, data=data, audit=audit, hidden_isolation=isolation)
         _play(plans, where, parallel, as_json)
 
 
@@ -211,16 +214,18 @@ app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_
 
 
 def _plans(
-    given: RunOptions, env_ids: list[str], jail: JailSettings, served: Door | None = None
+    given: RunOptions, env_ids: list[str], jail: JailSettings, served: DoorOptions | None = None
 ) -> list[Plan]:
     """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
     started_in = Path.cwd()
     exp_id = given.exp_id or options.default_exp_id()
+    served = served or DoorOptions()
+    where, agent_host = served.door(), served.host_of(given.agent)
     plans = [
         Plan(
-            settings=given.settings(env_id, exp_id),
+            settings=msgspec.structs.replace(given.settings(env_id, exp_id), agent_host=agent_host),
             agent=given.agent,
             runs=given.runs,
             started_in=started_in,
@@ -228,7 +233,7 @@ def _plans(
             overwrite=given.overwrite,
             resume=given.resume,
             jail=jail,
-            door=served,
+            door=where,
         )
         for env_id in env_ids
     ]

@@ -7,17 +7,20 @@ too; the token is a file of mode 0600 beside the gateway's other secrets, and no
 from __future__ import annotations
 
 import ipaddress
+import re
 from urllib.parse import urlsplit
 
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import ELSEWHERE
 from evopolicy_gateway.layout import RunFolder
 
 AGENT = "remote"
 """What `--agent` calls an agent that somebody else starts."""
 TOKEN_VARIABLE = "EVOPOLICYGYM_TOKEN"
 """Where the staged rules tell an agent to find its bearer token."""
+_BOOT_ID = re.compile(r"[0-9a-fA-F]{8}(-[0-9a-fA-F]{4}){3}-[0-9a-fA-F]{12}")
 
 
 class Door(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,6 +64,20 @@ def check_agent(agent: str, door: Door | None) -> None:
             "--agent remote needs --http HOST:PORT: where the run is served; it goes with `evopolicy run` alone"
         )
     raise ConfigError("--http goes with --agent remote; an agent that is started here is served on loopback")
+
+
+def agent_host_of(agent: str, host: str) -> str:
+    """The kernel that `--agent-host` names, or `ELSEWHERE`. ConfigError for what is neither."""
+    if agent != AGENT:
+        raise ConfigError(
+            "--agent-host goes with --agent remote; an agent that is started here is alive on this machine"
+        )
+    if host != ELSEWHERE and not _BOOT_ID.fullmatch(host):
+        raise ConfigError(
+            f"--agent-host {host!r}: give the boot id of the agent's machine (there: cat"
+            f" /proc/sys/kernel/random/boot_id), or `{ELSEWHERE}` when it is on no machine of the cluster"
+        )
+    return host if host == ELSEWHERE else host.lower()
 
 
 def finish(folder: RunFolder) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import msgspec
 import typer
@@ -13,6 +13,7 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
+from evopolicy_common.messages.operator import HiddenCases
 from evopolicy_gateway.submit_request import Bounds, ids_in
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
@@ -40,6 +41,23 @@ Audit = Annotated[
         max=1.0,
         metavar="SHARE",
         help="Share of the episodes that a second local worker plays again from their actions, compared bit for bit.",
+    ),
+]
+
+HiddenIsolation = Literal["related", "strict", "off"]
+Isolation = Annotated[
+    str | None,
+    typer.Option(
+        "--hidden-isolation",
+        help="Of the cluster brought up here: related (default), no hidden episode shares a kernel with an agent whose run "
+        "shares its cases; strict, with any agent; off.",
+    ),
+]
+HiddenCasesOption = Annotated[
+    str,
+    typer.Option(
+        "--hidden-cases",
+        help="Validation and held-out cases: shared by all runs of an environment, or per-run (nothing can be paired).",
     ),
 ]
 
@@ -94,6 +112,21 @@ def cases_of(text: str) -> tuple[int, ...]:
     if not ids:
         raise ConfigError(f"--cases {text!r} names no case; say it as 0-3,7")
     return ids
+
+
+def isolation_of(text: str | None, *, local: bool) -> str | None:
+    """What `--hidden-isolation` asks of a cluster brought up here; None for its default. ConfigError where it is wrong."""
+    if text is not None and not local:
+        raise ConfigError(
+            "--hidden-isolation goes with a cluster brought up here; elsewhere it is the coordinator's:"
+            " evopolicy-coordinator --hidden-isolation"
+        )
+    return None if text is None else one_of("--hidden-isolation", text, HiddenIsolation)
+
+
+def hidden_cases_of(text: str) -> HiddenCases:
+    """The hidden cases that `--hidden-cases` names. ConfigError when there are none of that name."""
+    return one_of("--hidden-cases", text, Literal["shared", "per-run"]).replace("-", "_")  # type: ignore[return-value]
 
 
 def one_of(option: str, text: str, kind: object) -> str:

@@ -13,9 +13,17 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.door import Door, door_of
+from evopolicy_gateway.door import Door, agent_host_of, door_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
-from evopolicy_gateway.options import Limits, TierName, limits_of, one_of, tier_of
+from evopolicy_gateway.options import (
+    HiddenCasesOption,
+    Limits,
+    TierName,
+    hidden_cases_of,
+    limits_of,
+    one_of,
+    tier_of,
+)
 
 WALL_S = 12 * 3600.0
 
@@ -48,6 +56,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     max_episodes: Annotated[int | None, typer.Option(min=1, help="Most episodes of a submit.")] = None
     validation: Annotated[int | None, typer.Option(min=1, help="Hidden validation cases.")] = None
     heldout: Annotated[int | None, typer.Option(min=1, help="Hidden held-out cases.")] = None
+    hidden_cases: HiddenCasesOption = "shared"
     policy_scope: Annotated[
         str, typer.Option(help="episode: a fresh Policy each; submit: one through a submit.")
     ] = "episode"
@@ -86,6 +95,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             max_episodes_per_submit=self.max_episodes,
             n_validation=self.validation,
             n_heldout=self.heldout,
+            hidden_cases=hidden_cases_of(self.hidden_cases),
             policy_scope=one_of("--policy-scope", self.policy_scope, PolicyScope),  # type: ignore[arg-type]
             observations=one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
             simulation=one_of("--simulation", self.simulation, SimulationRule),  # type: ignore[arg-type]
@@ -154,6 +164,20 @@ class DoorOptions(msgspec.Struct, frozen=True, kw_only=True):
         str | None,
         typer.Option(help="How the agent reaches it where that is another URL, such as that of a TLS front."),
     ] = None
+
+    agent_host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOOT_ID|elsewhere",
+            help="With --agent remote: the kernel that the agent runs on (there: cat /proc/sys/kernel/random/boot_id), so that"
+            " hidden episodes are kept from it; elsewhere: you vouch that it is on no machine of the cluster. Default: it"
+            " may be on any, so no hidden episode is played before the agent has ended.",
+        ),
+    ] = None
+
+    def host_of(self, agent: str) -> str:
+        """`RunSettings.agent_host`. ConfigError for what names no kernel, or an agent that is started here."""
+        return "" if self.agent_host is None else agent_host_of(agent, self.agent_host)
 
     def door(self) -> Door | None:
         """None without `--http`. ConfigError naming the option that is wrong."""

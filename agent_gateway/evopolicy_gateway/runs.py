@@ -37,6 +37,8 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     data: Path | None = None
     audit: float = 0.0
     """Of a local one: share of the episodes that a second worker plays again."""
+    hidden_isolation: str | None = None
+    """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
 
 
 class RunResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,7 +78,13 @@ async def connected(
         file = where.file
         if where.local_slots is not None:
             cluster = await stack.enter_async_context(
-                local_cluster("local", state=where.state, data=where.data, audit=where.audit)
+                local_cluster(
+                    "local",
+                    state=where.state,
+                    data=where.data,
+                    audit=where.audit,
+                    hidden_isolation=where.hidden_isolation,
+                )
             )
             await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
             file, failed = cluster.operator_file, cluster.failed

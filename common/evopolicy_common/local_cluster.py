@@ -60,12 +60,17 @@ class LocalCluster:
 
 @contextlib.asynccontextmanager
 async def local_cluster(
-    kind: str, *, state: Path | None = None, data: Path | None = None, audit: float = 0.0
+    kind: str,
+    *,
+    state: Path | None = None,
+    data: Path | None = None,
+    audit: float = 0.0,
+    hidden_isolation: str | None = None,
 ) -> AsyncIterator[LocalCluster]:
     """A coordinator inside the `async with`; it and its workers are taken down at its end. Enter it on the main thread.
 
     `kind` names its logs and its folder. `state` None: a folder that is thrown away. `audit`: share of the episodes that
-    a second worker plays again. ConfigError when the coordinator does not come up (the folder may be in use).
+    a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. ConfigError when the coordinator does not come up (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
@@ -82,6 +87,8 @@ async def local_cluster(
             coordinator += ["--data", str(data.absolute())]
         if audit:
             coordinator += ["--audit", str(audit)]
+        if hidden_isolation is not None:
+            coordinator += ["--hidden-isolation", hidden_isolation]
         processes = _Processes(root / "logs", kind)
         try:
             await processes.keep_up("coordinator", coordinator)

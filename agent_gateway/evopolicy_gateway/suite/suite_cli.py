@@ -69,6 +69,7 @@ def suite(
     ] = None,
     data: options.DataFolder = None,
     audit: options.Audit = 0.0,
+    hidden_isolation: options.Isolation = None,
     as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
     """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was."""
@@ -79,6 +80,7 @@ def suite(
             raise ConfigError(
                 "--audit goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --audit"
             )
+        isolation = options.isolation_of(hidden_isolation, local=local)
         if changed not in ("refuse", "keep", "rerun"):
             raise ConfigError(f"--changed {changed!r}: there are refuse, keep, rerun")
         wanted = suite_file.read(file)
@@ -89,7 +91,13 @@ def suite(
         root = (runs or Path("runs") / wanted.name).absolute()
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots, state=state or root / ".cluster", data=data, audit=audit)
+            where = Cluster(
+                local_slots=slots,
+                state=state or root / ".cluster",
+                data=data,
+                audit=audit,
+                hidden_isolation=isolation,
+            )
         order = Order(
             suite=wanted,
             runs=tuple(expanded),

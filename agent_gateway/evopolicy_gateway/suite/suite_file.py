@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -26,6 +26,7 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import RunFolder, run_folder
+from evopolicy_gateway.options import hidden_cases_of
 
 Positive = Annotated[int, Meta(ge=1)]
 WALL_S = 12 * 3600.0
@@ -43,6 +44,7 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     max_episodes: Positive | None = None
     validation: Positive | None = None
     heldout: Positive | None = None
+    hidden_cases: Literal["shared", "per-run"] | None = None
     policy_scope: PolicyScope | None = None
     observations: ObservationForm | None = None
     simulation: SimulationRule | None = None
@@ -283,6 +285,7 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         max_episodes_per_submit=table.max_episodes,
         n_validation=table.validation,
         n_heldout=table.heldout,
+        hidden_cases=hidden_cases_of(table.hidden_cases or "shared"),
         policy_scope=table.policy_scope or "episode",
         observations=table.observations or "arrays",
         simulation=table.simulation or "forbidden",
