@@ -30,6 +30,15 @@ class Ready(Event, frozen=True, kw_only=True, tag="ready"):
     submit_url: str
     notes: tuple[str, ...] = ()
     """What the operator should know of the run that was opened."""
+    held_s: float = 0.0
+    """As in `Progress`."""
+
+
+class Waits(Event, frozen=True, kw_only=True, tag="waits"):
+    """The gateway waits, and not for the agent: before `Ready` for the agent's permit, at the end for the agent's end."""
+
+    waits_for: str
+    """Empty: no longer."""
 
 
 class Progress(Event, frozen=True, kw_only=True, tag="progress"):
@@ -54,6 +63,8 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     """Seconds in which a submit was in flight."""
     feedback_s: float = 0.0
     """Of these, from the last result's arrival to the committed feedback."""
+    held_s: float = 0.0
+    """Seconds for which submits of the run have waited so far because hidden episodes had the machines."""
     spent: bool = False
     """No further submit can be taken, and none runs."""
     cancelled: bool = False
@@ -82,6 +93,12 @@ class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
     paused_s: float = 0.0
     """It waits that long for `provider`; 0.0: it does not, or no longer."""
     provider: str = ""
+
+
+class AgentSurvives(Event, frozen=True, kw_only=True, tag="agent_survives"):
+    """Its time is over, but the kernel holds processes of it that were killed; `AgentEnded` comes when they are gone."""
+
+    pids: tuple[int, ...]
 
 
 class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
@@ -132,12 +149,20 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """None: not jailed."""
 
 
+class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):
+    """To a keeper: submits have waited so long in all since it was started, which counts against no limit of the agent."""
+
+    seconds: float
+
+
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
     """To a keeper: end the agent and all that it has started."""
 
 
-AnyEvent = Ready | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentEnded
-AnyOrder = CloseRun | StartAgent | StopAgent
+AnyEvent = (
+    Ready | Waits | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentSurvives | AgentEnded
+)
+AnyOrder = CloseRun | StartAgent | HeldTime | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 

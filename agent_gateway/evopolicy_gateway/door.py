@@ -7,14 +7,17 @@ too; the token is a file of mode 0600 beside the gateway's other secrets, and no
 from __future__ import annotations
 
 import ipaddress
+import platform
 import re
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import msgspec
 
+from evopolicy_common import host
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import ELSEWHERE
-from evopolicy_gateway.layout import RunFolder
+from evopolicy_gateway.layout import IntendedRun, RunFolder
 
 AGENT = "remote"
 """What `--agent` calls an agent that somebody else starts."""
@@ -33,26 +36,35 @@ class Door(msgspec.Struct, frozen=True, kw_only=True):
     """How the agent reaches it where that is not `http://host:port`: a TLS front, a forwarded port. No `/` at its end."""
 
 
+class AgentPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """The kernel that an agent runs on, as `RequestPermit` tells it."""
+
+    boot_id: str = ""
+    """Empty: unknown, which counts as every kernel."""
+    machine_id: str = ""
+    host: str = ""
+
+
 def door_of(http: str, url: str | None) -> Door:
     """The door of `--http HOST:PORT` and `--http-url`. ConfigError for what is none."""
-    host, colon, port = http.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
+    address, colon, port = http.rpartition(":")
+    address = address.removeprefix("[").removesuffix("]")
+    if not colon or not address or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
         raise ConfigError(
             f"--http {http!r}: say it as HOST:PORT, such as 10.0.0.5:8080; port 0 takes a free one"
         )
     if url is None:
-        if _is_wildcard(host):
+        if _is_wildcard(address):
             raise ConfigError(
                 f"--http {http}: an agent cannot dial every address; name one, or say with --http-url how it is reached"
             )
-        return Door(host=host, port=int(port))
+        return Door(host=address, port=int(port))
     found = urlsplit(url)
     if found.scheme not in ("http", "https") or not found.hostname or found.query or found.fragment:
         raise ConfigError(f"--http-url {url!r}: say it as https://HOST or https://HOST:PORT/PATH")
     if any(not (letter.isalnum() or letter in "-._~:/[]%") for letter in url):
         raise ConfigError(f"--http-url {url!r}: letters of a plain URL only, no quotes and no spaces")
-    return Door(host=host, port=int(port), url=url.rstrip("/"))
+    return Door(host=address, port=int(port), url=url.rstrip("/"))
 
 
 def check_agent(agent: str, door: Door | None) -> None:
@@ -66,29 +78,59 @@ def check_agent(agent: str, door: Door | None) -> None:
     raise ConfigError("--http goes with --agent remote; an agent that is started here is served on loopback")
 
 
-def agent_host_of(agent: str, host: str) -> str:
+def agent_host_of(agent: str, named: str) -> str:
     """The kernel that `--agent-host` names, or `ELSEWHERE`. ConfigError for what is neither."""
     if agent != AGENT:
         raise ConfigError(
             "--agent-host goes with --agent remote; an agent that is started here is alive on this machine"
         )
-    if host != ELSEWHERE and not _BOOT_ID.fullmatch(host):
+    if named != ELSEWHERE and not _BOOT_ID.fullmatch(named):
         raise ConfigError(
-            f"--agent-host {host!r}: give the boot id of the agent's machine (there: cat"
+            f"--agent-host {named!r}: give the boot id of the agent's machine (there: cat"
             f" /proc/sys/kernel/random/boot_id), or `{ELSEWHERE}` when it is on no machine of the cluster"
         )
-    return host if host == ELSEWHERE else host.lower()
+    return named if named == ELSEWHERE else named.lower()
+
+
+def agent_place(folder: RunFolder) -> AgentPlace:
+    """Where the agent of an open run is alive: where its gateway is, unless somebody else starts it."""
+    if not folder.door.exists():
+        return AgentPlace(boot_id=host.boot_id(), machine_id=host.machine_id(), host=platform.node())
+    named = _agent_host(folder)
+    return AgentPlace(boot_id="" if named == ELSEWHERE else named)
+
+
+def ends_unseen(folder: RunFolder) -> bool:
+    """Whether only the operator can tell that the agent has ended: it is on machines that count, and not in our hands."""
+    return folder.door.exists() and _agent_host(folder) != ELSEWHERE
+
+
+def _agent_host(folder: RunFolder) -> str:
+    return msgspec.json.decode(folder.intended.read_bytes(), type=IntendedRun).settings.agent_host
+
+
+def said_of_place(agent_host: str, root: Path) -> str:
+    """What `--agent-host` means for a remote agent's run, for its operator."""
+    if agent_host == ELSEWHERE:
+        return "you vouch that the agent is on no machine of the cluster: run.json will say hidden_isolation: waived"
+    until = f"has ended and you have said so: evopolicy finish {root}"
+    if agent_host:
+        return f"no hidden case that this run shares is played on kernel {agent_host} until the agent {until}"
+    return (
+        "no --agent-host names the agent's machine, so it may be any: no hidden case that this run shares is played"
+        f" anywhere until the agent {until}"
+    )
 
 
 def finish(folder: RunFolder) -> None:
-    """Says that the remote agent of an open run is done. ConfigError where there is none."""
-    if not folder.door.exists():
-        raise ConfigError(f"{folder.root} is no open run of a remote agent")
+    """Says that the agent of an open run has ended. ConfigError where there is none that only the operator can see."""
+    if not folder.door.exists() and not folder.alone.exists():
+        raise ConfigError(f"{folder.root} is no open run of a remote agent, nor of one that nobody watches")
     folder.finish.touch(mode=0o600)
 
 
-def _is_wildcard(host: str) -> bool:
+def _is_wildcard(address: str) -> bool:
     try:
-        return ipaddress.ip_address(host).is_unspecified
+        return ipaddress.ip_address(address).is_unspecified
     except ValueError:
         return False

@@ -86,8 +86,13 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def finish(self) -> Path:
-        """Made when the operator says that a remote agent is done."""
+        """Made when the operator says that an agent that is not in our hands has ended."""
         return self.state / "finish"
+
+    @property
+    def alone(self) -> Path:
+        """Made by a gateway that was started by hand: nobody watches the agent, so only the operator knows its end."""
+        return self.state / "alone"
 
     @property
     def journal(self) -> Path:

@@ -7,6 +7,7 @@ what a refusal means.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
@@ -14,12 +15,14 @@ import structlog
 
 from evopolicy_common import codec, keys
 from evopolicy_common.blobs import digest_of
-from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
+from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import (
     CloseRun,
     GatewayReply,
     OpenRun,
+    Permit,
+    RequestPermit,
     ResultsPage,
     ResultsRequest,
     RunClosed,
@@ -34,10 +37,15 @@ from evopolicy_common.messages.worker import Message
 from evopolicy_common.refusals import NOT_NOW
 from evopolicy_common.requests import Requester
 from evopolicy_common.transport import Link
+from evopolicy_gateway.door import AgentPlace
 from evopolicy_gateway.journal import Requested
 
 RESULTS_WAIT_S = 10.0
 """How long the coordinator may hold a question for results."""
+HELD_WAIT_S = 1.0
+"""The same while nothing of the submit runs: what it waits is given back to the agent's clock, which must not run out first."""
+FIRST_PERMIT_WAIT_S = 3.0
+"""A permit that takes longer is shown as waited for."""
 STATE_PATIENCE_S = 1.0
 
 
@@ -59,7 +67,37 @@ class Session:
 
     async def open(self) -> RunOpened:
         """All that is fixed for the run, and its state."""
-        return await self._ask("open", OpenRun(run=self._run, token=self._token), RunOpened)
+        message = OpenRun(run=self._run, token=self._token, asks_permit=True)
+        return await self._ask("open", message, RunOpened)
+
+    async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
+        """Returns True once the run's agent may be alive at `place`; `on_wait` is told what that waits for.
+
+        ConfigError where the coordinator knows no permits.
+        """
+        wait_s = FIRST_PERMIT_WAIT_S
+        while True:
+            message = RequestPermit(
+                run=self._run,
+                token=self._token,
+                boot_id=place.boot_id,
+                machine_id=place.machine_id,
+                host=place.host,
+                wait_s=wait_s,
+            )
+            try:
+                permit = await self._ask("permit", message, Permit, wait_s=wait_s)
+            except RefusedError as error:
+                if error.status != "bad_message":
+                    raise
+                raise ConfigError(
+                    "the coordinator is of an older version, which cannot keep hidden episodes from the agent's machine:"
+                    f" update it, or use the version of evopolicy that it is of ({error.message})"
+                ) from error
+            if permit.granted:
+                return True
+            on_wait(permit.waits_for)
+            wait_s = RESULTS_WAIT_S
 
     async def state(self) -> RunState | None:
         """The run's state now; None when the coordinator does not answer at once."""
@@ -86,16 +124,18 @@ class Session:
         )
         return await self._ask("submit", message, SubmitAccepted)
 
-    async def results(self, submit_index: int, cursor: int) -> ResultsPage:
-        """What happened to a submit since `cursor`; comes after `RESULTS_WAIT_S` at the latest, empty if need be."""
+    async def results(
+        self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S
+    ) -> ResultsPage:
+        """What happened to a submit since `cursor`; comes after `wait_s` seconds at the latest, empty if need be."""
         question = ResultsRequest(
             run=self._run,
             token=self._token,
             submit_index=submit_index,
             cursor=cursor,
-            wait_s=RESULTS_WAIT_S,
+            wait_s=wait_s,
         )
-        return await self._ask("results", question, ResultsPage, wait_s=RESULTS_WAIT_S)
+        return await self._ask("results", question, ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """The bytes that `ref` names, checked."""

@@ -1,4 +1,4 @@
-"""The agent's wall clock, which stands still while its provider is away."""
+"""The agent's wall clock, which stands still while its provider is away; waits for hidden episodes are given back to it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,16 @@ class AgentClock:
         self._started = now()
         self._paused_s = 0.0
         self._paused_at: float | None = None
+        self._held_s = 0.0
+
+    def held(self, seconds: float) -> None:
+        """Gives back so many seconds in all, for which its submits have waited because hidden episodes had the machines."""
+        self._held_s = max(self._held_s, seconds)
 
     def left_s(self) -> float:
         """Seconds that are left; below zero when it has run out."""
         now = self._now() if self._paused_at is None else self._paused_at
-        return self._limit_s - (now - self._started - self._paused_s)
+        return self._limit_s - (now - self._started - self._paused_s - self._held_s)
 
     def used_s(self) -> float:
         """Seconds that have passed on it."""

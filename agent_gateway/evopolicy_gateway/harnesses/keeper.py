@@ -10,7 +10,7 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import msgspec
@@ -19,7 +19,7 @@ import structlog
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway import control, processes
-from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentTime, AgentTurn, Orders, StartAgent
+from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentSurvives, AgentTime, AgentTurn, Orders, StartAgent
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
@@ -34,6 +34,7 @@ END_GRACE_S = 3.0
 LAST_WORDS_S = 2.0
 _TEXT_SHOWN = 2000
 _TELL_TIME_S = 5.0
+_SURVIVORS_PAUSE_S = 1.0
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -55,7 +56,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         clock=clock,
     )
     play = asyncio.create_task(_play(order, stage, config))
-    told = asyncio.create_task(_stopped(orders))
+    told = asyncio.create_task(_stopped(orders, clock))
     late = asyncio.create_task(clock.run_out())
     telling = asyncio.create_task(_tell_time(clock))
     log.info("agent started", agent=order.agent)
@@ -63,7 +64,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         await asyncio.wait([play, told, late], return_when=asyncio.FIRST_COMPLETED)
         reason = None if play.done() else "told" if told.done() else "wall_limit"
         stage.over.set()
-        left = await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=stage.started)
+        await _until_gone(stage.started)
         # With its programs gone a harness ends by itself, and can still say how far it came.
         await asyncio.wait([play], timeout=LAST_WORDS_S)
         play.cancel()
@@ -73,8 +74,6 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
             task.cancel()
         control.emit(AgentTime(used_s=clock.used_s()))
         agent_log.close()
-    if left:
-        log.error("processes of the agent survive", pids=left)
     if isinstance(ending, Ending):
         return AgentEnded(
             reason=reason or ending.reason,
@@ -134,11 +133,27 @@ async def _tell_time(clock: AgentClock) -> None:
         control.emit(AgentTime(used_s=clock.used_s()))
 
 
-async def _stopped(orders: Orders) -> None:
-    """Returns when the parent says stop, or is gone."""
+async def _stopped(orders: Orders, clock: AgentClock) -> None:
+    """Returns when the parent says stop, or is gone; gives back to the clock what it is told meanwhile."""
     while (order := await orders.next()) is not None:
+        if isinstance(order, control.HeldTime):
+            clock.held(order.seconds)
         if isinstance(order, control.StopAgent):
             return
+
+
+async def _until_gone(started: Collection[int]) -> None:
+    """Ends all that the agent has started, and returns when nothing of it lives.
+
+    What survives being killed (the kernel holds it) is told to the parent: as long as it lives the agent is not gone.
+    """
+    told: list[int] = []
+    while left := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
+        if left != told:
+            log.error("processes of the agent survive", pids=left)
+            control.emit(AgentSurvives(pids=tuple(left)))
+            told = left
+        await asyncio.sleep(_SURVIVORS_PAUSE_S)
 
 
 async def _main() -> int:
