@@ -12,10 +12,10 @@ from evopolicy_gateway import processes
 from evopolicy_gateway.control import AnyEvent, Order, event_of, line
 
 
-async def end_orphans() -> None:
-    """Ends what has become this process's child by its parent's death."""
+async def end_orphans() -> list[int]:
+    """Ends what has become this process's child by its parent's death; returns what survives, which the kernel holds."""
     async with child_process.starting():
-        await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
+        return await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
 
 
 class Child(ChildProcess):

@@ -32,6 +32,8 @@ class Ready(Event, frozen=True, kw_only=True, tag="ready"):
     """What the operator should know of the run that was opened."""
     held_s: float = 0.0
     """As in `Progress`."""
+    permit_s: float = 0.0
+    """Seconds for which the agent's permit was waited for."""
 
 
 class Waits(Event, frozen=True, kw_only=True, tag="waits"):
@@ -147,6 +149,8 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     session_file: str | None = None
     jail: JailOrder | None = None
     """None: not jailed."""
+    lock: str | None = None
+    """File that the keeper holds while the agent may be alive; it waits for a keeper before it that still does."""
 
 
 class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):

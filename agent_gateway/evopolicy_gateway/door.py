@@ -1,7 +1,9 @@
-"""Where a run is served when its agent is in a container or on another host: `run --agent remote --http HOST:PORT`.
+"""Where a run is served when its agent is in a container or on another host, `run --agent remote --http HOST:PORT`, and where
+an agent is alive.
 
 Rules: an address is listened on only because the operator named it; then every request needs the bearer token, on loopback
-too; the token is a file of mode 0600 beside the gateway's other secrets, and no command's argument or output.
+too; the token is a file of mode 0600 beside the gateway's other secrets, and no command's argument or output. An agent that
+is not started here counts as being on every machine unless its operator says which, and as alive until he says that it is not.
 """
 
 from __future__ import annotations
@@ -92,6 +94,18 @@ def agent_host_of(agent: str, named: str) -> str:
     return named if named == ELSEWHERE else named.lower()
 
 
+def place_of(named: str) -> AgentPlace:
+    """The place of `evopolicy-gateway --agent-host`. ConfigError for what names none."""
+    if named == "unknown":
+        return AgentPlace()
+    if not _BOOT_ID.fullmatch(named):
+        raise ConfigError(
+            f"--agent-host {named!r}: give the boot id of the agent's machine (there: cat"
+            " /proc/sys/kernel/random/boot_id), or `unknown`"
+        )
+    return AgentPlace(boot_id=named.lower())
+
+
 def agent_place(folder: RunFolder) -> AgentPlace:
     """Where the agent of an open run is alive: where its gateway is, unless somebody else starts it."""
     if not folder.door.exists():
@@ -106,7 +120,11 @@ def ends_unseen(folder: RunFolder) -> bool:
 
 
 def _agent_host(folder: RunFolder) -> str:
-    return msgspec.json.decode(folder.intended.read_bytes(), type=IntendedRun).settings.agent_host
+    try:
+        intended = folder.intended.read_bytes()
+    except FileNotFoundError:
+        return ""
+    return msgspec.json.decode(intended, type=IntendedRun).settings.agent_host
 
 
 def said_of_place(agent_host: str, root: Path) -> str:

@@ -2,12 +2,16 @@
 
 It holds the run's capability and nothing else of the cluster. Stopped without a word (signal, death, its operator gone) it
 leaves the run open: started again on the same folder it goes on where it was.
+
+Nothing is served, and so no agent started or told of, before the coordinator permits the agent to be alive where it is. The
+run's closing ends the permit, so it comes after the agent's end: the parent says so, or else the operator (`evopolicy finish`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,12 +25,15 @@ from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_gateway import workspace
 from evopolicy_gateway.agents_md import Urls
+from evopolicy_gateway.door import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.http import make_app
 from evopolicy_gateway.journal import Closed, Journal
 from evopolicy_gateway.layout import OpenedRun, RunFolder
 from evopolicy_gateway.server import bind, serving
 from evopolicy_gateway.session import Session
 from evopolicy_gateway.submits import Desk
+
+_LOOK_S = 1.0
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -49,23 +56,34 @@ class Gateway:
         *,
         on_ready: Callable[[Urls, Desk], None],
         on_change: Callable[[Desk], None],
-        close_when_spent: bool,
+        on_wait: Callable[[str], None] = lambda waits_for: None,
+        alone: bool,
+        place: AgentPlace | None = None,
     ) -> None:
         """`connect` and `credentials_file` (its folder) replace those of the run; its capability stays.
 
-        `close_when_spent`: nobody else watches the agent.
+        `on_wait` is told what it waits for beside the agent, empty for nothing any more. `alone`: nobody else watches the
+        agent. `place`: where the agent is, if not where the run's folder says.
         """
         self._folder = folder
         self._connect = connect
         self._credentials_file = credentials_file
         self._on_ready = on_ready
         self._on_change = on_change
-        self._close_when_spent = close_when_spent
+        self._on_wait = on_wait
+        self._alone = alone
+        self._place = place
+        self._stopped = asyncio.Event()
+        """Told to leave the run open."""
+        self.permit_s = 0.0
+        """Seconds for which the agent's permit was waited for."""
         self._told: asyncio.Future[Close | None] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
 
     def tell(self, close: Close | None) -> None:
-        """Ends the gateway: closing the run, or (None) leaving it open."""
+        """Ends the gateway: closing the run, or (None) leaving it open, also where its closing waits."""
+        if close is None:
+            self._stopped.set()
         if not self._told.done():
             self._told.set_result(close)
 
@@ -84,13 +102,13 @@ class Gateway:
                 session = Session(link, run)
                 try:
                     opened = await self._unless_told(session.open())
+                    if opened is None or not await self._permitted(session):
+                        return False
                 except RefusedError as error:
                     if error.status not in RUN_OVER:
                         raise
                     log.warning("the run takes no more", status=error.status, why=error.message)
                     return True
-                if opened is None:
-                    return False
                 workspace.stage(self._folder, opened, address.urls())
                 blobs = BlobStore(self._folder.blobs)
                 desk = Desk(session, opened, self._folder.workspace, journal, blobs, self._changed.set)
@@ -107,6 +125,17 @@ class Gateway:
         finally:
             sock.close()
             journal.close()
+
+    async def _permitted(self, session: Session) -> bool:
+        """Whether the agent may be alive; False when told to end first."""
+        if self._alone:
+            self._folder.alone.touch(mode=0o600)
+        place = self._place or agent_place(self._folder)
+        asked = time.monotonic()
+        granted = await self._unless_told(session.permit(place, self._on_wait))
+        self.permit_s = time.monotonic() - asked
+        self._on_wait("")
+        return granted is not None
 
     async def _watch(self, desk: Desk, http: asyncio.Task[None]) -> Close | None:
         """Passes changes on until told to end."""
@@ -125,17 +154,30 @@ class Gateway:
                 return self._told.result()
             self._changed.clear()
             self._on_change(desk)
-            if self._close_when_spent and desk.spent:
-                return Close(reason="budget_spent")
+            if self._alone and (desk.spent or self._folder.finish.exists()):
+                return Close(reason="budget_spent" if desk.spent else "agent_stopped")
 
     async def _close(self, session: Session, journal: Journal, desk: Desk, close: Close) -> bool:
-        # The agent is gone, but what it asked for last is still played and written.
+        # The agent has no more to say, but what it asked for last is still played and written.
         desk.closed = True
         await desk.idle()
+        if not await self._agent_gone(desk):
+            return False
         await session.close(close.reason, close.agent)
         await asyncio.to_thread(journal.append, Closed(reason=close.reason))
         log.info("run closed", reason=close.reason)
         return True
+
+    async def _agent_gone(self, desk: Desk) -> bool:
+        """True when the agent has ended, as far as anybody can tell; False when told to leave the run open first."""
+        unseen = self._alone or ends_unseen(self._folder)
+        while unseen and not (desk.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
+            self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._stopped.wait(), _LOOK_S)
+            await desk.refresh()
+        self._on_wait("")
+        return not self._stopped.is_set()
 
     async def _unless_told(self, wanted: Any) -> Any:
         """The result, or None when told to end first."""

@@ -54,15 +54,20 @@ def info_document(
 
 
 def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str, Any]:
-    """A submit that runs: how far it is and, when nothing of it runs, what it waits for."""
-    n_done, waits_for = ticket.n_done, ticket.waits_for
+    """A submit that runs: how far it is and, when nothing of it runs, what it waits for.
+
+    `held_s`: seconds that it waited because the cluster's other work had the machines; they count against no limit.
+    """
+    n_done, waits_for, held_s = ticket.n_done, ticket.waits_for, ticket.held_s
     seen = state.in_flight if state is not None else None
     if seen is not None and ticket.accepted is not None and seen.submit_index == ticket.accepted.submit_index:
         n_done, waits_for = max(n_done, seen.n_done), waits_for or seen.waits_for
+        held_s = max(held_s, seen.held_s)
     return {
         "submit_id": ticket.index,
         "status": "running",
         "n_episodes": ticket.n_episodes,
         "n_done": n_done,
         "waits_for": waits_for,
+        "held_s": round(held_s, 1),
     }

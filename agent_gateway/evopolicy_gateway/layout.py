@@ -115,6 +115,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root.with_name(f".{self.root.name}.lock")
 
     @property
+    def keeper_lock(self) -> Path:
+        """Held by the agent's keeper as long as the agent may be alive, also when the command that started it was killed."""
+        return self.state / "keeper.lock"
+
+    @property
     def intended(self) -> Path:
         """What the coordinator is asked to open, written before it is asked: `IntendedRun`."""
         return self.state / "intended.json"

@@ -17,6 +17,7 @@ from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
+    AgentGone,
     CancelRun,
     Claim,
     ClaimState,
@@ -111,6 +112,11 @@ class Operations:
         """Ends a run as it is. TransportError when nobody answers soon."""
         message = CancelRun(token=self._token, run=run)
         await self._requests.until_answered("cancel", message, Done, patience_s=_PATIENCE_S)
+
+    async def agent_gone(self, run: str) -> None:
+        """Ends the permit of an open run's agent, which is no longer alive. TransportError when nobody answers soon."""
+        message = AgentGone(token=self._token, run=run)
+        await self._requests.until_answered("agent_gone", message, Done, patience_s=_PATIENCE_S)
 
     async def upload(self, bundle: Bundle) -> None:
         """Brings a bundle to the coordinator."""

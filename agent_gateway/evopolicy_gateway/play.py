@@ -1,7 +1,8 @@
 """One run from its opening to `run.json`, as the operator's process sees it.
 
-Order is what counts here: the run is opened, the gateway serves, the agent starts; the agent and all that it started are
-gone before the run is closed; only then hidden cases are scored, and only this process is told. A gateway that dies is
+Order is what counts here: the run is opened, the coordinator permits the agent to be alive here, the gateway serves, the agent
+starts; the agent and all that it started are gone before the run is closed or cancelled, which ends the permit; only then its
+hidden cases are scored here, and only this process is told. A gateway that dies is
 started again on the same port while the agent goes on; a keeper that dies is started again with its agent. When this
 process itself is killed its children end, and the folder holds all that going on with the run needs.
 """
@@ -18,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common import credentials
+from evopolicy_common import credentials, host
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
@@ -33,15 +34,18 @@ from evopolicy_gateway.children import Child
 from evopolicy_gateway.control import (
     AgentDoing,
     AgentEnded,
+    AgentSurvives,
     AgentTime,
     AgentTurn,
     CloseRun,
+    HeldTime,
     Progress,
     Ready,
     RunClosed,
     StartAgent,
+    Waits,
 )
-from evopolicy_gateway.door import TOKEN_VARIABLE, Door, check_agent
+from evopolicy_gateway.door import TOKEN_VARIABLE, Door, check_agent, said_of_place
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
@@ -57,6 +61,7 @@ _QUICK_DEATH_S = 5.0
 _MAX_QUICK_DEATHS = 5
 _MAX_KEEPER_DEATHS = 5
 _USAGE_ERROR = 2
+_SURVIVORS_PAUSE_S = 1.0
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -162,6 +167,12 @@ class RunPlay:
         self._closed = asyncio.Event()
         self._cancelled = False
         """Somebody else has ended the run at the coordinator."""
+        self.agent_gone = asyncio.Event()
+        """Set once the agent's side is over: what is left needs no place of an agent."""
+        self._survivors: list[int] = []
+        """Processes of the agent that could not be ended."""
+        self._held_before = 0.0
+        """`held_s` of the run when the keeper was started."""
         self._order: CloseRun | None = None
         self._gateway: Child | None = None
         self._keeper: Child | None = None
@@ -242,16 +253,20 @@ class RunPlay:
         try:
             if agents_side:
                 await self._agents_side()
+            self.agent_gone.set()
             finished = await self._finish(run)
         except BaseException as error:
-            if not (self._stays_open and isinstance(error, asyncio.CancelledError)):
+            if self._survivors:
+                self._tell_survivors()
+            elif self._stays_open and isinstance(error, asyncio.CancelledError):
+                await self._leave_open(run)
+            else:
                 await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
         return await record.write(self._folder, plan, finished, self._operations, self._stopwatch.times)
 
     async def _agents_side(self) -> None:
         """Until the run is closed."""
-        self._stopwatch.opened()
         serving = asyncio.create_task(self._keep_gateway())
         following = asyncio.create_task(self._follow())
         keeping: asyncio.Task[AgentEnded] | None = None
@@ -262,12 +277,13 @@ class RunPlay:
                 serving.result()
             if not self._ready.done():
                 return  # cancelled before it was served
+            self._stopwatch.opened()
             keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
             spent = asyncio.create_task(self._spent.wait())
             going: list[asyncio.Future[Any]] = [serving, keeping, spent]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
             spent.cancel()
-            if not serving.done() and not keeping.done():
+            if not serving.done() and not keeping.done() and not self._cancelled:
                 await asyncio.wait(
                     [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
                 )
@@ -286,7 +302,7 @@ class RunPlay:
             for child in (self._keeper, self._gateway):
                 if child is not None:
                     await child.end(END_GRACE_S)
-            await children.end_orphans()
+            self._survivors = await children.end_orphans()
             self._stopwatch.closed()
 
     async def _close(self, ended: AgentEnded) -> None:
@@ -341,7 +357,11 @@ class RunPlay:
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
     async def _on_gateway_event(self, event: object) -> None:
-        if isinstance(event, Ready):
+        if isinstance(event, Waits):
+            self._watch.held(self._name, event.waits_for)
+        elif isinstance(event, Ready):
+            self._stopwatch.permit_told(event.permit_s)
+            self._stopwatch.held_told(event.held_s)
             if not self._ready.done():
                 for text in event.notes:
                     self._watch.note(self._name, text)
@@ -352,17 +372,28 @@ class RunPlay:
         elif isinstance(event, Progress):
             self._stopwatch.gateway_told(event.in_flight_s, event.feedback_s)
             self._watch.progress(self._name, event)
+            await self._give_back(event.held_s)
             self._cancelled = self._cancelled or event.cancelled
             if event.spent:
                 self._spent.set()
         elif isinstance(event, RunClosed):
             self._closed.set()
 
+    async def _give_back(self, held_s: float) -> None:
+        """What the agent's submits waited for hidden episodes is given back to its clock."""
+        before, held = self._stopwatch.times.held_s, self._stopwatch.held_told(held_s)
+        if held > before and self._keeper is not None:
+            await self._keeper.tell(HeldTime(seconds=held - self._held_before))
+
     def _tell_where(self, ready: Ready) -> None:
         """What the operator hands to a remote agent."""
         if self._plan.door is None:
+            if not host.boot_id():
+                why = f"{host.NO_BOOT_ID}; until then no hidden case that this run shares is played while its agent lives"
+                self._watch.note(self._name, why)
             return
         for text in (
+            said_of_place(self._plan.settings.agent_host, self._folder.root),
             f"the agent is served at {ready.submit_url}",
             f"its bearer token is in {self._folder.bearer}; it finds it in {TOKEN_VARIABLE}",
             f"its workspace is {self._folder.workspace}; the rules are in AGENTS.md there",
@@ -399,6 +430,7 @@ class RunPlay:
     async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
         """How the agent ended; None when its keeper died."""
         self._stopwatch.agent_begins()
+        self._held_before = self._stopwatch.times.held_s
         left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.harnesses.keeper"]
         self._keeper = await Child.start(program, self._folder.harness_log, talks=True)
@@ -416,6 +448,7 @@ class RunPlay:
                 wall_limit_s=left_s,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
+                lock=str(self._folder.keeper_lock),
                 jail=self._jail(),
             )
         )
@@ -427,12 +460,29 @@ class RunPlay:
                 self._watch.doing(self._name, event)
             elif isinstance(event, AgentTime):
                 self._stopwatch.agent_told(event.used_s)
+            elif isinstance(event, AgentSurvives):
+                self._survivors = list(event.pids)
+                self._tell_survivors()
             elif isinstance(event, AgentEnded):
                 ended = event
         await self._keeper.ended()
         # What a keeper that died has left behind has become ours.
-        await children.end_orphans()
+        while left := await children.end_orphans():
+            if left != self._survivors:
+                self._survivors = left
+                self._tell_survivors()
+            await asyncio.sleep(_SURVIVORS_PAUSE_S)
+        self._survivors = []
         return ended
+
+    def _tell_survivors(self) -> None:
+        pids = ", ".join(map(str, self._survivors))
+        self._watch.note(
+            self._name,
+            f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case that it shares is"
+            f" played on this machine before they are gone; go on with it with --resume then, or, once it is certain that they"
+            f" are gone: evopolicy runs agent-gone {self.run}",
+        )
 
     async def _finish(self, run: str) -> RunFinished:
         async for progress in self._operations.wait(run):
@@ -440,6 +490,12 @@ class RunPlay:
             if progress.finished is not None:
                 return progress.finished
         raise AssertionError("waiting ends with the finished run")
+
+    async def _leave_open(self, run: str) -> None:
+        """Tells the coordinator that the agent of a run that stays open is gone; it needs another permit to go on."""
+        with contextlib.suppress(EvopolicyError, TimeoutError):
+            async with asyncio.timeout(GIVE_UP_PATIENCE_S):
+                await self._operations.agent_gone(run)
 
     async def _give_up(self, run: str, why: str | None) -> None:
         """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""

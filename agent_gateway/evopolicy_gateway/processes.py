@@ -81,13 +81,12 @@ def end_descendants(
     return _below(spare)
 
 
-def end_orphans(known: Collection[int]) -> None:
+def end_orphans(known: Collection[int]) -> list[int]:
     """Ends what has become this process's child by its parent's death: all but the `known` and what is below them.
 
-    Does nothing in a process that has not become a subreaper: its other children are not ours to end.
+    Returns what survives. Does nothing in a process that has not become a subreaper: its other children are not ours to end.
     """
-    if _reaps:
-        end_descendants(0.0, spare=known)
+    return end_descendants(0.0, spare=known) if _reaps else []
 
 
 def _table() -> list[tuple[int, int, bytes]]:

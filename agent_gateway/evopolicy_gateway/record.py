@@ -123,6 +123,8 @@ def run_record(
             queue_s=round(finished.wall_s.get("queue", 0.0), 3),
             rollout_s=round(finished.wall_s.get("rollout", 0.0), 3),
             feedback_s=round(times.feedback_s, 3),
+            held_s=round(times.held_s, 3),
+            permit_s=round(times.permit_s, 3),
             finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
         ),
         outcome=_outcome(finished),

@@ -20,7 +20,8 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.alone import alone
-from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed
+from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed, Waits
+from evopolicy_gateway.door import AgentPlace, place_of
 from evopolicy_gateway.gateway import Close, Gateway, folder_of
 from evopolicy_gateway.layout import RunFolder
 from evopolicy_gateway.submits import Desk
@@ -44,6 +45,14 @@ def serve(
             help="Folder of `evopolicy-coordinator certs issue gateway`, in place of the credentials in the folder.",
         ),
     ] = None,
+    agent_host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOOT_ID|unknown",
+            help="Kernel that the agent runs on (there: cat /proc/sys/kernel/random/boot_id), unknown for any; default:"
+            " this machine's.",
+        ),
+    ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print the URLs as one JSON object.")] = False,
     controlled: Annotated[
         bool,
@@ -54,16 +63,17 @@ def serve(
 
     Example: evopolicy-gateway runs/evolve/gym_acrobot/first
 
-    `evopolicy run` starts it by itself; started by hand it takes an open run over after a crash, on the same port. It
-    closes the run when the budget is spent. Ctrl-C leaves the run open.
+    `evopolicy run` starts it by itself; started by hand it takes an open run over after a crash, on the same port. Nobody
+    watches the agent then: when it has ended, `evopolicy finish` closes the run. Ctrl-C leaves the run open.
     """
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():
         folder = folder_of(run_directory)
+        place = None if agent_host is None else place_of(agent_host)
         # The command that controls a gateway holds the folder for both.
         with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
             closed = asyncio.run(
-                _serve(folder, tuple(connect or ()), credentials_file, json_output, controlled)
+                _serve(folder, tuple(connect or ()), credentials_file, place, json_output, controlled)
             )
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
@@ -87,6 +97,7 @@ async def _serve(
     folder: RunFolder,
     connect: tuple[str, ...],
     credentials_file: Path | None,
+    place: AgentPlace | None,
     json_output: bool,
     controlled: bool,
 ) -> bool:
@@ -101,6 +112,8 @@ async def _serve(
                     task_url=urls.task,
                     submit_url=urls.submit,
                     notes=notes if undrawn else (),
+                    held_s=round(desk.held_s, 3),
+                    permit_s=round(gateway.permit_s, 3),
                 )
             )
         elif json_output:
@@ -112,13 +125,27 @@ async def _serve(
         if controlled:
             control.emit(progress_of(desk))
 
+    said = ""
+
+    def waits(what: str) -> None:
+        nonlocal said
+        if what == said:
+            return
+        said = what
+        if controlled:
+            control.emit(Waits(waits_for=what))
+        elif what:
+            print(f"waiting for {what}", file=sys.stderr, flush=True)
+
     gateway = Gateway(
         folder,
         connect,
         credentials_file,
         on_ready=ready,
         on_change=changed,
-        close_when_spent=not controlled,
+        on_wait=waits,
+        alone=not controlled,
+        place=place,
     )
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -167,6 +194,7 @@ def progress_of(desk: Desk) -> Progress:
         best_mean=max(means, default=None),
         in_flight_s=round(desk.in_flight_s, 3),
         feedback_s=round(desk.feedback_s, 3),
+        held_s=round(desk.held_s, 3),
         spent=desk.spent,
         cancelled=desk.cancelled,
     )

@@ -124,9 +124,7 @@ class Session:
         )
         return await self._ask("submit", message, SubmitAccepted)
 
-    async def results(
-        self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S
-    ) -> ResultsPage:
+    async def results(self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S) -> ResultsPage:
         """What happened to a submit since `cursor`; comes after `wait_s` seconds at the latest, empty if need be."""
         question = ResultsRequest(
             run=self._run,

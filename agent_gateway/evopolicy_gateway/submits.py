@@ -47,7 +47,7 @@ from evopolicy_gateway.journal import (
     SetAside,
     Settled,
 )
-from evopolicy_gateway.session import Session
+from evopolicy_gateway.session import HELD_WAIT_S, RESULTS_WAIT_S, Session
 from evopolicy_gateway.submit_request import Bounds, parse
 from evopolicy_gateway.tickets import ConflictError, Ticket
 
@@ -95,6 +95,8 @@ class Desk:
         self.n_rejected = 0
         self.in_flight_s = 0.0
         """Seconds in which a submit was in flight, of this process."""
+        self.held_s = run.state.held_s
+        """Seconds for which submits of the run have waited because hidden episodes had the machines."""
         self.feedback_s = 0.0
         """Of these, from the last result's arrival to the committed feedback."""
         self._session = session
@@ -198,6 +200,7 @@ class Desk:
         # While a submit is on its way, an answer may be older than what its acceptance told.
         if state is not None and state.n_submits >= self.state.n_submits:
             self.state = state
+            self.held_s = max(self.held_s, state.held_s)
             self._close(state.is_finalized, state.cancelled)
         return self.state
 
@@ -387,13 +390,17 @@ class Desk:
         tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
         await asyncio.to_thread(tree.begin)
         scores: dict[int, EpisodeScore] = {}
-        cursor = 0
+        cursor, held_before = 0, self.held_s
         done: SubmitDone | None = None
         while done is None:
-            page = await self._session.results(index, cursor)
+            page = await self._session.results(
+                index, cursor, HELD_WAIT_S if ticket.waits_for else RESULTS_WAIT_S
+            )
             cursor, done = page.cursor, page.done
             await self._write_page(tree, ticket.request.key, page, first, scores)
+            self.held_s = max(self.held_s, page.held_s)
             ticket.n_done, ticket.waits_for = len(scores), page.waits_for
+            ticket.held_s = self.held_s - held_before
             self._on_change()
             if done is None and len(ticket.request.env_instances) - len(scores) >= LINGER_EPISODES:
                 await asyncio.sleep(LINGER_S)

@@ -39,6 +39,8 @@ class Ticket:
         self.n_done = 0
         """Episodes whose feedback is written."""
         self.waits_for = ""
+        self.held_s = 0.0
+        """Seconds for which none of its episodes ran because hidden episodes had the machines."""
         self.accepted: Accepted | None = None
         self.decided = asyncio.Event()
         """Set once it is accepted, or never will be."""

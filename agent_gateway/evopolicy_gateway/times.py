@@ -27,6 +27,10 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """A submit was in flight."""
     feedback_s: float = 0.0
     """From the last episode's result to the submit's answer."""
+    held_s: float = 0.0
+    """Submits waited because hidden episodes had the machines; not in `agent_s`."""
+    permit_s: float = 0.0
+    """The agent's start waited for hidden episodes that its machine played; in no other figure."""
 
 
 class Stopwatch:
@@ -48,6 +52,8 @@ class Stopwatch:
             open_s=base.open_s + (0.0 if self._opened is None else self._now() - self._opened),
             in_flight_s=base.in_flight_s + self._in_flight_s,
             feedback_s=base.feedback_s + self._feedback_s,
+            held_s=base.held_s,
+            permit_s=base.permit_s,
         )
 
     def opened(self) -> None:
@@ -81,6 +87,15 @@ class Stopwatch:
     def gateway_told(self, in_flight_s: float, feedback_s: float) -> None:
         """The counts of the gateway that runs now."""
         self._in_flight_s, self._feedback_s = in_flight_s, feedback_s
+
+    def held_told(self, seconds: float) -> float:
+        """The run's `held_s` so far, as the coordinator counts it; returns it, which never falls."""
+        self._base = msgspec.structs.replace(self._base, held_s=max(self._base.held_s, seconds))
+        return self._base.held_s
+
+    def permit_told(self, seconds: float) -> None:
+        """A permit was waited for, so long."""
+        self._base = msgspec.structs.replace(self._base, permit_s=self._base.permit_s + seconds)
 
     def keep(self) -> None:
         """Writes it down; what the disk refuses is told by something that matters more."""

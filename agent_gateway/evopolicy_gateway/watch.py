@@ -26,6 +26,9 @@ PHASES = {
 class Watch(Protocol):
     """Is told what happens to runs; `run` is a run's short name."""
 
+    def held(self, run: str, what: str) -> None:
+        """It may not begin, or not be closed, before `what`; empty: it may now."""
+
     def note(self, run: str, text: str) -> None:
         """Something worth a line."""
 
@@ -61,6 +64,9 @@ class Lines:
                 f" {progress.remaining_budget} of {progress.episode_budget} episodes left",
             )
         self._waits_for(run, progress.waits_for)
+
+    def held(self, run: str, what: str) -> None:
+        self._waits_for(run, what)
 
     def turn(self, run: str, turn: int, text: str) -> None:
         self.note(run, f"turn {turn}: {first_line(text)}")
@@ -113,6 +119,11 @@ class LiveTable:
             )
         row.progress = progress
 
+    def held(self, run: str, what: str) -> None:
+        self._row(run).held = what
+        if what:
+            self.note(run, f"waiting for {what}")
+
     def turn(self, run: str, turn: int, text: str) -> None:
         self._row(run).said = first_line(text)
 
@@ -146,11 +157,12 @@ class _Row:
         self.last_submit: str | None = None
         self.last = ""
         self.said = ""
+        self.held = ""
 
     def cells(self) -> tuple[Text, ...]:
         progress = self.progress
         if progress is None:
-            return (Text(""),) * 4 + (Text("starting"),)
+            return (Text(""),) * 4 + (Text(f"waiting for {self.held}" if self.held else "starting"),)
         used = progress.episode_budget - progress.remaining_budget
         best = "" if progress.best_mean is None else f"{progress.best_mean:.4g}"
         return (
@@ -162,6 +174,8 @@ class _Row:
         )
 
     def _now(self, progress: Progress) -> str:
+        if self.held:
+            return f"waiting for {self.held}"
         if self.phase is not None:
             done = f" {self.phase.done}/{self.phase.total}" if self.phase.total else ""
             waits = f", waiting for {self.phase.waits_for}" if self.phase.waits_for else ""

@@ -97,6 +97,10 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
     """At least one train episode ran."""
     feedback_s: float = 0.0
     """From the last episode's result to the submit's answer."""
+    held_s: float = 0.0
+    """A submit waited because hidden episodes had the machines; in none of the phases and against no limit."""
+    permit_s: float = 0.0
+    """The agent's start waited until its machine played no hidden episodes that its run shares; in none of the phases."""
     finalise_s: float = 0.0
     """From the agent's end to `run.json`."""
 

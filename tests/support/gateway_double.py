@@ -21,6 +21,8 @@ from evopolicy_common.messages.gateway import (
     CloseRun,
     EpisodeFeedback,
     OpenRun,
+    Permit,
+    RequestPermit,
     ResultsPage,
     ResultsRequest,
     RunClosed,
@@ -133,6 +135,9 @@ class Double:
         self.failures: dict[int, PolicyFailure] = {}
         """By request index."""
         self.refuse_submit: Refused | None = None
+        self.permits: list[Permit | Refused] = []
+        """Answers to requests for a permit, the last one again and again; none: it is granted."""
+        self.held_s = 0.0
 
     def on_queries(self, queries: list[transport.IncomingQuery]) -> None:
         for query in queries:
@@ -157,6 +162,10 @@ class Double:
             return Refused(status="bad_token", message="wrong token")
         if isinstance(message, OpenRun):
             return msgspec.structs.replace(self.run, state=self._state())
+        if isinstance(message, RequestPermit):
+            if not self.permits:
+                return Permit(granted=True)
+            return self.permits.pop(0) if len(self.permits) > 1 else self.permits[0]
         if isinstance(message, StateRequest):
             return StateReply(state=self._state())
         if isinstance(message, BlobPut):
@@ -192,7 +201,9 @@ class Double:
     def _page(self, message: ResultsRequest) -> ResultsPage:
         submit = self.submits[message.submit_index]
         if not self.go.is_set():
-            return ResultsPage(cursor=message.cursor, episodes=(), done=None, waits_for="a worker")
+            return ResultsPage(
+                cursor=message.cursor, episodes=(), done=None, waits_for="a worker", held_s=self.held_s
+            )
         status, cause, n_kept = self.verdict(submit)
         n = len(submit.env_instances)
         arrivals = self.order(n) if status in ("ok", "rollout_timeout", "quarantined") else []
@@ -212,7 +223,7 @@ class Double:
                 n_kept=n_kept,
             )
         episodes = tuple(episode(i, submit.env_instances[i], self.failures.get(i)) for i in page)
-        return ResultsPage(cursor=cursor, episodes=episodes, done=done)
+        return ResultsPage(cursor=cursor, episodes=episodes, done=done, held_s=self.held_s)
 
     def _state(self) -> RunState:
         running = None
@@ -222,12 +233,14 @@ class Double:
                 n_episodes=len(self.submits[-1].env_instances),
                 n_done=0,
                 waits_for="a worker",
+                held_s=self.held_s,
             )
         return RunState(
             remaining_budget=self.remaining,
             n_submits=len(self.submits),
             is_finalized=self.closed is not None,
             in_flight=running,
+            held_s=self.held_s,
         )
 
     def _first(self, index: int) -> int:
@@ -267,6 +280,9 @@ def prepare(root: Path, found: Credentials) -> RunFolder:
 class Served(msgspec.Struct, frozen=True):
     """A gateway that serves, and what a test looks at."""
 
+    waits: list[str]
+    """What it has said that it waits for."""
+
     double: Double
     folder: RunFolder
     gateway: Gateway
@@ -281,14 +297,16 @@ class Served(msgspec.Struct, frozen=True):
 
 
 @contextlib.asynccontextmanager
-async def gateway_on(folder: RunFolder, double: Double) -> AsyncIterator[Served]:
+async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIterator[Served]:
     """A gateway on that folder; stopped without closing the run at the end, if it still serves."""
+    waits: list[str] = []
     ready: asyncio.Future[tuple[Urls, Desk]] = asyncio.get_running_loop().create_future()
     gateway = Gateway(
         folder,
         on_ready=lambda urls, desk: ready.set_result((urls, desk)),
         on_change=lambda desk: None,
-        close_when_spent=False,
+        on_wait=waits.append,
+        **{"alone": False, **more},
     )
     task = asyncio.create_task(gateway.run())
     await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
@@ -296,7 +314,7 @@ async def gateway_on(folder: RunFolder, double: Double) -> AsyncIterator[Served]
         task.result()
     urls, desk = ready.result()
     async with httpx.AsyncClient(timeout=30.0, trust_env=False) as client:
-        yield Served(double, folder, gateway, task, urls, desk, client)
+        yield Served(waits, double, folder, gateway, task, urls, desk, client)
     gateway.tell(None)
     await task
 

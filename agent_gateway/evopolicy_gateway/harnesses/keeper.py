@@ -7,6 +7,7 @@ credentials, and so that a gateway that dies and comes back finds the agent stil
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import signal
 import sys
@@ -19,7 +20,15 @@ import structlog
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway import control, processes
-from evopolicy_gateway.control import AgentDoing, AgentEnded, AgentSurvives, AgentTime, AgentTurn, Orders, StartAgent
+from evopolicy_gateway.control import (
+    AgentDoing,
+    AgentEnded,
+    AgentSurvives,
+    AgentTime,
+    AgentTurn,
+    Orders,
+    StartAgent,
+)
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
@@ -165,6 +174,10 @@ async def _main() -> int:
     first = await orders.next()
     if not isinstance(first, StartAgent):
         return 2
+    if first.lock is not None:
+        # Of this process alone, and let go of by its death: no program of the agent inherits it.
+        file = os.open(first.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        await asyncio.to_thread(fcntl.flock, file, fcntl.LOCK_EX)
     main = asyncio.create_task(keep(first, orders))
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, orders.end)

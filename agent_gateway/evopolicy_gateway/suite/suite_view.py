@@ -112,6 +112,9 @@ class SuiteView:
                 budget_left=progress.remaining_budget,
             )
 
+    def held(self, run: str, what: str) -> None:
+        self._waits_for(run, what)
+
     def turn(self, run: str, turn: int, text: str) -> None:
         self.rows[run].action = first_line(text)
         self.event("turn", run, turn=turn, text=first_line(text))

@@ -96,6 +96,7 @@ def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
             "n_episodes": 2,
             "n_done": 0,
             "waits_for": "a worker",
+            "held_s": 0.0,
         }
 
     play(tmp_path, script)

@@ -38,6 +38,18 @@ def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_pat
     assert Stopwatch(path).times == second.times
 
 
+def test_what_was_waited_for_hidden_episodes_is_kept_and_in_no_other_figure(tmp_path: Path) -> None:
+    path = tmp_path / "times.json"
+    first = Stopwatch(path)
+    first.permit_told(2.0)
+    assert first.held_told(3.0) == 3.0
+    # Both are told by each gateway: of the whole run the one, of its own wait the other.
+    first.permit_told(1.0)
+    assert first.held_told(2.0) == 3.0
+    first.keep()
+    assert Stopwatch(path).times == Times(held_s=3.0, permit_s=3.0)
+
+
 def test_times_that_cannot_be_read_or_written_stop_nothing(tmp_path: Path) -> None:
     path = tmp_path / "times.json"
     path.write_text("{")

@@ -158,6 +158,19 @@ def test_the_clock_stands_still_in_a_pause() -> None:
     assert clock.left_s() == -1.0
 
 
+def test_what_its_submits_waited_for_hidden_episodes_is_given_back_to_the_clock() -> None:
+    now = [0.0]
+    clock = AgentClock(10.0, lambda: now[0])
+    now[0] = 9.0
+    clock.held(3.0)
+    assert (clock.left_s(), clock.used_s()) == (4.0, 6.0)
+    clock.held(2.0)
+    assert clock.left_s() == 4.0
+    clock.held(5.0)
+    now[0] = 16.0
+    assert clock.left_s() == -1.0
+
+
 QWEN = """
 harness = "qwen"
 program = ["fake-qwen"]

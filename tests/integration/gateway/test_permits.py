@@ -1,0 +1,220 @@
+"""No agent is started or told of before its permit, and no run is closed before its agent is gone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from gateway_double import RUN, Double, answering, gateway_on, opened, prepare, served
+
+from evopolicy_common import host
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.gateway import CloseRun, OpenRun, Permit, RequestPermit
+from evopolicy_common.messages.operator import ELSEWHERE, RunSettings
+from evopolicy_common.messages.worker import Message, Refused
+from evopolicy_common.refusals import Refusal
+from evopolicy_gateway import door
+from evopolicy_gateway.door import AgentPlace, Door
+from evopolicy_gateway.gateway import Close, Gateway
+from evopolicy_gateway.layout import IntendedRun, RunFolder, save
+
+KERNEL = "0f2e9a7c-11d0-4b35-8d2f-5a3c9e7b1d60"
+WAITING = Permit(granted=False, waits_for="hidden episodes to end on this machine")
+
+
+def asked(double: Double, kind: type[Message]) -> list[Message]:
+    return [message for message in double.asked if isinstance(message, kind)]
+
+
+def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Gateway, list[object]]:
+    """A gateway, and what it has said: URLs once it serves, texts of what it waits for."""
+    said: list[object] = []
+    gateway = Gateway(
+        folder,
+        on_ready=lambda urls, desk: said.append(urls),
+        on_change=lambda desk: None,
+        on_wait=said.append,
+        alone=alone,
+        **more,  # type: ignore[arg-type]
+    )
+    return gateway, said
+
+
+async def until(what: Callable[[], object]) -> None:
+    async with asyncio.timeout(60.0):
+        while not what():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+def remote(folder: RunFolder, agent_host: str) -> None:
+    save(folder.door, Door(host="127.0.0.1", port=0))
+    settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", agent_host=agent_host)
+    save(folder.intended, IntendedRun(key="k", settings=settings))
+
+
+def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.permits = [WAITING]
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            gateway, said = quiet(folder)
+            task = asyncio.create_task(gateway.run())
+            await until(lambda: len(asked(double, RequestPermit)) > 1)
+            assert set(said) == {WAITING.waits_for}
+            assert not folder.workspace.exists()
+            double.permits = []
+            await until(lambda: len(said) > 1 and said[-2] == "")
+            assert gateway.permit_s > 0.0
+            gateway.tell(None)
+            assert not await task
+        opening = asked(double, OpenRun)[0]
+        assert isinstance(opening, OpenRun)
+        assert opening.asks_permit
+        first = asked(double, RequestPermit)[0]
+        assert isinstance(first, RequestPermit)
+        assert (first.run, first.boot_id, first.machine_id) == (RUN, host.boot_id(), host.machine_id())
+
+    asyncio.run(main())
+
+
+def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            for _ in range(2):
+                async with gateway_on(folder, double):
+                    pass
+        assert len(asked(double, RequestPermit)) == 2
+        assert double.closed is None
+
+    asyncio.run(main())
+
+
+def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.permits = [Refused(status=Refusal.RUN_CANCELLED, message="the run was cancelled")]
+        async with answering(tmp_path, double) as found:
+            gateway, said = quiet(prepare(tmp_path / "run", found))
+            assert await gateway.run()
+        assert said == []
+
+    asyncio.run(main())
+
+
+def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.permits = [Refused(status=Refusal.BAD_MESSAGE, message="not a message")]
+        async with answering(tmp_path, double) as found:
+            gateway, said = quiet(prepare(tmp_path / "run", found))
+            with pytest.raises(ConfigError, match="older version.*update it"):
+                await gateway.run()
+        assert said == []
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(("agent_host", "asks_for"), [("", ""), (KERNEL, KERNEL), (ELSEWHERE, "")])
+def test_permit_of_a_remote_agent_is_for_the_kernel_that_its_operator_names(
+    tmp_path: Path, agent_host: str, asks_for: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.state.mkdir()
+    remote(folder, agent_host)
+    assert door.agent_place(folder) == AgentPlace(boot_id=asks_for)
+    assert door.ends_unseen(folder) == (agent_host != ELSEWHERE)
+
+
+def test_run_of_a_remote_agent_is_closed_when_its_operator_says_that_it_has_ended(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            remote(folder, KERNEL)
+            async with gateway_on(folder, double) as service:
+                service.gateway.tell(Close(reason="budget_spent"))
+                await until(lambda: len(service.waits) > 1)
+                assert "evopolicy finish" in service.waits[1]
+                assert double.closed is None
+                assert service.desk.closed
+                door.finish(folder)
+                assert await service.task
+        assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
+            "budget_spent"
+        ]
+
+    asyncio.run(main())
+
+
+def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            remote(folder, ELSEWHERE)
+            async with gateway_on(folder, double) as service:
+                assert await service.close()
+        assert double.closed is not None
+
+    asyncio.run(main())
+
+
+def test_gateway_that_is_stopped_while_it_waits_for_an_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            remote(folder, "")
+            async with gateway_on(folder, double) as service:
+                service.gateway.tell(Close(reason="wall_limit"))
+                await until(lambda: len(service.waits) > 1)
+                service.gateway.tell(None)
+                assert not await service.task
+        assert double.closed is None
+
+    asyncio.run(main())
+
+
+def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened(episode_budget=1))
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found)
+            async with gateway_on(folder, double, alone=True, place=AgentPlace(boot_id=KERNEL)) as service:
+                await service.http.post(service.urls.submit, json={"env_instances": [1]})
+                await until(lambda: len(service.waits) > 1)
+                assert "evopolicy finish" in service.waits[1]
+                assert double.closed is None
+                door.finish(folder)
+                assert await service.task
+        permit = asked(double, RequestPermit)[0]
+        assert isinstance(permit, RequestPermit)
+        assert permit.boot_id == KERNEL
+
+    asyncio.run(main())
+
+
+def test_submit_that_hidden_episodes_hold_up_tells_so_and_counts_against_no_limit(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened(state=msgspec.structs.replace(opened().state, held_s=5.0)))
+        double.held_s = 5.0
+        double.go.clear()
+        async with served(tmp_path, double) as service:
+            assert service.desk.held_s == 5.0
+            await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
+            double.held_s = 7.5
+            await until(lambda: service.desk.held_s == 7.5)
+            running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
+            assert running["waits_for"] == "a worker"
+            assert running["held_s"] >= 2.5
+            double.go.set()
+            await service.desk.idle()
+            assert service.desk.tickets[0].held_s == 2.5
+
+    asyncio.run(main())
