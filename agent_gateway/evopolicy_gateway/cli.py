@@ -225,7 +225,7 @@ def _plans(
     where, agent_host = served.door(), served.host_of(given.agent)
     plans = [
         Plan(
-            settings=msgspec.structs.replace(given.settings(env_id, exp_id), agent_host=agent_host),
+            settings=given.settings(env_id, exp_id, agent_host),
             agent=given.agent,
             runs=given.runs,
             started_in=started_in,

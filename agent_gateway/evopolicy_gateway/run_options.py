@@ -81,8 +81,8 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
         bool, typer.Option("--resume", help="Go on with the run of that --exp-id, whose command was killed.")
     ] = False
 
-    def settings(self, env: str, exp_id: str) -> RunSettings:
-        """The settings of one run. ConfigError naming the option that is wrong."""
+    def settings(self, env: str, exp_id: str, agent_host: str = "") -> RunSettings:
+        """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
         entry = self.entry or harnesses.entry_name(self.agent)
         return RunSettings(
             env=env,
@@ -96,6 +96,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             n_validation=self.validation,
             n_heldout=self.heldout,
             hidden_cases=hidden_cases_of(self.hidden_cases),
+            agent_host=agent_host,
             policy_scope=one_of("--policy-scope", self.policy_scope, PolicyScope),  # type: ignore[arg-type]
             observations=one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
             simulation=one_of("--simulation", self.simulation, SimulationRule),  # type: ignore[arg-type]

@@ -45,7 +45,7 @@ def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Ga
 
 async def until(what: Callable[[], object]) -> None:
     async with asyncio.timeout(60.0):
-        while not what():  # noqa: ASYNC110
+        while not what():
             await asyncio.sleep(0.01)
 
 
@@ -113,7 +113,7 @@ def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: P
         double.permits = [Refused(status=Refusal.BAD_MESSAGE, message="not a message")]
         async with answering(tmp_path, double) as found:
             gateway, said = quiet(prepare(tmp_path / "run", found))
-            with pytest.raises(ConfigError, match="older version.*update it"):
+            with pytest.raises(ConfigError, match=r"older version.*update it"):
                 await gateway.run()
         assert said == []
 
