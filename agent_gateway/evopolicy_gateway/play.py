@@ -14,6 +14,7 @@ import contextlib
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -147,11 +148,13 @@ class RunPlay:
         *,
         name: str | None = None,
         stays_open: bool = False,
+        on_agent_gone: Callable[[], None] = lambda: None,
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
         `name`: how the watch knows the run, its environment otherwise.
         `stays_open`: when this is cancelled the run is left as it is, to be resumed.
+        `on_agent_gone` is called once the agent's side is over: what is left of the run needs no agent's place.
         """
         self._plan = plan
         self._folder = plan.folder
@@ -167,8 +170,7 @@ class RunPlay:
         self._closed = asyncio.Event()
         self._cancelled = False
         """Somebody else has ended the run at the coordinator."""
-        self.agent_gone = asyncio.Event()
-        """Set once the agent's side is over: what is left needs no place of an agent."""
+        self._on_agent_gone = on_agent_gone
         self._survivors: list[int] = []
         """Processes of the agent that could not be ended."""
         self._held_before = 0.0
@@ -253,7 +255,7 @@ class RunPlay:
         try:
             if agents_side:
                 await self._agents_side()
-            self.agent_gone.set()
+            self._on_agent_gone()
             finished = await self._finish(run)
         except BaseException as error:
             if self._survivors:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Collection, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -96,7 +96,7 @@ async def connected(
 async def play_all(
     plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal
 ) -> list[RunResult]:
-    """Plays all plans, so many at once; one that fails does not stop the others."""
+    """Plays all plans, so many agents at once; one that fails does not stop the others."""
     results: dict[int, RunResult] = {}
     with watching(console) as watch:
         settings = [plan.settings for plan in plans]
@@ -106,8 +106,11 @@ async def play_all(
             gate = asyncio.Semaphore(parallel)
 
             async def one(index: int, plan: Plan) -> None:
-                async with gate:
-                    results[index] = await _play(plan, operations, gateway, watch)
+                await gate.acquire()
+                with contextlib.ExitStack() as place:
+                    # Once its agent is gone, the next one begins while this run is scored.
+                    place.callback(gate.release)
+                    results[index] = await _play(plan, operations, gateway, watch, place.close)
 
             async def everything() -> None:
                 async with asyncio.TaskGroup() as group:
@@ -158,8 +161,14 @@ def report(results: Sequence[RunResult], console: Terminal) -> None:
         console.print(f"run directory: {result.run_directory}", soft_wrap=True)
 
 
-async def _play(plan: Plan, operations: Operations, gateway: Credentials, watch: Watch) -> RunResult:
-    play = RunPlay(plan, operations, gateway, watch)
+async def _play(
+    plan: Plan,
+    operations: Operations,
+    gateway: Credentials,
+    watch: Watch,
+    on_agent_gone: Callable[[], None],
+) -> RunResult:
+    play = RunPlay(plan, operations, gateway, watch, on_agent_gone=on_agent_gone)
     try:
         return _result(plan, await (play.go_on() if plan.resume else play.play()))
     except ConfigError as error:

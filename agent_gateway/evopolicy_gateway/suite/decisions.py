@@ -5,11 +5,14 @@
 - A run that the cluster has closed is only finished. One still open goes on in its agent's session; without a session it
   is begun again as a new attempt, and what there is of it is kept aside.
 - Where the file now wants other settings than a run was played with, the operator decides.
+- Runs that share no hidden case are begun side by side where there are such, as agents and hidden episodes of runs that do
+  must not be on one machine and wait for each other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -87,6 +90,20 @@ def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision
         return Decision(run=run, kind="resume", attempt=attempt)
     why = "its agent keeps no session that could be continued"
     return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
+
+
+def side_by_side(waiting: Sequence[Decision], under_way: Iterable[SuiteRun]) -> list[Decision]:
+    """The order in which waiting runs are best begun: those first that share hidden cases with the fewest runs under way.
+
+    Otherwise as they stand. `under_way`: runs whose agent is at work or whose hidden cases are being played.
+    """
+    shared = Counter(_hidden_cases(run) for run in under_way)
+    return sorted(waiting, key=lambda one: shared[_hidden_cases(one.run)])
+
+
+def _hidden_cases(run: SuiteRun) -> str:
+    """Equal for runs that share hidden cases."""
+    return run.settings.env if run.settings.hidden_cases == "shared" else run.name
 
 
 def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ Rules:
   the run here, and its folder stays as it is.
 - Cancelled, it leaves runs open and gives no claim back: the same host goes on with them, and another takes them over
   once their time is up.
+- A run takes a place (`parallel`) until its agent is gone: the next one begins while it is scored.
 - A provider that is away holds back further runs with it; those that go on wait by themselves.
 - A cap that is used up holds back all further runs, and leaves those of coding agents open as a cancelled sweep does.
 """
@@ -17,6 +18,7 @@ import hashlib
 import socket
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +37,15 @@ from evopolicy_gateway.layout import OpenedRun, RunFolder
 from evopolicy_gateway.operations import Operations
 from evopolicy_gateway.play import Plan, RunPlay
 from evopolicy_gateway.suite import suite_index
-from evopolicy_gateway.suite.decisions import Decision, Found
+from evopolicy_gateway.suite.decisions import Decision, Found, side_by_side
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 _ASK_AGAIN_S = 5.0
 _LOOK_S = 1.0
+_MAX_SCORED = 256
+"""Runs without an agent that are followed at once, beside those that have a place: each is a question to the coordinator."""
 ATTEMPTS = ".attempts"
 
 
@@ -78,6 +82,10 @@ class Sweep:
         self._paused_until: dict[str, float] = {}
         self._ending: set[str] = set()
         """Runs that have been cancelled and are not done with it."""
+        self._scored: set[str] = set()
+        """Runs whose agent is gone."""
+        self._moved = asyncio.Event()
+        """An agent has gone."""
         self._unsaved = False
         view.on_doing = self._on_doing
 
@@ -100,13 +108,14 @@ class Sweep:
                     self._view.say(f"{len(todo)} runs are left as they are: {why}")
                     return
                 if waiting:
-                    await asyncio.wait(waiting, timeout=_LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+                    await self._wait(waiting)
                 elif todo:
                     await asyncio.sleep(1.0)
                 for name, task in list(self._active.items()):
                     if task.done():
                         del self._active[name]
                         self._ending.discard(name)
+                        self._scored.discard(name)
                         taken_over = not task.cancelled() and isinstance(task.exception(), _TakenOverError)
                         if task.cancelled() or taken_over:
                             # Another host has it, whose result is asked for in time; or a cap is used up.
@@ -125,31 +134,54 @@ class Sweep:
             with contextlib.suppress(EvopolicyError):
                 self._save()
 
+    async def _wait(self, waiting: list[asyncio.Task[None]]) -> None:
+        """Until a run has ended, an agent has gone, or it is time to look again."""
+        moved = asyncio.ensure_future(self._moved.wait())
+        await asyncio.wait([*waiting, moved], timeout=_LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+        moved.cancel()
+        self._moved.clear()
+
     def _startable(self, todo: list[Decision], by_name: dict[str, Decision]) -> list[Decision]:
         """Runs that the limits let begin now."""
-        now = time.monotonic()
         limits = self._suite.parallel
-        active = [by_name[name].run for name in self._active]
-        found: list[Decision] = []
-        if self._used_up() is not None:
-            return found
-        for decision in todo:
-            run = decision.run
-            if len(active) >= limits.machine:
+        under_way = [by_name[name].run for name in self._active]
+        placed = [by_name[name].run for name in self._active if name not in self._scored]
+        if self._used_up() is not None or len(self._scored) >= _MAX_SCORED:
+            return []
+        # What is only finished has no agent, and so needs no place.
+        found = [one for one in todo if one.kind == "finish" and self._is_time(one.run)]
+        left = [one for one in todo if one.kind != "finish"]
+        while len(placed) < limits.machine:
+            fitting = (one for one in side_by_side(left, under_way) if self._fits(one.run, placed))
+            decision = next(fitting, None)
+            if decision is None:
                 break
-            same_agent = sum(other.agent == run.agent for other in active)
-            same_provider = sum(other.provider == run.provider for other in active)
-            most = run.parallel or limits.agent
-            if (
-                (most is not None and same_agent >= most)
-                or same_provider >= limits.providers.get(run.provider, limits.machine)
-                or self._not_before.get(run.name, 0.0) > now
-                or self._paused_until.get(run.provider, 0.0) > now
-            ):
-                continue
+            left.remove(decision)
             found.append(decision)
-            active.append(run)
+            placed.append(decision.run)
+            under_way.append(decision.run)
         return found
+
+    def _fits(self, run: SuiteRun, placed: list[SuiteRun]) -> bool:
+        """Whether the limits let a run begin beside those that have a place."""
+        limits = self._suite.parallel
+        same_agent = sum(other.agent == run.agent for other in placed)
+        same_provider = sum(other.provider == run.provider for other in placed)
+        most = run.parallel or limits.agent
+        return (
+            (most is None or same_agent < most)
+            and same_provider < limits.providers.get(run.provider, limits.machine)
+            and self._is_time(run)
+        )
+
+    def _is_time(self, run: SuiteRun) -> bool:
+        now = time.monotonic()
+        waits_until = max(self._not_before.get(run.name, 0.0), self._paused_until.get(run.provider, 0.0))
+        return waits_until <= now
+
+    def _agent_gone(self, name: str) -> None:
+        self._scored.add(name)
+        self._moved.set()
 
     def _stop_at_the_cap(self, by_name: dict[str, Decision]) -> None:
         """Interrupts what still uses tokens once a cap of the sweep is used up."""
@@ -254,6 +286,7 @@ class Sweep:
             self._view,
             name=run.name,
             stays_open=True,
+            on_agent_gone=partial(self._agent_gone, run.name),
         )
         self._plays[run.name] = play
         return await (play.resume() if decision.kind in ("resume", "finish") else play.play())

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import io
+import random
 from pathlib import Path
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.control import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
-from evopolicy_gateway.suite.decisions import Decision, Found, check_changes, decide, feedback_bytes, told
+from evopolicy_gateway.suite.decisions import (
+    Decision,
+    Found,
+    check_changes,
+    decide,
+    feedback_bytes,
+    side_by_side,
+    told,
+)
 from evopolicy_gateway.suite.suite_file import SuiteRun, check_agents_start, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index, used
 from evopolicy_gateway.suite.suite_view import TableView
@@ -288,3 +299,62 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     names = [line.split()[0] for line in rows]
     assert names == [second.name, failed.name, *(run.name for run in runs[4:]), third.name, first.name]
     assert rows[-2].split()[1:] == ["7", "3", "score", "2.5", "(random", "0.5)"]
+
+
+PLACES = st.tuples(st.sampled_from("abcd"), st.sampled_from(["shared", "per_run"]))
+"""A run's environment, and whether it shares its hidden cases."""
+
+
+def waiting(places: list[tuple[str, str]]) -> list[Decision]:
+    run = expand(read("smoke"), Path())[0]
+    return [
+        Decision(
+            run=msgspec.structs.replace(
+                run,
+                name=f"{number}",
+                settings=msgspec.structs.replace(run.settings, env=env, hidden_cases=cases),  # type: ignore[arg-type]
+            ),
+            kind="new",
+            attempt=1,
+        )
+        for number, (env, cases) in enumerate(places)
+    ]
+
+
+def related(one: SuiteRun, other: SuiteRun) -> bool:
+    shared = {one.settings.hidden_cases, other.settings.hidden_cases} == {"shared"}
+    return one.name == other.name or (shared and one.settings.env == other.settings.env)
+
+
+@given(st.lists(PLACES, max_size=12), st.lists(PLACES, max_size=6))
+def test_runs_related_to_fewest_under_way_come_first_and_others_keep_their_order(
+    places: list[tuple[str, str]], busy: list[tuple[str, str]]
+) -> None:
+    under_way = [
+        msgspec.structs.replace(one.run, name=f"busy {number}") for number, one in enumerate(waiting(busy))
+    ]
+    before = waiting(places)
+    after = side_by_side(before, under_way)
+    shared = [sum(related(one.run, other) for other in under_way) for one in after]
+    assert sorted(one.run.name for one in after) == sorted(one.run.name for one in before)
+    assert shared == sorted(shared)
+    for number in set(shared):
+        kept = [int(one.run.name) for one, n in zip(after, shared, strict=True) if n == number]
+        assert kept == sorted(kept)
+
+
+@given(st.integers(1, 5), st.integers(1, 5), st.integers(1, 4), st.randoms(use_true_random=False))
+def test_related_runs_meet_only_where_nothing_else_is_left(
+    agents: int, environments: int, parallel: int, luck: random.Random
+) -> None:
+    left = waiting([(f"env-{env}", "shared") for env in range(environments) for _ in range(agents)])
+    under_way: list[SuiteRun] = []
+    while left:
+        while left and len(under_way) < parallel:
+            decision = side_by_side(left, under_way)[0]
+            met = any(related(decision.run, other) for other in under_way)
+            free = any(not any(related(one.run, other) for other in under_way) for one in left)
+            assert not (met and free)
+            left.remove(decision)
+            under_way.append(decision.run)
+        under_way.remove(luck.choice(under_way))

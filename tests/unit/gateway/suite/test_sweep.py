@@ -70,6 +70,8 @@ class Stage:
         """Every set of runs that went on together."""
         self.attempts: dict[str, int] = {}
         self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
+        self.score: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.0)
+        """What a run takes once its agent is gone."""
         stage = self
 
         class Play:
@@ -84,7 +86,9 @@ class Stage:
                 *,
                 name: str,
                 stays_open: bool,
+                on_agent_gone: Callable[[], None],
             ) -> None:
+                self.on_agent_gone = on_agent_gone
                 self.plan, self.name, self.run, self.agent_at_work = plan, name, f"run of {name}", True
                 assert stays_open
 
@@ -97,6 +101,8 @@ class Stage:
                     await stage.act(self.name)
                 finally:
                     stage.going.discard(self.name)
+                self.on_agent_gone()
+                await stage.score(self.name)
                 return run_record(self.plan, finished(self.plan), None, [], Times())
 
             resume = play
@@ -178,6 +184,54 @@ def test_limits_per_machine_agent_and_provider_hold(tmp_path: Path, monkeypatch:
     assert max(sum(agent in "ab" for agent in one) for one in together) == 1
     assert max(one.count("c") for one in together) == 2
     assert max(one.count("d") for one in together) == 1
+
+
+def test_next_agent_begins_while_the_run_before_is_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = HEAD + "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = Stage(tmp_path, text, monkeypatch)
+    monkeypatch.setattr(sweep, "_LOOK_S", PATIENCE_S)
+
+    async def score(name: str) -> None:
+        # No run's score comes before the last agent has begun.
+        await until(lambda: len(stage.begun) == 3)
+
+    stage.score = score
+    index = stage.play()
+    assert {entry.state for entry in index.runs.values()} == {"completed"}
+    assert max(map(len, stage.most)) == 1
+
+
+def test_runs_that_are_followed_without_an_agent_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = HEAD + "[defaults]\nrepeats = 4\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = Stage(tmp_path, text, monkeypatch)
+    monkeypatch.setattr(sweep, "_MAX_SCORED", 2)
+    scored: set[str] = set()
+    most: list[int] = []
+
+    async def score(name: str) -> None:
+        scored.add(name)
+        most.append(len(scored))
+        await asyncio.sleep(0.05)
+        scored.discard(name)
+
+    stage.score = score
+    index = stage.play()
+    assert {entry.state for entry in index.runs.values()} == {"completed"}
+    assert max(most) == 2
+
+
+def test_unrelated_environments_are_played_side_by_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = 'name = "s"\nenvironments = ["toy/line", "toy/maze"]\n[parallel]\nmachine = 2\n'
+    stage = Stage(tmp_path, text + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
+    stage.act = lambda name: until(lambda: len(stage.begun) >= 2)
+    stage.play()
+    assert stage.begun[:2] == ["a/toy/line/0", "a/toy/maze/0"]
 
 
 def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_back(
