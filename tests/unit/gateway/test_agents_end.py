@@ -1,0 +1,139 @@
+"""An agent is gone when nothing of it lives, and not before: a real keeper with processes that cannot be killed."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from frozen import freezer
+
+from evopolicy_gateway import control
+from evopolicy_gateway.control import (
+    AgentEnded,
+    AgentSurvives,
+    AnyEvent,
+    HeldTime,
+    Order,
+    StartAgent,
+    StopAgent,
+)
+
+PATIENCE_S = 60.0
+AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
+
+
+class Keeper:
+    """A keeper process with an agent that writes its process id into `folder`."""
+
+    def __init__(self, root: Path, wall_limit_s: float = 1000.0) -> None:
+        self.folder = root / "pids"
+        self.folder.mkdir(exist_ok=True)
+        self.lock = root / "keeper.lock"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "evopolicy_gateway.harnesses.keeper"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        program = root / "agent.py"
+        program.write_text(AGENT.format(folder=str(self.folder)))
+        self.tell(
+            StartAgent(
+                agent=f"command:{sys.executable} {program}",
+                workspace=str(root),
+                agent_log=str(root / "agent.jsonl"),
+                urls={},
+                started_in=str(root),
+                wall_limit_s=wall_limit_s,
+                lock=str(self.lock),
+            )
+        )
+
+    def tell(self, order: Order) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(control.line(order))
+        self.process.stdin.flush()
+
+    def agent(self) -> int:
+        """Its process id, once it runs."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not (found := os.listdir(self.folder)):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        return int(found[0])
+
+    def until(self, kind: type[AnyEvent]) -> AnyEvent:
+        """The next event of a kind."""
+        assert self.process.stdout is not None
+        for data in self.process.stdout:
+            event = control.event_of(data)
+            if isinstance(event, kind):
+                return event
+        raise AssertionError(f"the keeper ended without {kind.__name__}")
+
+    def holds_its_lock(self) -> bool:
+        with self.lock.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
+
+@pytest.fixture
+def keeper(tmp_path: Path) -> Iterator[Keeper]:
+    found = Keeper(tmp_path)
+    yield found
+    found.process.kill()
+    found.process.communicate()
+
+
+def test_agent_that_survives_is_told_and_has_not_ended_before_it_is_gone(keeper: Keeper) -> None:
+    with freezer() as held:
+        agent = keeper.agent()
+        held.freeze(agent)
+        keeper.tell(StopAgent())
+        told = keeper.until(AgentSurvives)
+        assert isinstance(told, AgentSurvives)
+        assert agent in told.pids
+        assert keeper.holds_its_lock()
+        held.thaw()
+        ended = keeper.until(AgentEnded)
+        assert isinstance(ended, AgentEnded)
+        assert ended.reason == "told"
+    assert keeper.process.wait(PATIENCE_S) == 0
+    assert not keeper.holds_its_lock()
+
+
+def test_keeper_waits_for_one_before_it_that_still_has_an_agent(keeper: Keeper, tmp_path: Path) -> None:
+    first = keeper.agent()
+    second = Keeper(tmp_path)
+    try:
+        time.sleep(0.5)
+        assert os.listdir(keeper.folder) == [str(first)]
+        keeper.tell(StopAgent())
+        keeper.until(AgentEnded)
+        os.unlink(keeper.folder / str(first))
+        assert second.agent() != first
+    finally:
+        second.tell(StopAgent())
+        second.until(AgentEnded)
+        second.process.communicate()
+
+
+def test_time_that_submits_were_held_is_given_back(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path, wall_limit_s=3.0)
+    started = time.monotonic()
+    keeper.agent()
+    keeper.tell(HeldTime(seconds=4.0))
+    ended = keeper.until(AgentEnded)
+    assert isinstance(ended, AgentEnded)
+    assert ended.reason == "wall_limit"
+    assert time.monotonic() - started >= 7.0
+    keeper.process.communicate()
