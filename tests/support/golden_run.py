@@ -69,7 +69,8 @@ class Case(msgspec.Struct, frozen=True):
 class GoldenCluster:
     """A tapped coordinator, and a worker behind a wiretap."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *options: str, slots: int = 2) -> None:
+        """`options`: more of the coordinator's."""
         self.root = root
         self.tap = root / "tap"
         self.leak = root / "leak"
@@ -81,6 +82,7 @@ class GoldenCluster:
         self._start(
             *(str(TAPPED), str(self.tap), str(self.leak), "--state", str(root / "st")),
             *("--data", str(root / "data"), "--listen", "tcp/127.0.0.1:0", "--ready-file", str(ready)),
+            *options,
         )
         self.wait_for(ready.exists)
         told = json.loads(ready.read_text())
@@ -91,7 +93,7 @@ class GoldenCluster:
         self.worker_tap = Wiretap(*self.address)
         through = self.through(self.worker_tap, "worker", root / "worker.json")
         self._start(
-            *("-m", "evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
+            *("-m", "evopolicy_worker.cli", "--env", "toy", "--slots", str(slots), "--grace", "0"),
             *("--credentials", str(through)),
         )
 

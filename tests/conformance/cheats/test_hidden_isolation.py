@@ -1,0 +1,233 @@
+"""A jailed agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none is
+played there before it is gone. With the rule switched off the same agent hears which cases are played.
+
+The channel is one of many (memory shared by processes, which the kernel counts for the whole machine); the records of who was
+where hold for all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+import urllib.request
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden_run import GoldenCluster
+from signalling_policy import LEVELS
+from waiting import PATIENCE_S
+from whereabouts import heard_by, met, moments
+
+from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_gateway.layout import RunFolder
+
+pytestmark = pytest.mark.slow
+
+HERE = Path(__file__).parent
+POLICY = HERE / "signalling_policy.py"
+N_HIDDEN = 2
+"""Of each hidden split."""
+QUIET_S = 6.0
+"""How long a listener is given after a submit: much longer than what would be played takes."""
+
+
+class Listening:
+    """`evopolicy run` with an agent that listens."""
+
+    def __init__(self, cluster: GoldenCluster, name: str, agent: str, *options: str) -> None:
+        self.cluster = cluster
+        self.root = cluster.root / "runs" / "e" / "toy_line" / name
+        self.folder = RunFolder(self.root)
+        self.said = cluster.root / f"{name}-said"
+        words = ["run", "--env", "toy/line", "--agent", agent, "--entry", "e", "--exp-id", name, *options]
+        words += ["--credentials", cluster.files["operator"], "--runs", str(cluster.root / "runs")]
+        with self.said.open("wb") as said:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "evopolicy_gateway.cli", *words, "--budget", "8"],
+                env=cluster.environment,
+                cwd=cluster.root,
+                stdout=said,
+                stderr=said,
+            )
+
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + 2 * PATIENCE_S
+        while not condition():
+            assert self.process.poll() is None, self.said.read_text()
+            assert time.monotonic() < deadline, self.said.read_text()
+            time.sleep(0.05)
+
+    @property
+    def run(self) -> str:
+        """The coordinator's id of the run, while it is open."""
+        return str(json.loads(self.folder.opened.read_bytes())["run"])
+
+    def listens(self) -> None:
+        """Waits until its agent listens."""
+        self.wait_for(lambda: heard_by(self.root).get("looks", 0))
+
+    def heard(self) -> list[float]:
+        return heard_by(self.root)["heard"]
+
+    def stop(self) -> RunRecord:
+        """Its agent ends; the run's record."""
+        (self.folder.workspace / "stop").touch()
+        return self.record()
+
+    def record(self) -> RunRecord:
+        assert self.process.wait(timeout=2 * PATIENCE_S) == 0, self.said.read_text()
+        return decode_run_record(self.folder.run_json.read_bytes())
+
+
+@contextlib.contextmanager
+def listening(cluster: GoldenCluster, name: str, n_submits: int, *options: str) -> Iterator[Listening]:
+    agent = f"command:{sys.executable} {HERE / 'hearing_agent.py'} {POLICY} {n_submits}"
+    found = Listening(cluster, name, agent, *options)
+    try:
+        yield found
+    finally:
+        if found.process.poll() is None:
+            found.process.terminate()
+        found.process.wait(timeout=PATIENCE_S)
+
+
+@contextlib.contextmanager
+def cluster_of(root: Path, *options: str) -> Iterator[GoldenCluster]:
+    # One slot, so that one pulse is one episode.
+    cluster = GoldenCluster(root, *options, slots=1)
+    try:
+        yield cluster
+    finally:
+        cluster.close()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GoldenCluster]:
+    """With the rule switched off."""
+    with cluster_of(tmp_path_factory.mktemp("shared"), "--hidden-isolation", "off") as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GoldenCluster]:
+    with cluster_of(tmp_path_factory.mktemp("isolated")) as cluster:
+        yield cluster
+
+
+def pulses(cluster: GoldenCluster, split: str) -> list[int]:
+    """What the policy's pulses are high, in MiB, on the cases of a split, as an agent could learn them."""
+    starts = [float(np.random.default_rng(case.seed).uniform(-1.0, 1.0)) for case in cluster.cases[split]]
+    return [32 + 16 * min(LEVELS - 1, int((start + 1.0) / 2.0 * LEVELS)) for start in starts]
+
+
+def recognised(heard: list[float], wanted: list[int]) -> int:
+    """How many of the wanted pulses are among what was heard, in order, within a quarter of a level."""
+    found = 0
+    for height in heard:
+        found += found < len(wanted) and abs(height - wanted[found]) < 4.0
+    return found
+
+
+def test_without_the_rule_an_agent_hears_its_own_hidden_cases(shared: GoldenCluster) -> None:
+    with listening(shared, "own", 1) as run:
+        run.listens()
+        run.wait_for(lambda: recognised(run.heard(), pulses(shared, "valid")) == N_HIDDEN)
+        together = met(shared, moments(shared))
+        assert together
+        record = run.stop()
+    assert record.hidden_isolation == "shared"
+
+
+def test_agent_that_listens_hears_no_hidden_case_and_none_is_played_beside_it(
+    isolated: GoldenCluster,
+) -> None:
+    with listening(isolated, "own", 1) as run:
+        run.listens()
+        time.sleep(QUIET_S)
+        assert heard_by(run.root)["looks"] > 100
+        before = moments(isolated)
+        assert "hidden" not in {moment.what for moment in before}
+        assert recognised(run.heard(), pulses(isolated, "valid")) == 0
+        record = run.stop()
+    assert record.hidden_isolation == "exclusive"
+    assert len(record.outcome.heldout_returns) == N_HIDDEN
+    after = moments(isolated)
+    assert sum(moment.what == "hidden" for moment in after) >= 2 * N_HIDDEN
+    assert met(isolated, after) == []
+
+
+def test_without_the_rule_a_sibling_hears_what_another_run_is_scored_on(shared: GoldenCluster) -> None:
+    with listening(shared, "sibling", 0) as sibling:
+        sibling.listens()
+        with listening(shared, "scored", 1) as scored:
+            scored.listens()
+            scored.stop()
+        sibling.wait_for(lambda: recognised(sibling.heard(), pulses(shared, "heldout")) == N_HIDDEN)
+        sibling.process.terminate()
+
+
+def test_sibling_hears_nothing_of_a_run_that_is_scored_only_when_it_is_gone(isolated: GoldenCluster) -> None:
+    with listening(isolated, "sibling", 1) as sibling:
+        sibling.listens()
+        with listening(isolated, "scored", 1) as scored:
+            scored.listens()
+            # The agent of the run that is to be scored is gone, and its sibling goes on listening.
+            (scored.folder.workspace / "stop").touch()
+            scored.wait_for(lambda: ("close", run_of(scored)) in [(m.what, m.who) for m in moments(isolated)])
+            n_before = len(sibling.heard())
+            time.sleep(QUIET_S)
+            assert recognised(sibling.heard()[n_before:], pulses(isolated, "heldout")) == 0
+            assert scored.process.poll() is None
+            assert "waiting for" in scored.said.read_text()
+            sibling.stop()
+            scored.record()
+    assert met(isolated, moments(isolated)) == []
+
+
+def run_of(run: Listening) -> str:
+    return run.said.read_text().partition("run ")[2].split()[0]
+
+
+def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_elsewhere(
+    isolated: GoldenCluster,
+) -> None:
+    """The policy that plays a hidden case would tell one that plays a train case, whose feedback goes anywhere."""
+    kernel = str(uuid.uuid4())
+    words = ("--http", "127.0.0.1:0", "--agent-host", kernel)
+    far = Listening(isolated, "far", "remote", *words)
+    try:
+        far.wait_for(lambda: far.folder.bearer.exists() and "served at" in far.said.read_text())
+        elsewhere = run_of(far)
+        (far.folder.system / "policy.py").write_bytes(POLICY.read_bytes())
+        with listening(isolated, "near", 1) as near:
+            near.listens()
+            (near.folder.workspace / "stop").touch()
+            near.wait_for(lambda: ("close", run_of(near)) in [(m.what, m.who) for m in moments(isolated)])
+            # From now on its hidden episodes want the one slot, as do these train episodes.
+            for _ in range(4):
+                assert submitted(far, [0, 1]) == "ok"
+            near.record()
+        (far.folder.finish).touch()
+        far.record()
+    finally:
+        if far.process.poll() is None:
+            far.process.terminate()
+        far.process.wait(timeout=PATIENCE_S)
+    assert met(isolated, moments(isolated), [elsewhere]) == []
+
+
+def submitted(run: Listening, episodes: list[int]) -> str:
+    url = next(line.split()[-1] for line in run.said.read_text().splitlines() if "served at" in line)
+    request = urllib.request.Request(
+        url,
+        data=json.dumps({"env_instances": episodes}).encode(),
+        headers={"Authorization": f"Bearer {run.folder.bearer.read_text().strip()}"},
+    )
+    with urllib.request.urlopen(request, timeout=2 * PATIENCE_S) as answer:
+        return str(json.load(answer)["status"])
