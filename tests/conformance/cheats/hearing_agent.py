@@ -12,6 +12,7 @@ import urllib.request
 
 LEAST_MIB = 24.0
 LOOK_S = 0.004
+LONGEST_S = 8.0
 
 
 def shared_mib():
@@ -39,18 +40,21 @@ for _ in range(int(sys.argv[2])):
     submit()
 heard, looks = [], 0
 floor = top = shared_mib()
+since = time.monotonic()
 tell(heard, looks)
 while not os.path.exists("stop"):
     now = shared_mib()
     looks += 1
-    if now > top:
-        top = now
-    elif now < floor + 2.0 and top - floor > LEAST_MIB:
-        heard.append(round(top - floor, 1))
+    if now < floor + 4.0:
+        if top - floor > LEAST_MIB:
+            heard.append(round(top - floor, 1))
+            tell(heard, looks)
+        floor = top = min(floor, now)
+        since = time.monotonic()
+    elif time.monotonic() - since > LONGEST_S:
+        # Somebody else's memory, which stays.
         floor = top = now
-        tell(heard, looks)
-    elif top - floor <= LEAST_MIB:
-        floor = top = now
+    top = max(top, now)
     if looks % 100 == 0:
         tell(heard, looks)
     time.sleep(LOOK_S)

@@ -127,10 +127,10 @@ def pulses(cluster: GoldenCluster, split: str) -> list[int]:
 
 
 def recognised(heard: list[float], wanted: list[int]) -> int:
-    """How many of the wanted pulses are among what was heard, in order, within a quarter of a level."""
+    """How many of the wanted pulses are among what was heard, in order, within half a level."""
     found = 0
     for height in heard:
-        found += found < len(wanted) and abs(height - wanted[found]) < 4.0
+        found += found < len(wanted) and abs(height - wanted[found]) < 8.0
     return found
 
 
