@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import os
@@ -14,6 +15,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.summary import utc_text
 
 _MAX_TOLD_BYTES = 200
+_PAUSE_S = 0.2
 
 
 @contextlib.contextmanager
@@ -45,6 +47,15 @@ def check_free(lock: Path, what: Path) -> None:
         _lock(fd, what)
     finally:
         os.close(fd)
+
+
+async def until_free(lock: Path, what: Path) -> None:
+    """Returns once nobody holds the lock."""
+    while True:
+        try:
+            return check_free(lock, what)
+        except ConfigError:
+            await asyncio.sleep(_PAUSE_S)
 
 
 def _taken(lock: Path, what: Path) -> int:

@@ -142,7 +142,7 @@ def said_of_place(agent_host: str, root: Path) -> str:
 
 def finish(folder: RunFolder) -> None:
     """Says that the agent of an open run has ended. ConfigError where there is none that only the operator can see."""
-    if not folder.door.exists() and not folder.alone.exists():
+    if not folder.door.exists() and not folder.unwatched.exists():
         raise ConfigError(f"{folder.root} is no open run of a remote agent, nor of one that nobody watches")
     folder.finish.touch(mode=0o600)
 

@@ -129,7 +129,7 @@ class Gateway:
     async def _permitted(self, session: Session) -> bool:
         """Whether the agent may be alive; False when told to end first."""
         if self._alone:
-            self._folder.alone.touch(mode=0o600)
+            self._folder.unwatched.touch(mode=0o600)
         place = self._place or agent_place(self._folder)
         asked = time.monotonic()
         granted = await self._unless_told(session.permit(place, self._on_wait))

@@ -90,9 +90,9 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "finish"
 
     @property
-    def alone(self) -> Path:
+    def unwatched(self) -> Path:
         """Made by a gateway that was started by hand: nobody watches the agent, so only the operator knows its end."""
-        return self.state / "alone"
+        return self.state / "unwatched"
 
     @property
     def journal(self) -> Path:

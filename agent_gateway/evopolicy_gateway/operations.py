@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import structlog
+import msgspec
 
 from evopolicy_common import credentials
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.bundles import Bundle
 from evopolicy_common.credentials import Credentials
-from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
+from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
@@ -36,6 +38,8 @@ from evopolicy_common.messages.operator import (
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.requests import operator_requests
 from evopolicy_common.transport import Link
+from evopolicy_gateway.alone import until_free
+from evopolicy_gateway.layout import OpenedRun, RunFolder
 
 WAIT_S = 3.0
 """Of a long poll: so often a command hears what it waits for."""
@@ -114,9 +118,24 @@ class Operations:
         await self._requests.until_answered("cancel", message, Done, patience_s=_PATIENCE_S)
 
     async def agent_gone(self, run: str) -> None:
-        """Ends the permit of an open run's agent, which is no longer alive. TransportError when nobody answers soon."""
+        """Ends the permit of a run's agent, which is no longer alive. TransportError when nobody answers soon."""
         message = AgentGone(token=self._token, run=run)
         await self._requests.until_answered("agent_gone", message, Done, patience_s=_PATIENCE_S)
+
+    async def drop(self, folder: RunFolder) -> None:
+        """Ends the run that a folder holds open, so that it is played no more and its agent's permit ends with it.
+
+        The agent of a command that was killed may still be ending: that is waited for. Does nothing where there is none, or
+        the cluster does not know it.
+        """
+        if not folder.opened.exists():
+            return
+        run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+        await until_free(folder.keeper_lock, folder.root)
+        with contextlib.suppress(EvopolicyError):
+            await self.cancel(run)
+            if not folder.door.exists():
+                await self.agent_gone(run)
 
     async def upload(self, bundle: Bundle) -> None:
         """Brings a bundle to the coordinator."""

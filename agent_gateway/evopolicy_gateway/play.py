@@ -92,9 +92,9 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         """ConfigError when the agent cannot start, or its jail or the run's folder cannot be had, such as one that may not
         be overwritten."""
         check_free(self.folder.lock, self.folder.root)
-        self._check()
+        self.check_held()
 
-    def _check(self) -> None:
+    def check_held(self) -> None:
         """`check` for who may hold the folder's lock."""
         check_agent(self.agent, self.door)
         harnesses.make(self.agent, self.started_in, self.config).check()
@@ -126,7 +126,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     def claim(self) -> None:
         """Makes the run's folder, empty, for who holds its lock. ConfigError as `check`."""
-        self._check()
+        self.check_held()
         if self.folder.root.exists():
             remove_tree(self.folder.root)
         self.folder.root.mkdir(parents=True)
@@ -203,6 +203,8 @@ class RunPlay:
 
     async def _play(self) -> RunRecord:
         plan = self._plan
+        plan.check_held()
+        await self._operations.drop(self._folder)
         plan.claim()
         self._folder.state.mkdir(mode=0o700)
         key = uuid.uuid4().hex
@@ -255,13 +257,17 @@ class RunPlay:
         try:
             if agents_side:
                 await self._agents_side()
+            if self._cancelled:
+                await self._tell_gone(run)
             self._on_agent_gone()
             finished = await self._finish(run)
         except BaseException as error:
             if self._survivors:
                 self._tell_survivors()
+                how = f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {run}"
+                self._watch.note(self._name, how)
             elif self._stays_open and isinstance(error, asyncio.CancelledError):
-                await self._leave_open(run)
+                await self._tell_gone(run)
             else:
                 await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
@@ -482,8 +488,7 @@ class RunPlay:
         self._watch.note(
             self._name,
             f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case that it shares is"
-            f" played on this machine before they are gone; go on with it with --resume then, or, once it is certain that they"
-            f" are gone: evopolicy runs agent-gone {self.run}",
+            " played on this machine, before they are gone",
         )
 
     async def _finish(self, run: str) -> RunFinished:
@@ -493,8 +498,10 @@ class RunPlay:
                 return progress.finished
         raise AssertionError("waiting ends with the finished run")
 
-    async def _leave_open(self, run: str) -> None:
-        """Tells the coordinator that the agent of a run that stays open is gone; it needs another permit to go on."""
+    async def _tell_gone(self, run: str) -> None:
+        """Tells the coordinator that the agent of a run that was not closed is gone; it needs another permit to go on."""
+        if self._plan.door is not None:
+            return  # nobody here knows
         with contextlib.suppress(EvopolicyError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_PATIENCE_S):
                 await self._operations.agent_gone(run)
@@ -504,6 +511,7 @@ class RunPlay:
         with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_PATIENCE_S):
                 await self._operations.cancel(run)
+                await self._tell_gone(run)
                 finished = await self._finish(run)
                 times = self._stopwatch.times
                 await record.write(self._folder, self._plan, finished, self._operations, times, why)

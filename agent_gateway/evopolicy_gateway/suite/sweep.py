@@ -337,9 +337,7 @@ class Sweep:
         """Keeps what there is of an earlier attempt, and ends its run at the cluster."""
         if not folder.root.exists():
             return
-        if folder.opened.exists():
-            opened = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun)
-            await self._forget(opened.run)
+        await self._operations.drop(folder)
         kept = self._root / ATTEMPTS / folder.root.relative_to(self._root)
         target = kept.with_name(f"{kept.name}.{max(attempt, 1)}")
         while target.exists():

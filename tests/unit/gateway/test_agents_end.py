@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
 import os
 import subprocess
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 from frozen import freezer
 
-from evopolicy_gateway import control
+from evopolicy_gateway import alone, control
 from evopolicy_gateway.control import (
     AgentEnded,
     AgentSurvives,
@@ -23,6 +24,9 @@ from evopolicy_gateway.control import (
     StartAgent,
     StopAgent,
 )
+from evopolicy_gateway.door import Door
+from evopolicy_gateway.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.operations import Operations
 
 PATIENCE_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
@@ -137,3 +141,43 @@ def test_time_that_submits_were_held_is_given_back(tmp_path: Path) -> None:
     assert ended.reason == "wall_limit"
     assert time.monotonic() - started >= 7.0
     keeper.process.communicate()
+
+
+class Cluster(Operations):
+    """What it is asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def cancel(self, run: str) -> None:
+        self.asked.append(f"cancel {run}")
+
+    async def agent_gone(self, run: str) -> None:
+        self.asked.append(f"gone {run}")
+
+
+def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(alone, "_PAUSE_S", 0.01)
+    folder = RunFolder(tmp_path / "run")
+    folder.state.mkdir(parents=True)
+    cluster = Cluster()
+
+    async def main() -> None:
+        await cluster.drop(folder)
+        assert cluster.asked == []
+        save(folder.opened, OpenedRun(run="r-1"))
+        with folder.keeper_lock.open("w") as held:
+            fcntl.flock(held, fcntl.LOCK_EX)
+            dropping = asyncio.create_task(cluster.drop(folder))
+            await asyncio.sleep(0.1)
+            assert cluster.asked == []
+        await asyncio.wait_for(dropping, PATIENCE_S)
+        assert cluster.asked == ["cancel r-1", "gone r-1"]
+        # Of a remote agent nobody here knows whether it has ended.
+        save(folder.door, Door(host="127.0.0.1", port=0))
+        await cluster.drop(folder)
+        assert cluster.asked[2:] == ["cancel r-1"]
+
+    asyncio.run(main())

@@ -14,6 +14,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.messages.operator import ClaimState, RunFinished
 from evopolicy_common.run_record import RunRecord
 from evopolicy_gateway.control import AgentDoing
+from evopolicy_gateway.layout import RunFolder
 from evopolicy_gateway.play import Plan
 from evopolicy_gateway.record import run_record
 from evopolicy_gateway.suite import suite_index, sweep
@@ -48,6 +49,9 @@ class Cluster:
 
     async def cancel(self, run: str) -> None:
         self.cancelled.append(run)
+
+    async def drop(self, folder: RunFolder) -> None:
+        pass
 
 
 class Stage:
