@@ -291,7 +291,7 @@ class RunPlay:
             going: list[asyncio.Future[Any]] = [serving, keeping, spent]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
             spent.cancel()
-            if not serving.done() and not keeping.done() and not self._cancelled:
+            if not serving.done() and not keeping.done():
                 await asyncio.wait(
                     [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
                 )

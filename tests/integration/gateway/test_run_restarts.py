@@ -8,11 +8,15 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
 from commands import agent, command, record_in, run_arguments, run_dir, run_on
 from waiting import PATIENCE_S, wait_until
+
+from evopolicy_gateway import door
+from evopolicy_gateway.layout import RunFolder
 
 
 def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:
@@ -157,6 +161,10 @@ def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: P
         body = json.dumps({"env_instances": "0-3"}).encode()
         with urllib.request.urlopen(urllib.request.Request(known[0], data=body)) as answer:
             assert json.load(answer)["submit_id"] == 1
+        # Nobody watches this agent: its run is closed by its operator's word.
+        time.sleep(2.0)
+        assert by_hand.poll() is None
+        door.finish(RunFolder(folder))
         assert by_hand.wait(timeout=PATIENCE_S) == 0
     finally:
         by_hand.kill()
