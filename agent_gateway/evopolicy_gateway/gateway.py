@@ -94,14 +94,14 @@ class Gateway:
         journal = Journal(self._folder.journal)
         try:
             async with contextlib.AsyncExitStack() as stack:
-                link = await self._unless_told(
+                link = await self._unless_stopped(
                     stack.enter_async_context(transport.connect(found, timeout_s=None))
                 )
                 if link is None:
                     return False
                 session = Session(link, run)
                 try:
-                    opened = await self._unless_told(session.open())
+                    opened = await self._unless_stopped(session.open())
                     if opened is None or not await self._permitted(session):
                         return False
                 except RefusedError as error:
@@ -127,15 +127,22 @@ class Gateway:
             journal.close()
 
     async def _permitted(self, session: Session) -> bool:
-        """Whether the agent may be alive; False when told to end first."""
+        """Whether the agent may be alive, or need not be any more; False when told to leave the run open first."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
-        place = self._place or agent_place(self._folder)
         asked = time.monotonic()
-        granted = await self._unless_told(session.permit(place, self._on_wait))
+        permit = asyncio.ensure_future(
+            session.permit(self._place or agent_place(self._folder), self._on_wait)
+        )
+        waited: list[asyncio.Future[Any]] = [permit, self._told]
+        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
         self.permit_s = time.monotonic() - asked
         self._on_wait("")
-        return granted is not None
+        if permit.done():
+            return permit.result()
+        permit.cancel()
+        await asyncio.gather(permit, return_exceptions=True)
+        return not self._stopped.is_set()
 
     async def _watch(self, desk: Desk, http: asyncio.Task[None]) -> Close | None:
         """Passes changes on until told to end."""
@@ -179,10 +186,11 @@ class Gateway:
         self._on_wait("")
         return not self._stopped.is_set()
 
-    async def _unless_told(self, wanted: Any) -> Any:
-        """The result, or None when told to end first."""
-        task = asyncio.ensure_future(wanted)
-        await asyncio.wait([task, self._told], return_when=asyncio.FIRST_COMPLETED)
+    async def _unless_stopped(self, wanted: Any) -> Any:
+        """The result, or None when told to leave the run open first."""
+        task, stopped = asyncio.ensure_future(wanted), asyncio.ensure_future(self._stopped.wait())
+        await asyncio.wait([task, stopped], return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
         if task.done():
             return task.result()
         task.cancel()

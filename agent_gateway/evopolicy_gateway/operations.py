@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-import structlog
 import msgspec
+import structlog
 
 from evopolicy_common import credentials
 from evopolicy_common.blobs import digest_of

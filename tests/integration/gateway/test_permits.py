@@ -102,7 +102,20 @@ def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
         async with answering(tmp_path, double) as found:
             gateway, said = quiet(prepare(tmp_path / "run", found))
             assert await gateway.run()
-        assert said == []
+        assert said == [""]
+
+    asyncio.run(main())
+
+
+def test_gateway_of_an_agent_that_has_ended_closes_the_run_without_a_permit(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        double.permits = [WAITING]
+        async with answering(tmp_path, double) as found:
+            gateway, _ = quiet(prepare(tmp_path / "run", found))
+            gateway.tell(Close(reason="agent_stopped"))
+            assert await gateway.run()
+        assert double.closed is not None
 
     asyncio.run(main())
 
@@ -115,7 +128,7 @@ def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: P
             gateway, said = quiet(prepare(tmp_path / "run", found))
             with pytest.raises(ConfigError, match=r"older version.*update it"):
                 await gateway.run()
-        assert said == []
+        assert said == [""]
 
     asyncio.run(main())
 
