@@ -19,11 +19,12 @@ from urllib.parse import urlsplit
 
 import pytest
 from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, opened, prepare
+from waiting import wait_until
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.run_record import decode_run_record
 from evopolicy_gateway.cli import app as evopolicy
-from evopolicy_gateway.door import Door, door_of
+from evopolicy_gateway.door import Door, door_of, finish
 from evopolicy_gateway.layout import RunFolder, save
 
 HOST = "127.0.0.2"
@@ -200,6 +201,11 @@ def test_a_door_is_what_the_operator_named() -> None:
         (["--agent", "evolve", "--http", "10.0.0.5:8080", "--jail", "none"], "goes with --agent remote"),
         (["--agent", "remote", "--http", "127.0.0.1:0", "--jail", "open-network"], "not started here"),
         (["--agent", "remote", "--http-url", "https://gym.example"], "needs"),
+        (["--agent", "evolve", "--agent-host", "elsewhere"], "goes with --agent remote"),
+        (["--agent", "remote", "--http", "127.0.0.1:0", "--agent-host", "my-laptop"], "boot_id"),
+        (["--agent", "evolve", "--hidden-isolation", "off"], "evopolicy-coordinator --hidden-isolation"),
+        (["--agent", "evolve", "--local", "--hidden-isolation", "none"], "related, strict, off"),
+        (["--agent", "evolve", "--hidden-cases", "mine"], "shared, per-run"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], told: str) -> None:
@@ -288,19 +294,37 @@ def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(tmp
     assert not run.folder.state.exists()
 
 
-def test_a_remote_run_ends_by_itself_when_its_budget_is_spent(tmp_path: Path) -> None:
+def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_ended(tmp_path: Path) -> None:
     run = RemoteRun(tmp_path)
+    try:
+        run.wait_until_served()
+        assert "it may be any: no hidden case" in run.said.read_text()
+        assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
+        wait_until(lambda: "waiting for the agent's end" in run.said.read_text())
+        assert run.submit([0], token_of(run.folder))[0] == 409
+        assert run.process.poll() is None
+        finish(run.folder)
+    finally:
+        code = run.end()
+    assert code == 0, run.said.read_text()
+    record = decode_run_record(run.folder.run_json.read_bytes())
+    assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "exclusive")
+
+
+def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(tmp_path: Path) -> None:
+    run = RemoteRun(tmp_path, "--agent-host", "elsewhere")
     try:
         run.wait_until_served()
         assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
     finally:
         code = run.end()
     assert code == 0, run.said.read_text()
-    assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "budget_spent"
+    record = decode_run_record(run.folder.run_json.read_bytes())
+    assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "waived")
 
 
 def test_a_remote_run_ends_when_its_agents_time_is_over(tmp_path: Path) -> None:
-    run = RemoteRun(tmp_path, "--agent-wall-s", "1")
+    run = RemoteRun(tmp_path, "--agent-wall-s", "1", "--agent-host", "elsewhere")
     assert run.end() == 3, run.said.read_text()
     assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "wall_limit"
 
