@@ -32,6 +32,9 @@ MESSAGES = [
     for kind in get_args(union)
 ]
 
+REQUESTS = get_args(WorkerRequest | GatewayRequest | OperatorRequest)
+"""Their plain values are looked into."""
+
 Path = tuple[str | int, ...]
 
 
@@ -143,7 +146,7 @@ def test_no_part_of_a_message_may_be_beyond_its_bound(kind: type[Message], decod
     message = codec.decode(decoder, msgspec.msgpack.encode(whole))
     assert codec.decode(decoder, codec.encode(message)) == message
     for path, part in parts(found):
-        if not path:
+        if not path or (plain(part) and kind not in REQUESTS):
             continue
         for value in beyond(part):
             try:
