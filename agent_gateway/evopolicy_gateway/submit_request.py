@@ -94,7 +94,7 @@ def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
             )
         first = int(match[1])
         last = int(match[2]) if match[2] is not None else first
-        shown = part.strip()
+        shown = part.strip()[:40]
         _check_id(first, f"{shown!r} in {_FIELD}", bounds)
         _check_id(last, f"{shown!r} in {_FIELD}", bounds)
         if last < first:

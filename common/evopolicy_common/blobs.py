@@ -18,6 +18,9 @@ from pathlib import Path
 
 from evopolicy_common.errors import StorageError
 
+MAX_UNFINISHED = 16
+"""Uploads that one sender may have begun and not finished; beyond that its oldest is given up."""
+
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -163,6 +166,8 @@ class BlobStore:
             if offset == 0 and have:
                 part.unlink()
                 have = 0
+            if offset == 0 and len(data) < size:
+                self._make_room(part)
             if offset != have or offset + len(data) > size:
                 return have
             with part.open("ab") as file:
@@ -199,6 +204,14 @@ class BlobStore:
         for folder in self._root.iterdir():
             if len(folder.name) == 2:
                 yield from (path.name for path in folder.iterdir() if is_digest(path.name))
+
+    def _make_room(self, part: Path) -> None:
+        """Gives up the oldest unfinished uploads of a sender that has begun too many."""
+        begun = [each for each in self._parts.glob(f"{part.name.partition('-')[0]}-*") if each != part]
+        for old in sorted(begun, key=lambda each: each.stat().st_mtime)[
+            : max(0, len(begun) + 1 - MAX_UNFINISHED)
+        ]:
+            old.unlink(missing_ok=True)
 
     def _finish(self, part: Path, digest: str) -> None:
         if digest_of(part.read_bytes()) != digest:

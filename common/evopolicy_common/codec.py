@@ -32,6 +32,9 @@ INLINE_BYTES = 24 * 1024
 MAX_MESSAGE_BYTES = (16 << 20) - (64 << 10)
 """No longer message is made or read. Zenoh's own limit, beyond which it drops a message without a word, is 16 MiB."""
 
+MAX_BLOB_BYTES = 1 << 30
+"""Of one blob."""
+
 MAX_PACKED_BYTES = 256 << 20
 """Of a job's outcomes packed as one blob."""
 

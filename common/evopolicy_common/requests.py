@@ -86,7 +86,12 @@ class Requester(Generic[Reply]):
             pause = min(LONGEST_PAUSE_S, pause * 2)
 
     async def upload(self, sender: str, token: str, digest: str, data: bytes) -> None:
-        """Brings a blob to the coordinator in acknowledged chunks; what it already has is not sent again."""
+        """Brings a blob to the coordinator in acknowledged chunks; what it already has is not sent again.
+
+        ProtocolError when it is larger than a blob may be.
+        """
+        if len(data) > codec.MAX_BLOB_BYTES:
+            raise ProtocolError(f"a blob of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
         offset = 0
         while True:
             chunk = data[offset : offset + codec.CHUNK_BYTES]
@@ -100,12 +105,16 @@ class Requester(Generic[Reply]):
             offset = ack.have
 
     async def download(self, sender: str, token: str, digest: str) -> bytes:
-        """A blob from the coordinator, checked against its digest."""
+        """A blob from the coordinator, checked against its digest; ProtocolError when it is another, or too large."""
         data = bytearray()
         while True:
             chunk = await self.until_answered(
                 "blob", BlobGet(sender=sender, token=token, digest=digest, offset=len(data)), BlobChunk
             )
+            if chunk.size > codec.MAX_BLOB_BYTES:
+                raise ProtocolError(
+                    f"blob {digest} of {chunk.size:,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit"
+                )
             data += chunk.data
             if len(data) >= chunk.size or not chunk.data:
                 break

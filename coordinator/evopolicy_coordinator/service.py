@@ -26,7 +26,7 @@ from importlib import metadata
 import msgspec
 import structlog
 
-from evopolicy_common import bundles
+from evopolicy_common import bundles, codec
 from evopolicy_common.errors import PartFailedError, ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
@@ -56,7 +56,6 @@ from evopolicy_coordinator.writer import Outbox, Writer
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
-MAX_BLOB_BYTES = 1 << 30
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
 _FORGET_S = 120.0
@@ -302,7 +301,7 @@ class Service:
         most = MAX_BUNDLE_BYTES
         if parsed.room == "work":
             _check_session(core, parsed.asker, message.token)
-            most = MAX_BLOB_BYTES
+            most = codec.MAX_BLOB_BYTES
         elif parsed.room == "gw":
             run = core.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":

@@ -29,6 +29,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from evopolicy_common import codec
 from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import (
@@ -57,8 +58,6 @@ MAX_FAULT = 4000
 """Characters of an error that are told."""
 MAX_JOB_OUTPUT_BYTES = 64 << 20
 """Of what is kept of a job's stdout, stderr and tracebacks, each episode has an equal share: 327 may use their limits up."""
-MAX_BLOB_BYTES = 1 << 30
-"""Of one trajectory or video."""
 MAX_ENDS = 5
 """So often is one episode's policy started again here after an end from outside; then the job is played elsewhere."""
 MAX_WARM_ENVIRONMENTS = 4
@@ -511,8 +510,8 @@ def _framed(outcome: EpisodeOutcome) -> bytes:
 
 
 def _blob(data: bytes) -> BlobRef:
-    if len(data) > MAX_BLOB_BYTES:
-        raise WorkerError(f"a recording of {len(data):,} bytes; {MAX_BLOB_BYTES:,} are the limit")
+    if len(data) > codec.MAX_BLOB_BYTES:
+        raise WorkerError(f"a recording of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
     return BlobRef(digest=digest_of(data), size=len(data), inline=data)
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common.blobs import BlobStore, digest_of, is_digest, write_atomically
+from evopolicy_common.blobs import MAX_UNFINISHED, BlobStore, digest_of, is_digest, write_atomically
 from evopolicy_common.errors import StorageError
 
 
@@ -77,3 +77,15 @@ def test_an_atomic_write_replaces_the_file_and_leaves_nothing_beside(tmp_path: P
     assert path.read_bytes() == b"two"
     assert path.stat().st_mode & 0o777 == 0o600
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_sender_that_finishes_nothing_takes_a_bounded_number_of_places(tmp_path: Path) -> None:
+    store = BlobStore(tmp_path)
+    for k in range(3 * MAX_UNFINISHED):
+        assert store.append_chunk("w", digest_of(b"%d" % k), 1000, 0, b"begun") == 5
+    store.append_chunk("other", digest_of(b"mine"), 1000, 0, b"begun")
+    assert len(list((tmp_path / "parts").iterdir())) == MAX_UNFINISHED + 1
+    # The latest go on where they were.
+    last = 3 * MAX_UNFINISHED - 1
+    assert store.append_chunk("w", digest_of(b"%d" % last), 1000, 5, b"on") == 7
+    assert store.append_chunk("w", digest_of(b"0"), 1000, 5, b"on") == 0

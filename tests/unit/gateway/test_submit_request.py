@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import RequestError
@@ -133,3 +133,22 @@ def test_the_longest_text_of_ranges_is_counted_without_being_written_out() -> No
     body = json.dumps({"env_instances": ",".join(["0-63"] * 150_000)}).encode()
     assert len(body) < MAX_BODY_BYTES
     assert refusal(body).message.startswith("9600000 episodes")
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.sampled_from(['{"env_instances": "%s"}', '{"env_instances": ["%s"]}', "%s", '{"%s": 1}']),
+    st.lists(st.sampled_from([" ", "7", "-", ",", "99", "x"]), max_size=6),
+)
+def test_no_refusal_repeats_a_long_request(form: str, pieces: list[str]) -> None:
+    told = ""
+    try:
+        parse(
+            (form % "".join(piece * (300_000 if piece in " x" else 1) for piece in pieces)).encode()[
+                :MAX_BODY_BYTES
+            ],
+            BOUNDS,
+        )
+    except RequestError as error:
+        told = error.message
+    assert len(told) < 600

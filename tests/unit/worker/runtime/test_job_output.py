@@ -56,7 +56,7 @@ def test_the_largest_outcomes_of_a_job_can_be_handed_in(n: int) -> None:
 def test_a_recording_that_no_coordinator_takes_is_the_workers_failure(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(episodes, "MAX_BLOB_BYTES", 10)
+    monkeypatch.setattr(codec, "MAX_BLOB_BYTES", 10)
     assert episodes._blob(b"x" * 10).size == 10
     with pytest.raises(WorkerError, match="11 bytes; 10 are the limit"):
         episodes._blob(b"x" * 11)
