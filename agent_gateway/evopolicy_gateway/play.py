@@ -26,6 +26,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, RunSettings
 from evopolicy_common.notices import Waiting
+from evopolicy_common.preflight import check_loopback, check_text, check_writable
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import children, control, harnesses, record
@@ -96,6 +97,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     def check_held(self) -> None:
         """`check` for who may hold the folder's lock."""
+        check_text(self.started_in, "cd")
+        check_writable(self.runs, "--runs")
+        if self.door is None:
+            check_loopback()
         check_agent(self.agent, self.door)
         harnesses.make(self.agent, self.started_in, self.config).check()
         self.jail.check()

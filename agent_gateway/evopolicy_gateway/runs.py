@@ -16,6 +16,7 @@ from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.local_cluster import local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.preflight import explained
 from evopolicy_common.run_record import RunRecord
 from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.operations import Operations, find_credentials
@@ -179,10 +180,13 @@ async def _play(
             error=str(error),
             wrong_option=True,
         )
-    except EvopolicyError as error:
-        watch.note(plan.settings.env, f"failed: {error}")
+    except (EvopolicyError, OSError) as error:
+        why = explained(error) if isinstance(error, OSError) else str(error)
+        if why is None:
+            raise
+        watch.note(plan.settings.env, f"failed: {why}")
         return RunResult(
-            env=plan.settings.env, run_directory=str(plan.folder.root), status="error", error=str(error)
+            env=plan.settings.env, run_directory=str(plan.folder.root), status="error", error=why
         )
 
 

@@ -17,12 +17,12 @@ from starlette.types import ASGIApp
 
 from evopolicy_common.blobs import write_atomically
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.preflight import LOOPBACK, no_loopback
 from evopolicy_gateway.agents_md import Urls, urls_at, urls_below
 from evopolicy_gateway.door import Door
 from evopolicy_gateway.layout import RunFolder, save
 from evopolicy_gateway.patience import PatientProtocol
 
-LOOPBACK = "127.0.0.1"
 _REBIND_TRIES = 20
 _REBIND_PAUSE_S = 0.25
 KEEP_ALIVE_S = 30
@@ -58,7 +58,10 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
         return await _rebind(address), address
     token = secrets.token_hex(16)
     if not folder.door.exists():
-        sock = _bound(LOOPBACK, 0)
+        try:
+            sock = _bound(LOOPBACK, 0)
+        except OSError as error:
+            raise ConfigError(no_loopback(error)) from error
         address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
     else:
         door = msgspec.json.decode(folder.door.read_bytes(), type=Door)

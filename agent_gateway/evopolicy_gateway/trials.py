@@ -20,6 +20,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.notices import Waiting
+from evopolicy_common.preflight import check_writable
 from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
 from evopolicy_gateway.episode_files import trajectory_files
 from evopolicy_gateway.formatting import cut_text
@@ -81,6 +82,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
     bundle = _bundle(trial.policy)
+    check_writable(trial.out, "--out")
     console = terminal(stderr=as_json)
     results: list[TrialResult] = []
 

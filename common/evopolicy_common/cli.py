@@ -15,6 +15,7 @@ import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.preflight import explained
 from evopolicy_common.terminal import harmless, one_line, say
 
 Connect = Annotated[
@@ -117,6 +118,12 @@ def fail_on_our_errors() -> Iterator[None]:
         fail(str(error), USAGE_ERROR)
     except EvopolicyError as error:
         fail(str(error), FAILURE)
+    except OSError as error:
+        # A net below the checks that come first: what the machine refuses later is told, too.
+        text = explained(error)
+        if text is None:
+            raise
+        fail(text, FAILURE)
     except KeyboardInterrupt:
         fail("interrupted", 130)
 

@@ -18,6 +18,7 @@ from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.notices import told_if_slow
+from evopolicy_common.preflight import check_scratch, check_writable
 from evopolicy_common.ready import Ready, read_ready
 from evopolicy_common.scratch import scratch_folder
 
@@ -74,6 +75,8 @@ async def local_cluster(
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
+        check_scratch()  # where workers keep their sandboxes
+        check_writable(root, "--state")
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Of this process alone: the folder may be in use, and the file that is there another's.
         ready_file = root / f"{kind}-{os.getpid()}.json"

@@ -19,6 +19,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from evopolicy_common.preflight import check_scratch
+
 _OWNER = "owner"
 _MAKING_S = 60.0
 """More than it takes from the folder to its file."""
@@ -26,7 +28,11 @@ _MAKING_S = 60.0
 
 @contextlib.contextmanager
 def scratch_folder(kind: str) -> Iterator[Path]:
-    """A new private folder `evopolicy-<kind>-…` inside the `with`; clears away what killed owners have left."""
+    """A new private folder `evopolicy-<kind>-…` inside the `with`; clears away what killed owners have left.
+
+    ConfigError when the system's temporary folder is full.
+    """
+    check_scratch()
     clear_stale(kind)
     root = Path(tempfile.mkdtemp(prefix=f"evopolicy-{kind}-"))
     lock = -1

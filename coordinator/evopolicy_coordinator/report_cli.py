@@ -16,6 +16,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.preflight import check_writable
 from evopolicy_common.terminal import say, say_json, say_lines, terminal
 from evopolicy_coordinator.analysis.comparability import UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reader import load_runs
@@ -80,6 +81,7 @@ def report(
     from evopolicy_coordinator.analysis.write import write_report
 
     try:
+        check_writable(out, "--out")
         with _progress() as tell:
             study = _study(runs, allow_mixed, allow_unknown, jobs or os.cpu_count() or 1, tell)
             if not study.suites:

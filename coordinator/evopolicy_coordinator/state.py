@@ -30,6 +30,7 @@ from evopolicy_common import credentials, keys
 from evopolicy_common.blobs import write_atomically
 from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.preflight import check_writable
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
@@ -150,6 +151,8 @@ def cluster_of(root: Path, cluster: str | None) -> str:
 
 
 def _make_private(root: Path) -> None:
+    # A coordinator that comes back to a full disk waits for room.
+    check_writable(root, "--state", may_be_full=(root / "identity.json").exists())
     try:
         root.mkdir(parents=True, mode=0o700, exist_ok=True)
         mode = stat.S_IMODE(root.stat().st_mode)

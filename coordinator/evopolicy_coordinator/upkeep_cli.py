@@ -13,6 +13,7 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.cli import bytes_text, fail_on_our_errors
 from evopolicy_common.credentials import default_state_dir
+from evopolicy_common.preflight import check_writable
 from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import upkeep
 
@@ -48,7 +49,10 @@ def collect(
     Run directories are not touched, and a run's outcome stays known. Safe beside a running coordinator.
     """
     with fail_on_our_errors():
-        done = upkeep.collect(state or default_state_dir(), older_than * DAY_S, dry_run=dry_run)
+        root = state or default_state_dir()
+        if root.is_dir() and not dry_run:
+            check_writable(root, "--state", may_be_full=True)
+        done = upkeep.collect(root, older_than * DAY_S, dry_run=dry_run)
     if as_json:
         say_json(done, indent=False)
         return

@@ -21,6 +21,7 @@ from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_loggin
 from evopolicy_common.errors import ConfigError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.preflight import check_scratch
 from evopolicy_common.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_worker import environments
@@ -108,6 +109,7 @@ def work(
                 f"{', '.join(missing)}: not installed here; install the worker's extra: pip install 'evopolicy[worker]'"
             )
         found = credentials.find("worker", tuple(connect or ()), credentials_file)
+        check_scratch()
         tiers = available_tiers(unsandboxed=unsandboxed)
         if not tiers:
             raise ConfigError(

@@ -17,6 +17,7 @@ import typer
 from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local_cluster import unless_failed
+from evopolicy_common.preflight import check_loopback, check_writable
 from evopolicy_common.run_record import decode_run_record
 from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway import options
@@ -117,6 +118,8 @@ def suite(
 
 async def _suite(order: Order) -> int:
     console = terminal(stderr=order.as_json)
+    check_writable(order.root, "--runs")
+    check_loopback()
     with alone(order.root / ".lock", order.root):
         index = suite_index.load(order.root, order.suite.name)
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))

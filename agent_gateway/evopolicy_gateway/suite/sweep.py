@@ -27,6 +27,7 @@ import msgspec
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.preflight import explained
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
 from evopolicy_gateway import harnesses
@@ -256,9 +257,12 @@ class Sweep:
                 settings=entry.settings,
                 earlier=entry.earlier,
             )
-        except EvopolicyError as error:
+        except (EvopolicyError, OSError) as error:
+            why = explained(error) if isinstance(error, OSError) else str(error)
+            if why is None:
+                raise
             known = self._index.runs[run.name].tokens
-            done = msgspec.structs.replace(entry, state="error", error=str(error), tokens=known)
+            done = msgspec.structs.replace(entry, state="error", error=why, tokens=known)
         finally:
             self._plays.pop(run.name, None)
         self._put(done)

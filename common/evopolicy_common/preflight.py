@@ -1,0 +1,114 @@
+"""What a command needs of its machine, checked before it begins anything: places to write, names to tell, a port to bind."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import tempfile
+from pathlib import Path
+
+from evopolicy_common.errors import ConfigError
+
+LOOPBACK = "127.0.0.1"
+LEAST_BYTES = 1 << 20
+LEAST_SCRATCH_BYTES = 16 << 20
+"""For a temporary folder: a throw-away cluster keeps its state there, and sandboxes their files."""
+LEAST_INODES = 64
+_LOOPBACK_S = 10.0
+
+_REMEDIES = {
+    errno.EROFS: "the file system is read-only",
+    errno.ENOSPC: "no space or no inodes are left (df -h, df -i): make room",
+    errno.EDQUOT: "the quota is used up: make room",
+    errno.EACCES: "this user may not write there",
+    errno.EPERM: "this user may not write there",
+    errno.EMFILE: "too many files are open (ulimit -n)",
+    errno.ENFILE: "too many files are open on this machine",
+    errno.ENOTDIR: "a part of the path is no folder",
+    errno.EADDRNOTAVAIL: "this machine does not have that address",
+    errno.EADDRINUSE: "something else listens there",
+}
+"""The machine's faults that a user can mend, and what to do."""
+
+
+def explained(error: OSError) -> str | None:
+    """The machine's fault with path and remedy, in a line; None when it is not of that kind, but perhaps a bug of ours."""
+    remedy = _REMEDIES.get(error.errno or 0)
+    if remedy is None:
+        return None
+    where = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else "a file"
+    return f"{where}: {os.strerror(error.errno or 0)}: {remedy}"
+
+
+def check_text(path: Path, choose: str) -> None:
+    """ConfigError for a path that is not UTF-8: messages, URLs and records that name it are text."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError as error:
+        raise ConfigError(
+            f"{os.fsencode(path).decode('utf-8', 'backslashreplace')}: this path is not UTF-8; choose another with {choose}"
+        ) from error
+
+
+def check_writable(
+    folder: Path, choose: str, *, least_bytes: int = LEAST_BYTES, may_be_full: bool = False
+) -> None:
+    """ConfigError unless files can be made in `folder`, which is made later if it is not there.
+
+    `choose`: the option or variable that names another folder. `may_be_full`: for who waits for room, or makes it.
+    """
+    folder = Path(os.path.abspath(folder))
+    check_text(folder, choose)
+    there = folder
+    try:
+        while not os.path.lexists(there):
+            there = there.parent
+        with tempfile.TemporaryFile(dir=there) as probe:
+            probe.write(bytes(4096))
+            probe.flush()
+        free = os.statvfs(there)
+    except OSError as error:
+        if may_be_full and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return
+        why = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
+        raise ConfigError(
+            f"cannot write to {folder}: {why}, or choose another folder with {choose}"
+        ) from error
+    n_bytes, least_inodes = free.f_bavail * free.f_frsize, LEAST_INODES if free.f_files else 0
+    if not may_be_full and (n_bytes < least_bytes or free.f_favail < least_inodes):
+        raise ConfigError(
+            f"cannot work in {folder}: {n_bytes >> 10:,} KiB and {free.f_favail:,} inodes are free, {least_bytes >> 10:,} KiB"
+            f" and {least_inodes} are needed; make room, or choose another folder with {choose}"
+        )
+
+
+def check_scratch() -> None:
+    """ConfigError when the system's temporary folder is full, or there is none."""
+    try:
+        folder = Path(tempfile.gettempdir())
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"no temporary folder can be written: {error.strerror}; make room, or name one with TMPDIR"
+        ) from error
+    check_writable(folder, "TMPDIR", least_bytes=LEAST_SCRATCH_BYTES)
+
+
+def check_loopback() -> None:
+    """ConfigError when nothing can listen on the loopback address."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
+            sock.bind((LOOPBACK, 0))
+            sock.listen()
+            # An interface that is down has its address, and nothing reaches it.
+            socket.create_connection(sock.getsockname(), timeout=_LOOPBACK_S).close()
+    except OSError as error:
+        raise ConfigError(no_loopback(error)) from error
+
+
+def no_loopback(error: OSError) -> str:
+    """Why nothing can listen on the loopback address, with the remedy."""
+    return (
+        f"cannot listen on {LOOPBACK}, where the agent's service is: {error.strerror or error}; bring IPv4 loopback up with"
+        " `ip link set lo up` (in a container: give it a network)"
+    )

@@ -1,0 +1,136 @@
+"""A home that refuses: read-only, full, named in no known letters, without a loopback. A line with path and remedy, at once."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import SMALL
+
+EVOPOLICY = f"{sys.executable} -m evopolicy_gateway.cli"
+COORDINATOR = f"{sys.executable} -m evopolicy_coordinator.cli"
+PLAYED = f"--env toy/line --agent evolve --exp-id t {' '.join(SMALL)}"
+SUITE = 'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
+POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
+PATIENCE_S = 120
+COMMANDS = {
+    "try": f"{EVOPOLICY} try policy --env toy/line",
+    "run": f"{EVOPOLICY} run --local {PLAYED}",
+    "local": f"{EVOPOLICY} local {PLAYED}",
+    "suite": f"{EVOPOLICY} suite t.toml --local",
+    "random": f"{EVOPOLICY} random --env toy/line --split train --cases 0",
+    "state": f"{EVOPOLICY} local {PLAYED} --runs /tmp/evopolicy-nowhere --state state",
+    "gc": f"{EVOPOLICY} gc --state old",
+    "report": f"{EVOPOLICY} report runs --out report",
+    "coordinator": f"{COORDINATOR} --state state",
+    "a coordinator's old state": f"{COORDINATOR} --state old",
+}
+
+
+@functools.cache
+def no_namespaces() -> str | None:
+    if shutil.which("unshare") is None:
+        return "unshare is missing: bash deploy/setup-host.sh --tests"
+    tried = subprocess.run(
+        ["unshare", "--mount", "--net", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True
+    )
+    return f"no mount namespaces here, which need root: {tried.stderr!r}" if tried.returncode else None
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A folder with a policy, a suite's file, and an old state."""
+    if (why := no_namespaces()) is not None:
+        pytest.skip(why)
+    folder = tmp_path / "home"
+    folder.mkdir()
+    (folder / "policy").mkdir()
+    (folder / "policy/policy.py").write_text(POLICY)
+    (folder / "t.toml").write_text(SUITE)
+    (folder / "runs").mkdir()
+    made = subprocess.run([*EVOPOLICY.split(), "data", "make", "--help"], capture_output=True)
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+def refused(where: str, command: str, folder: Path, *namespaces: str) -> str:
+    """What the command says, in a line on stderr, when it is started where the shell words `where` have been carried out."""
+    script = f"set -e\n{where}\nset +e\n{command}"
+    done = subprocess.run(
+        ["unshare", "--mount", *namespaces, "sh", "-c", script],
+        cwd=folder,
+        env={**os.environ, "XDG_STATE_HOME": str(folder / "xdg")},
+        capture_output=True,
+        timeout=PATIENCE_S,
+    )
+    said = done.stderr.decode("utf-8", "replace")
+    assert done.returncode == 2, (done.returncode, said, done.stdout)
+    assert len(said.splitlines()) == 1, said
+    assert done.stdout == b""
+    return said
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "random"])
+def test_a_read_only_home_is_told_before_anything_is_begun(home: Path, name: str) -> None:
+    old = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import sys; from pathlib import Path\n"
+            "from evopolicy_coordinator.state import StateFolder\nStateFolder.open(Path(sys.argv[1])).close()",
+            home / "old",
+        ]
+    )
+    assert old.returncode == 0
+    where = f"mount --bind {home} {home}; mount -o remount,ro,bind {home}; cd {home}"
+    said = refused(where, COMMANDS[name], home)
+    assert str(home) in said
+    assert "read-only" in said
+    assert any(option in said for option in ("--out", "--runs", "--state")), said
+
+
+@pytest.mark.parametrize("name", ["try", "local", "suite", "random"])
+@pytest.mark.parametrize("limit", ["size=1m", "nr_inodes=20"])
+def test_a_full_temporary_folder_is_told_before_anything_is_begun(home: Path, name: str, limit: str) -> None:
+    full = home / "tmp"
+    full.mkdir()
+    where = f"mount -t tmpfs -o {limit} none {full}; export TMPDIR={full}"
+    said = refused(where, COMMANDS[name], home)
+    assert str(full) in said
+    assert "TMPDIR" in said
+
+
+@pytest.mark.parametrize("name", ["run", "local", "suite"])
+@pytest.mark.parametrize(
+    "how", ["true", "ip link set lo up; ip addr del 127.0.0.1/8 dev lo"], ids=["down", "ipv6 only"]
+)
+def test_a_machine_without_ipv4_loopback_is_told_before_anything_is_begun(
+    home: Path, name: str, how: str
+) -> None:
+    said = refused(how, COMMANDS[name], home, "--net")
+    assert "127.0.0.1" in said
+    assert "ip link set lo up" in said
+    assert list((home / "runs").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"{EVOPOLICY} local {PLAYED} --state $ODD",
+        f"{EVOPOLICY} local {PLAYED} --runs $ODD",
+        f"{EVOPOLICY} try policy --env toy/line --out $ODD",
+        f"{EVOPOLICY} suite t.toml --local --runs $ODD",
+        f"{COORDINATOR} --state $ODD",
+        f"mkdir $ODD && cd $ODD && {EVOPOLICY} local {PLAYED} --runs {{home}}/runs",
+    ],
+)
+def test_a_path_that_is_not_utf_8_is_told_before_anything_is_begun(home: Path, command: str) -> None:
+    said = refused("export ODD=$(printf 'odd-\\377')", command.replace("{home}", str(home)), home)
+    assert r"odd-\xff" in said
+    assert "not UTF-8" in said
+    assert list((home / "runs").iterdir()) == []

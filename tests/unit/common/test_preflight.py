@@ -1,0 +1,57 @@
+"""The machine's faults are told with path and remedy; anything else stays a bug with its traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.preflight import check_text, check_writable, explained
+
+
+def test_a_full_disk_is_told_unless_who_asks_waits_for_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(ConfigError, match=f"{tmp_path / 'new'}.*make room.*--state"):
+        check_writable(tmp_path / "new", "--state")
+    check_writable(tmp_path / "new", "--state", may_be_full=True)
+
+
+def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:
+    check_writable(tmp_path / "a/b/c", "--out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_of_the_path_that_is_a_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"no folder.*--runs"):
+        check_writable(tmp_path / "file" / "runs", "--runs")
+
+
+def test_a_path_that_is_not_utf_8_is_told_in_letters_that_can_be_printed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"odd-\\xff: this path is not UTF-8; choose another with --state"):
+        check_text(Path(os.fsdecode(b"/odd-\xff")), "--state")
+
+
+def test_an_error_of_the_machine_ends_a_command_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended, fail_on_our_errors():
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), "/srv/runs")
+    assert ended.value.code == 1
+    assert "/srv/runs: Read-only file system" in capsys.readouterr().err
+
+
+def test_an_error_that_may_be_a_bug_keeps_its_traceback() -> None:
+    missing = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/x")
+    assert explained(missing) is None
+    with pytest.raises(FileNotFoundError), fail_on_our_errors():
+        raise missing
