@@ -171,9 +171,28 @@ _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
 
+MAX_LINE_BYTES = 1 << 20
+"""A line is no longer; whoever reads it takes four times as much."""
+_MAX_TEXT = 2000
+
+
 def line(message: Event | Order) -> bytes:
-    """A message as one line of JSON."""
-    return msgspec.json.encode(message) + b"\n"
+    """A message as one line of JSON; without what would make it too long, which an agent's CLI may have said.
+
+    The operator's own settings, in `StartAgent`, are left whole.
+    """
+    data = msgspec.json.encode(message) + b"\n"
+    if len(data) <= MAX_LINE_BYTES or isinstance(message, StartAgent):
+        return data
+    shorter: dict[str, Any] = {}
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        if isinstance(value, str):
+            shorter[name] = value[:_MAX_TEXT]
+        elif isinstance(value, dict):
+            size = len(msgspec.json.encode(value))
+            shorter[name] = value if size <= _MAX_TEXT else {"left_out": f"{size:,} bytes"}
+    return msgspec.json.encode(msgspec.structs.replace(message, **shorter)) + b"\n"
 
 
 def event_of(data: bytes) -> AnyEvent:
