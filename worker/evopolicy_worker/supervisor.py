@@ -6,7 +6,8 @@ Rules:
 - A result leaves the outbox only when the coordinator answered that it is durable; sending it twice is safe.
 - What is leased with `stop_in_silence` is stopped when no heartbeat was answered for the leases' time to live: from some
   time after that the coordinator may let an agent onto this kernel.
-- A slot that dies takes its own job with it and nothing else. What waits behind it is not blamed.
+- A slot that is ended from outside takes its own job with it and nothing else, and that is played again. What a policy can do to
+  its slot is an outcome of its job (`endings`).
 - On SIGTERM nothing new is asked for, what waits is given back, what runs may finish within the grace time.
 """
 
@@ -28,7 +29,6 @@ from evopolicy_common.errors import (
     EvopolicyError,
     PartFailedError,
     RefusedError,
-    SlotDiedError,
     TransportError,
 )
 from evopolicy_common.messages.environment import EnvironmentDescription
@@ -379,11 +379,6 @@ class Supervisor:
             else:
                 self._put_result(lease, "done", outcomes)
                 self.jobs_done += 1
-        except SlotDiedError as error:
-            healthy = False
-            kind: ResultKind = "returned" if lease.lease_id in self._cancelled else "slot_died"
-            log.warning("slot died", job=job.job_id, attempt=lease.attempt, error=str(error))
-            self._put_result(lease, kind, error=str(error))
         except (EvopolicyError, OSError) as error:
             healthy = False
             returned = lease.lease_id in self._cancelled

@@ -140,8 +140,9 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
 
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played; returned: given back unplayed (drained, preempted, cancelled); slot_died: the bundle brought its slot
-down, the supervisor lives (a strike); failed: infrastructure (environment crashed by itself, disk full, sandbox)."""
+"""done: played; returned: given back unplayed (drained, preempted, cancelled); failed: infrastructure (ended
+from outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions, which do not
+tell a slot that its policy brought down from one that was ended from outside; now the first is an outcome (done)."""
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):

@@ -8,7 +8,8 @@ Rules that this module owns:
 - An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
   name proves its grant. So is one of a worker that the job's group bars.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
-- A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
+- What a policy can do to its slot is an outcome, and what it cannot is played again without a limit (`failed`). Only workers of
+  earlier versions hand in strikes (`slot_died`), which may be either. A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
   that.
 """
 

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import signal
+from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -170,13 +171,14 @@ def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_p
 
 
 def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
-    died: set[str] = set()
+    died: Counter[str] = Counter()
     failed: set[str] = set()
 
     async def trouble(slot: ScriptedSlot, job: Job) -> None:
-        if job.episodes[0].index % 4 == 1 and job.job_id not in died:
-            died.add(job.job_id)
-            raise SlotDiedError("environment process ended with code 139")
+        # More often than would quarantine a bundle, were it the bundle's doing.
+        if job.episodes[0].index % 4 == 1 and died[job.job_id] < (5 if "/train/1" in job.job_id else 1):
+            died[job.job_id] += 1
+            raise SlotDiedError("environment process ended with status -9")
         if job.episodes[0].index % 4 == 2 and job.job_id not in failed:
             failed.add(job.job_id)
             raise SandboxError("no space for the policy's copy")
