@@ -3,6 +3,7 @@
 # make check  ruff and mypy
 # make bench  what an episode costs, beside a bare loop
 # make bench-throughput   episodes per second through the coordinator
+# make bench-channels     what a policy can tell others on its machine, at once and afterwards
 # make bench-report       a report over 1,024 runs
 # make faults real processes killed, frozen and starved through whole runs
 # make sim    the coordinator's core under a simulated network with faults
@@ -13,7 +14,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench bench-throughput bench-report faults sim clean
+.PHONY: help install demo test check bench bench-throughput bench-channels bench-report faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -51,6 +52,9 @@ bench-throughput: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/throughput.py $(ARGS)
 
 # How long a report over 1,024 runs takes, and its memory.
+bench-channels: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channels.py $(ARGS)
+
 bench-report: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/report_scale.py $(ARGS)
 

@@ -146,8 +146,8 @@ class PolicyProcess:
             "RLIMIT_SIGPENDING": 256,
         }
         if self._enclosed:
-            # Counted per user namespace: its parent, the zygote and the zygote's parent are in it too.
-            rlimits["RLIMIT_NPROC"] = limits.processes + 3
+            # Counted per user namespace: its parent and the zygote are in it too.
+            rlimits["RLIMIT_NPROC"] = limits.processes + 2
         init = {
             "home": self._home,
             "home_bytes": limits.file_bytes + sum(-(-size // 4096) * 4096 for _, _, size in bundle.names),

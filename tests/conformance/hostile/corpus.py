@@ -156,6 +156,8 @@ PAIRS = {
     " times": "with tier `none`",
     "Reads all of its memory for what the policies before it in the slot have left: their number, how long they took, how"
     " they ended": "-",
+    "Looks for names that are not there, which the kernel remembers; a policy in another slot asks by the clock which they"
+    " were": "with tier `none`",
     "Searches all objects, frames and generators for the case's seed": "with tier `none`",
 }
 """What is tried with more than one episode, and how it was seen to succeed."""

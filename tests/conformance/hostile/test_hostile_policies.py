@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import random
 import socket
 import threading
 import zlib
@@ -213,6 +214,28 @@ def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> No
     hidden = slots.play(source, record="actions").stdout
     assert train == hidden
     assert len(train) > 1000
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "none"])
+def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, tier: str) -> None:
+    bits, tag = [random.getrandbits(1) for _ in range(400)], f"{random.getrandbits(64):x}"
+    source = (POLICIES / "names.py").read_text()
+
+    def play(slot: Any, **told: Any) -> EpisodeOutcome:
+        files: dict[str, str | bytes] = {"policy.py": source, "target.json": json.dumps({"tag": tag, **told})}
+        outcome = slots.play(files, slot=slot, tier=tier, limits=PATIENT)
+        assert outcome.failure is None, outcome.failure
+        return outcome
+
+    play(slots.slot(tier), role="tell", bits=bits)  # type: ignore[arg-type]
+    # Undefended one folder is enough: there are many.
+    walk = "/" if tier == "bwrap" else os.path.dirname(os.__file__)
+    told = play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk).stdout
+    heard, machines_folders = json.loads(told)
+    agreeing = sum(one == bool(other) for one, other in zip(heard, bits, strict=True))
+    # Guessing gets half of them, give or take ten.
+    assert (agreeing > 300) == (tier == "none"), agreeing
+    assert (machines_folders != []) == (tier == "none"), machines_folders
 
 
 def unpacked(text: str) -> bytes:

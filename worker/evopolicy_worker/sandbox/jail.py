@@ -20,6 +20,7 @@ INSTALL_BWRAP = "apt-get install bubblewrap (Debian, Ubuntu), dnf install bubble
 
 POLICY_HOME = "/home/policy"
 _PACKAGES = "/packages"
+_PLACE = "/own"
 _DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
 """Not `/dev/zero`: mapped, it is shared memory without a file, whose inode numbers are counted for the whole machine."""
 _FIRST_UID = 0x6D000000
@@ -91,6 +92,7 @@ def plan(
             config["landlock"] = {"read": ["/"], "write": ["/tmp", "/dev"]}
         as_root = os.geteuid() == 0
         config["become_nobody"] = as_root
+        config |= _own_files(files)
         return Jail(
             command=(*_bubblewrap(files, as_root), *_python(files, "/sandbox")),
             config=config,
@@ -148,8 +150,7 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     for path in parents([*files.read, *map(os.path.realpath, files.read), "/dev/null", POLICY_HOME]):
         command += ["--perms", "0755", "--dir", path]
     for path in files.read:
-        target = os.path.realpath(path)
-        if target != path and os.path.isdir(path) and os.path.islink(path):
+        if os.path.isdir(path) and (target := _shown_at(path)) != path:
             command += ["--ro-bind", target, target, "--symlink", target, path]
         else:
             command += ["--ro-bind", path, path]
@@ -162,7 +163,34 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     for device in _DEVICES:
         if os.path.exists(device):
             command += ["--dev-bind", device, device]
-    return [*command, "--dir", POLICY_HOME, "--dir", "/tmp", "--chdir", "/", "--remount-ro", "/"]
+    return [
+        *command,
+        "--dir",
+        POLICY_HOME,
+        "--dir",
+        "/tmp",
+        "--dir",
+        _PLACE,
+        "--chdir",
+        "/",
+        "--remount-ro",
+        "/",
+    ]
+
+
+def _own_files(files: python_files.PythonFiles) -> dict[str, object]:
+    """What the zygote is to put copies in place of, and where it may work on them."""
+    folders: list[str] = []
+    libraries: list[str] = []
+    for path in filter(os.path.isdir, files.read):
+        (libraries if path in files.libraries else folders).append(_shown_at(path))
+    packages = [f"{_PACKAGES}/{name}" for name, path in files.packages.items() if os.path.isdir(path)]
+    return {"folders": [*folders, *packages, "/sandbox"], "libraries": libraries, "place": _PLACE}
+
+
+def _shown_at(path: str) -> str:
+    """Where a folder lies: links to folders are links in the sandbox too."""
+    return os.path.realpath(path) if os.path.islink(path) else path
 
 
 def parents(paths: list[str]) -> list[str]:

@@ -28,6 +28,8 @@ class PythonFiles(msgspec.Struct, frozen=True, kw_only=True):
     """The interpreter's own file, no link and no launcher of a virtual environment."""
     read: tuple[str, ...]
     """Files and folders, to be seen at their own paths."""
+    libraries: tuple[str, ...]
+    """Those of them that hold the system's shared libraries, of which Python needs a few."""
     hidden: tuple[str, ...]
     """Folders below those in `read` that must look empty."""
     packages: dict[str, str]
@@ -47,12 +49,14 @@ def find(allowed_packages: tuple[str, ...]) -> PythonFiles:
     else:
         # A prefix of Python's own (pyenv, conda, uv, /usr/local): libraries beside the standard library too.
         read.append(f"{prefix}/lib")
-    read += _shared_libraries()
+    libraries = _shared_libraries()
+    read += libraries
     # Resolved one by one: `/lib` is a link to `/usr/lib` on most systems, and both names are used.
     existing = tuple(dict.fromkeys(path for path in read if os.path.exists(path)))
     return PythonFiles(
         interpreter=interpreter,
         read=existing,
+        libraries=tuple(path for path in existing if path in libraries),
         hidden=tuple(sorted(_site_folders(existing))),
         packages=_packages(allowed_packages),
     )

@@ -11,6 +11,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import tempfile
 import time
@@ -26,6 +27,8 @@ START_TIMEOUT_S = 60.0
 ANSWER_TIMEOUT_S = 20.0
 DEATH_TIMEOUT_S = 10.0
 _MAX_MESSAGE = 1 << 16
+_REPORT = struct.Struct("8xi12xi100x5q")
+"""Of `siginfo_t` (128 bytes) the code and the status, of `struct rusage` user and system time and the largest memory."""
 
 
 class Child(msgspec.Struct, kw_only=True):
@@ -38,8 +41,6 @@ class Child(msgspec.Struct, kw_only=True):
     replies: int
     stdout: int
     stderr: int
-    parent: socket.socket
-    """Tells how it ended."""
 
     def kill(self) -> None:
         """SIGKILL. In its own pid namespace this ends everything that it may have started."""
@@ -47,7 +48,6 @@ class Child(msgspec.Struct, kw_only=True):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def close(self) -> None:
-        self.parent.close()
         for fd in (self.pidfd, self.requests, self.replies, self.stdout, self.stderr):
             os.close(fd)
 
@@ -115,7 +115,7 @@ class Zygote:
         ours.settimeout(ANSWER_TIMEOUT_S)
         try:
             with theirs:
-                socket.send_fds(self._control, [b"f"], [theirs.fileno()])
+                socket.send_fds(self._control, [b"fk"], [theirs.fileno()])
             said, fds, _, _ = socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)
             if not said:
                 raise ConnectionResetError("no process for a policy came of it")
@@ -135,17 +135,24 @@ class Zygote:
             replies=replies,
             stdout=stdout,
             stderr=stderr,
-            parent=ours,
         )
 
     def wait(self, child: Child) -> Exit:
         """How a killed or ended child ended. Takes its entry from the process table."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            child.parent.send(b"w")
-            said = child.parent.recv(_MAX_MESSAGE)
-            return msgspec.json.decode(said, type=Exit)
-        except (OSError, msgspec.DecodeError) as error:
+            with ours:
+                ours.settimeout(ANSWER_TIMEOUT_S)
+                with theirs:
+                    socket.send_fds(self._control, [b"w"], [child.pidfd, theirs.fileno()])
+                report = ours.recv(_MAX_MESSAGE)
+            code, status, user_s, user_us, system_s, system_us, peak = _REPORT.unpack_from(report)
+        except (OSError, struct.error) as error:
             raise SlotDiedError(f"the sandbox does not say how a policy's process ended: {error}") from error
+        cpu_s = user_s + system_s + (user_us + system_us) / 1e6
+        return Exit(
+            status=status << 8 if code == os.CLD_EXITED else status, cpu_s=cpu_s, peak_bytes=peak * 1024
+        )
 
     def bury_later(self, child: Child) -> None:
         """Kill the child now, and learn of its end when there is time: a process takes milliseconds to be taken down."""
@@ -164,6 +171,8 @@ class Zygote:
 
     def close(self) -> None:
         """Ends the zygote and with it every process in its sandbox."""
+        with contextlib.suppress(OSError):
+            self._control.send(b"q ")
         self._control.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)

@@ -25,12 +25,17 @@ import socket
 import struct
 import sys
 import traceback
+from collections.abc import Iterable
 from typing import Any
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
 MS_RDONLY, MS_NOSUID, MS_NODEV, MS_REMOUNT, MS_NOATIME, MS_BIND, MS_REC = 1, 2, 4, 32, 1024, 4096, 16384
 MS_PRIVATE = 1 << 18
 HOME_FLAGS = MS_NOSUID | MS_NODEV | MS_NOATIME
+WAITID = 247 if os.uname().machine == "x86_64" else 95
+P_PIDFD, WEXITED, MADV_DONTFORK = 3, 4, 10
+SIGINFO_BYTES, REPORT_BYTES = 128, 128 + 144
+"""Of `siginfo_t`; with `struct rusage` after it."""
 N_PIPES = 4
 NOBODY = 65534
 PID_MARK = 0x7FFFABCD
@@ -60,14 +65,15 @@ def main() -> None:
         if config["namespaces"]:
             for device in config["devices"]:
                 protect(device)
+            module("files").take_over(config["folders"], config["libraries"], config["place"])
     except BaseException as error:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
         raise
-    worker = zygote(control)
+    worker = zygote(control, config["namespaces"])
     # Only its forks come here. They must never go on as the zygote, whatever happens.
     del control
     try:
-        policys_parent(config, worker)
+        policy_process(config, worker)
     finally:
         os._exit(70)
 
@@ -105,18 +111,21 @@ def protect(device: str) -> None:
     check(libc.mount(None, device.encode(), None, flags, None), f"protect {device}")
 
 
+def module(name: str) -> Any:
+    """One of ours, beside this file. Not by the path: a bundle may have a module of that name."""
+    path = os.path.join(os.path.dirname(__file__), f"{name}.py")
+    spec = importlib.util.spec_from_file_location(f"_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    return found
+
+
 def warm(modules: list[str]) -> None:
     """Imports what every policy may use, so that children share it."""
     global player
-    # Not by the path: a bundle may have a module of that name.
-    spec = importlib.util.spec_from_file_location(
-        "_player", os.path.join(os.path.dirname(__file__), "player.py")
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    player = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(player)
-
+    player = module("player")
     np = player.np
     for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules):
         importlib.import_module(name)
@@ -138,77 +147,92 @@ def warm(modules: list[str]) -> None:
     gc.freeze()
 
 
-def zygote(control: socket.socket) -> int:
-    """Serves the worker until it hangs up; returns in a fork for each policy, with a socket to the worker.
+def zygote(control: socket.socket, namespaces: bool) -> int:
+    """Serves the worker until it is told to end; returns in a fork for each policy, with a socket to the worker.
 
     A policy can read all memory that it was forked with. So this process must learn nothing of the policies before, nor
-    count them: it has no part in what they are told or tell, does not wait for them, and runs no Python between two forks,
-    whose interpreter counts what it does. What is left is the same five calls in a circle, with the same arguments.
+    count them. It runs no Python between two forks, whose interpreter counts what it does: the same calls in a circle,
+    with the same arguments. How a policy ended lies in a page that children do not inherit, from where it is sent.
+
+    A request of one byte asks how a process ended (its pidfd, a socket for the answer), one of two asks for a process
+    (the socket that is returned) or, beginning with `q`, for the end.
     """
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    request = os.dup(0)
-    os.close(request)
-    asked, room = ctypes.create_string_buffer(1), ctypes.create_string_buffer(24)
-    pieces = (ctypes.c_size_t * 2)(ctypes.addressof(asked), 1)
-    # struct msghdr: no name, one piece, room for one descriptor, flags
-    message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(room), 24, 0)
+    page = unshared_page()
+    how, usage = ctypes.c_void_p(page), ctypes.c_void_p(page + SIGINFO_BYTES)
+    asked, room = ctypes.create_string_buffer(2), ctypes.create_string_buffer(24)
+    pieces = (ctypes.c_size_t * 2)(ctypes.addressof(asked), len(asked))
+    # struct msghdr: no name, one piece, room for two descriptors, flags
+    message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(room), len(room), 0)
     calls = ctypes.PyDLL(None)
+    myself = os.pidfd_open(os.getpid())
+    # The lowest numbers that are free, which descriptors that arrive get.
+    first, second = os.dup(0), os.dup(0)
+    os.close(first)
+    os.close(second)
 
     def step(name: str, result: Any, *arguments: Any) -> Any:
         function = calls[name]
         function.restype = result
         return functools.partial(function, *arguments)
 
+    def around(steps: Iterable[Any]) -> Any:
+        return functools.partial(next, map(operator.call, itertools.cycle(steps)))
+
+    ends = around(
+        (
+            # It begins again after a request for a process too. Then these descriptors are closed, and nothing happens.
+            step("recvmsg", ctypes.c_ssize_t, control.fileno(), message, 0),
+            step("syscall", None, WAITID, P_PIDFD, first, how, WEXITED, usage),
+            step("send", None, second, how, ctypes.c_size_t(REPORT_BYTES), 0),
+            step("close", None, first),
+            step("close", None, second),
+        )
+    )
+    until_two_bytes = map(operator.call, itertools.repeat(functools.partial(iter, ends, 2)))
+    # To look for what is not among the answers is to ask for all of them.
+    gone_through = map(operator.contains, until_two_bytes, itertools.repeat(object()))
     circle = (
-        # 0 ends the loop, here when the worker has hung up
-        step("recvmsg", ctypes.c_ssize_t, control.fileno(), message, 0),
-        # and here in the child.
+        functools.partial(next, map(operator.not_, gone_through)),
+        # 0, here and in the child, ends the circle.
+        step("memcmp", ctypes.c_int, asked, b"q", 1),
+        *([step("unshare", None, CLONE_NEWPID)] if namespaces else []),
         step("fork", ctypes.c_int),
-        step("close", None, request),
-        step("memset", None, asked, 0, 1),
+        # Else the next child would be born into the namespace of this one.
+        *([step("setns", None, myself, CLONE_NEWPID)] if namespaces else []),
+        step("close", None, first),
+        step("memset", None, asked, 0, 2),
         # A number in place of the child's, which counts the policies.
         step("labs", ctypes.c_long, ctypes.c_long(1 << 40)),
     )
     control.send(b'{"ready": true}')
-    calling = functools.partial(next, map(operator.call, itertools.cycle(circle)))
-    collections.deque(iter(calling, 0), maxlen=0)
-    if asked.raw == b"\0":
+    collections.deque(iter(around(circle), 0), maxlen=0)
+    if asked.raw[:1] == b"q":
         os._exit(0)
-    return request
+    return first
+
+
+def unshared_page() -> int:
+    """Address of memory that no child inherits."""
+    libc.mmap.restype = ctypes.c_void_p
+    page = libc.mmap(None, ctypes.c_size_t(4096), 3, 0x22, -1, ctypes.c_long(0))
+    check(libc.madvise(ctypes.c_void_p(page), ctypes.c_size_t(4096), MADV_DONTFORK), "madvise")
+    return int(page)
 
 
 # One policy's process.
 
 
-def policys_parent(config: dict[str, Any], worker: int) -> None:
-    """Forks the policy's process, and tells the worker how it ended. `worker`: a socket."""
-    libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    try:
-        if config["namespaces"]:
-            check(libc.unshare(CLONE_NEWPID | CLONE_NEWNS | CLONE_NEWIPC), "unshare pid, mounts, ipc")
-        child = os.fork()
-    except OSError as error:
-        os.write(worker, f"{type(error).__name__}: {error}".encode())
-        return
-    if child == 0:
-        policy_process(config, worker)
-        return
-    # Until the worker asks, its clock can be read, also when it has ended.
-    os.read(worker, 1)
-    _, status, usage = os.wait4(child, 0)
-    how = {"status": status, "cpu_s": usage.ru_utime + usage.ru_stime, "peak_bytes": usage.ru_maxrss * 1024}
-    os.write(worker, json.dumps(how).encode())
-    os._exit(0)
-
-
 def policy_process(config: dict[str, Any], worker: int) -> None:
+    """`worker`: a socket on which the worker waits for this process and its pipes."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     try:
         home = None
         if config["namespaces"]:
             home = config["home"]
+            if os.getpid() != 1:
+                raise OSError("it has no process namespace of its own")
+            check(libc.unshare(CLONE_NEWNS | CLONE_NEWIPC), "unshare mounts, ipc")
             check(libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None), "private mounts")
             mount_home(home, config["own_tmp"])
         hand_out_pipes(worker, home)
