@@ -10,7 +10,7 @@ from core_rig import BUNDLE, Rig, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core import events, scheduler
 
 
 def validating(rig: Rig, session: str, n: int = 1) -> None:
@@ -375,3 +375,34 @@ def test_a_poll_that_was_read_late_is_answered_while_its_worker_still_waits() ->
     request = rig._requests
     rig.pass_time(2.5)
     assert rig.replies[request] == wire.Leases(leases=())
+
+
+def test_one_answer_holds_no_more_leases_than_fit_into_a_message() -> None:
+    rig = Rig()
+    session = rig.register(slots=4096)
+    rig.create(train=64, budget=2000, most=1000)
+    rig.submit(*(k % 64 for k in range(1000)))
+    sizes = [len(rig.poll(session, 4096)) for _ in range(5)]
+    assert sizes == [scheduler.LEASES_MAX] * 3 + [1000 - 3 * scheduler.LEASES_MAX, 0]
+
+
+def test_a_worker_holds_no_more_leases_than_its_heartbeat_can_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "HELD_MAX", 20)
+    rig = Rig()
+    session = rig.register(slots=4096)
+    rig.create(train=64, budget=100, most=100)
+    rig.submit(*range(50))
+    first = rig.poll(session, 4096)
+    assert (len(first), rig.poll(session, 4096)) == (20, [])
+    rig.play(session, first[0])
+    assert len(rig.poll(session, 4096)) == 1
+
+
+def test_large_jobs_are_leased_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "EPISODES_MAX", 20)
+    rig = Rig()
+    session = rig.register(slots=64)
+    for k in range(6):
+        rig.create(f"r{k}", budget=16, policy_scope="submit")
+        rig.submit(*range(8), run=f"r{k}")
+    assert [len(rig.poll(session, 64)) for _ in range(3)] == [3, 3, 0]
