@@ -141,7 +141,7 @@ print(answer["feedback"], answer["status"], answer["summary"]["mean_return"])
 | 200, `missing_policy`, `denied_import`, `import_error`, `init_error` | `system/` gives no `Policy`: charged, see `errors.txt` |
 | 200, `rollout_timeout`, `quarantined` | it took too long, or it kept bringing its sandbox down: charged |
 | 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
-| 200 or 400, `cancelled` | the operator has ended the run: nothing charged, nothing more is taken |
+| 200 or 409, `cancelled` | the operator has ended the run: nothing charged, nothing more is taken |
 | 409, `run_closed` | the budget is spent: no more submits are taken |
 | 409 | another submit is running, or an `Idempotency-Key` was used twice for different requests |
 

@@ -39,7 +39,11 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=N
 
 @app.callback()
 def evopolicy() -> None:
-    """Evaluates agents that evolve policies: opens runs, plays them, and tells what they came to."""
+    """Evaluates agents that evolve policies: opens runs, plays them, and tells what they came to.
+
+    Exit codes of commands that play runs: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without
+    an ok submit, 4 an agent failed, 5 a run was cancelled, 130 Ctrl-C. The gravest of several runs counts: 1, 5, 4, 3.
+    """
 
 
 @app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")

@@ -22,6 +22,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evopolicy_common.errors import RequestError
+from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_gateway.info import info_document, progress_document
 from evopolicy_gateway.submit_request import MAX_BODY_BYTES, refuse_size
 from evopolicy_gateway.submits import RUN_CLOSED, Desk
@@ -178,7 +179,8 @@ async def _request_error(request: Request, error: Exception) -> Response:
     document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
     if isinstance(error, ConflictError):
         return _json(409, document | {"submit_id": error.index})
-    return _json({RUN_CLOSED: 409, "closed": 503, "gateway_failed": 500}.get(error.status, 400), document)
+    codes = {RUN_CLOSED: 409, CANCELLED: 409, "closed": 503, "gateway_failed": 500}
+    return _json(codes.get(error.status, 400), document)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

@@ -16,7 +16,8 @@ import structlog
 import typer
 
 from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_app, setup_logging
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.preflight import explained
 from evopolicy_gateway import control
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.alone import alone
@@ -89,7 +90,13 @@ def _failures_in_the_log() -> Iterator[None]:
         log.error("the gateway cannot serve", error=str(error))
         raise SystemExit(USAGE_ERROR) from error
     except Exception as error:
-        log.exception("the gateway failed", error=str(error))
+        foreseen = explained(error) if isinstance(error, OSError) else None
+        if foreseen is None and isinstance(error, EvopolicyError):
+            foreseen = str(error)
+        if foreseen is None:
+            log.exception("the gateway failed", error=str(error))
+        else:
+            log.error("the gateway failed", error=foreseen)
         raise SystemExit(FAILURE) from error
 
 

@@ -36,6 +36,7 @@ from evopolicy_common.messages.gateway import (
     SubmitInFlight,
 )
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.trajectory import Recorder
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.gateway import Close, Gateway
@@ -159,7 +160,7 @@ class Double:
 
     def _answer(self, message: Message) -> Message:
         if message.token != CAPABILITY:  # type: ignore[attr-defined]
-            return Refused(status="bad_token", message="wrong token")
+            return Refused(status=Refusal.BAD_TOKEN, message="wrong token")
         if isinstance(message, OpenRun):
             return msgspec.structs.replace(self.run, state=self._state())
         if isinstance(message, RequestPermit):

@@ -18,6 +18,9 @@ from http.client import HTTPException
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
+_OVER = ("run_closed", "cancelled")
+"""With 409: nothing more is taken. Any other 409 passes by itself."""
+
 
 class ProtocolError(Exception):
     """The gateway answered with something that the protocol does not allow, or stayed away too long."""
@@ -28,7 +31,7 @@ class Refusal:
     """A submit that was refused and cost nothing."""
 
     status: str
-    """`budget_invalid`, `invalid_env_instance`, `run_closed`."""
+    """`budget_invalid`, `invalid_env_instance`, `run_closed`, `cancelled`."""
     message: str
 
 
@@ -86,11 +89,11 @@ class Client:
         headers = {"Content-Type": "application/json", "Idempotency-Key": key}
         while True:
             status, answer = self._request(_extended(self.submit_url, query="wait=false"), body, headers)
-            if status != 409:
+            if status != 409 or self._json(answer).get("status") in _OVER:
                 break
             # Another submit runs, perhaps of an agent that was here before us: it ends by itself.
             self.sleep(self.poll_s)
-        if status == 400:
+        if status in (400, 409):
             refusal = self._json(answer)
             error = refusal.get("error") or {}
             return Refusal(

@@ -17,6 +17,7 @@ from gateway_double import Double, answering, gateway_on, opened, prepare, serve
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, RunState, Submit
 from evopolicy_common.messages.worker import Refused
+from evopolicy_common.refusals import Refusal
 from evopolicy_gateway import server, submits
 from evopolicy_gateway.feedback import SubmitTree
 
@@ -173,7 +174,7 @@ def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arrival(tmp_
 def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.refuse_submit = Refused(status="unavailable", message="disk full")
+        double.refuse_submit = Refused(status=Refusal.UNAVAILABLE, message="disk full")
         async with served(tmp_path, double) as s:
             request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
             await asyncio.sleep(0.2)
@@ -187,12 +188,13 @@ def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Pa
 def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.refuse_submit = Refused(status="run_closed", message="run 'run-1' takes no more submits")
+        double.refuse_submit = Refused(status=Refusal.RUN_CANCELLED, message="run 'run-1' was cancelled")
         async with served(tmp_path, double) as s:
             for _ in range(2):
                 answer = await s.http.post(s.urls.submit, json=BODY)
                 assert answer.status_code == 409
-                assert "closed" in answer.json()["error"]["message"]
+                assert answer.json()["status"] == "cancelled"
+                assert "cancelled" in answer.json()["error"]["message"]
                 assert "run-1" not in answer.text
             assert s.desk.spent
             assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True

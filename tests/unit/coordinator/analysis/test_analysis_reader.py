@@ -131,6 +131,12 @@ def test_damaged_run_is_left_out_with_its_reason(tmp_path: Path, how: str, reaso
     assert reason in loaded.left_out[0].reason
 
 
+def test_a_cancelled_run_is_left_out_as_what_it_is(tmp_path: Path) -> None:
+    write_run(tmp_path, VERSIONS, status="cancelled")
+    (left,) = load_runs([tmp_path]).left_out
+    assert "was cancelled" in left.reason
+
+
 def test_run_that_ended_in_an_error_is_left_out(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS, status="error")
     loaded = load_runs([tmp_path])

@@ -76,6 +76,15 @@ def test_another_submit_in_flight_is_waited_for(tmp_path: Path) -> None:
         assert isinstance(a_client(gateway.url).submit([0]), Verdict)
 
 
+@pytest.mark.parametrize("status", ["run_closed", "cancelled"])
+def test_a_run_that_takes_no_more_ends_the_asking(tmp_path: Path, status: str) -> None:
+    over = (409, {"status": status, "error": {"message": "no more submits are taken"}})
+    with serving(a_gateway(tmp_path, script=[over])) as gateway:
+        zero_policy(tmp_path)
+        refusal = a_client(gateway.url).submit([0])
+        assert refusal == Refusal(status=status, message="no more submits are taken")
+
+
 def test_a_retry_after_a_server_error_costs_no_second_submit(tmp_path: Path) -> None:
     with serving(a_gateway(tmp_path, script=[(503, {})])) as gateway:
         zero_policy(tmp_path)
