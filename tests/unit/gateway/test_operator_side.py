@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError, ProtocolError
-from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.run_record import decode_run_record, encode_run_record
 from evopolicy_common.terminal import Terminal
@@ -127,6 +127,10 @@ def test_limits_are_the_usual_ones_but_for_those_named() -> None:
     ):
         with pytest.raises(ConfigError, match="--limit"):
             limits_of([wrong])
+    for name, most in (*LARGEST_LIMITS.items(), ("memory_bytes", LARGEST_LIMIT)):
+        assert getattr(limits_of([f"{name}={most}"]), name) == most
+        with pytest.raises(ConfigError, match="at most"):
+            limits_of([f"{name}={2 * most}"])
 
 
 @given(st.lists(st.integers(0, 10**6 - 1), min_size=1, max_size=20))
