@@ -41,6 +41,8 @@ MANY_EPISODES = 300
 """Of a job with more, recordings of more than 1 KiB go as blobs too, so that its outcomes fit into one."""
 MAX_LOST = 5
 """So often the coordinator may lose what was uploaded for one result before that counts as a refusal."""
+UNPACK_S = 30.0
+"""What the coordinator may take to read outcomes from a blob before it is asked again."""
 PAUSE_S = 1.0
 
 
@@ -101,7 +103,8 @@ class Outbox:
                 batch = await self._batch()
                 n = len(batch)
                 message = HandIn(worker=self._worker, session=session, results=tuple(batch))
-                await self._ask.until_answered("done", message, HandInReply)
+                wait_s = UNPACK_S if any(result.packed for result in batch) else 0.0
+                await self._ask.until_answered("done", message, HandInReply, wait_s=wait_s)
             except RefusedError as error:
                 await self._refused(error, session, n)
             except ProtocolError as error:
