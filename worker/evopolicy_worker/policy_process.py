@@ -114,6 +114,7 @@ class PolicyProcess:
         self._usual_bytes = 0
         self._surplus_bytes = 0
         self._exit: Exit | None = None
+        self._gone = False
         self._finished: Ended | None = None
         self._closing = threading.Lock()
         self._requests = child.requests
@@ -250,7 +251,7 @@ class PolicyProcess:
             watch.drain()
             self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
             with self._closing:
-                if self._exit is not None:
+                if self._gone:
                     self._child.close()
                 else:
                     # It has said its last; what a hostile one writes from now on is not read.
@@ -460,7 +461,8 @@ class PolicyProcess:
         self.dead = True
         self._watch.since = 0.0
         self._child.kill()
-        if wait_dead(self._child.pidfd, zygotes.DEATH_TIMEOUT_S):
+        self._gone = wait_dead(self._child.pidfd, zygotes.DEATH_TIMEOUT_S)
+        if self._gone:
             # None when the sandbox has ended.
             with contextlib.suppress(SlotDiedError):
                 self._exit = self._zygote.wait(self._child)
