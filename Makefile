@@ -5,6 +5,7 @@
 # make bench-throughput   episodes per second through the coordinator
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
 # make bench-report       a report over 1,024 runs
+# make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
 # make faults real processes killed, frozen and starved through whole runs
 # make sim    the coordinator's core under a simulated network with faults
 VENV := .venv
@@ -14,7 +15,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench bench-throughput bench-channels bench-report faults sim clean
+.PHONY: help install demo test check bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -57,6 +58,10 @@ bench-channels: install
 
 bench-report: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/report_scale.py $(ARGS)
+
+# What it costs that hidden episodes and agents never share a machine. Smaller: ARGS="--agents 2 --environments toy --parallel 2"
+bench-isolation: install
+	@$(BIN)/python tests/bench/isolation_bench.py $(ARGS)
 
 # Real processes killed, frozen and starved: what is hit × when → outcome. More instants: ARGS="--fault-seeds 4"
 faults: install

@@ -317,7 +317,10 @@ class Intake:
             most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
             check_counts(budget, least, most, wanted.n_validation, wanted.n_heldout)
             cases = self._source.splits(
-                suite.name, wanted.env, self._counts(suite, wanted.n_validation, wanted.n_heldout)
+                suite.name,
+                wanted.env,
+                self._counts(suite, wanted.n_validation, wanted.n_heldout),
+                own=m.key if wanted.hidden_cases == "per_run" else "",
             )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error

@@ -100,9 +100,11 @@ def _identity(case: Case) -> tuple[int, str]:
     return case.seed, json.dumps(case.options or None, sort_keys=True)
 
 
-def derive(secret: bytes, suite: str, env: str, counts: dict[Split, int]) -> dict[Split, tuple[Case, ...]]:
-    """`counts[split]` cases of each split; the same for the same secret, suite and environment."""
-    taken: set[int] = set()
+def derive(
+    secret: bytes, suite: str, env: str, counts: dict[Split, int], taken: Iterable[int] = ()
+) -> dict[Split, tuple[Case, ...]]:
+    """`counts[split]` cases of each split, none with a seed that is `taken`; the same for the same arguments."""
+    taken = set(taken)
     drawn: dict[Split, list[Case]] = {split: [] for split in SPLITS}
     for index in range(max(counts.values(), default=0)):
         for split in SPLITS:
@@ -250,15 +252,24 @@ class SplitSource:
         """Whether splits are read from files; else they are derived."""
         return self._data is not None
 
-    def splits(self, suite: str, env: str, counts: dict[Split, int]) -> EnvironmentSplits:
+    def splits(self, suite: str, env: str, counts: dict[Split, int], own: str = "") -> EnvironmentSplits:
         """The splits of `env`; derived ones have exactly `counts`, those from files are cut to `counts` where set.
 
-        `counts` of a split from files may be left out (all of the file's cases). ConfigError when files are missing,
-        wrong, or have fewer cases than asked for.
+        `counts` of a split from files may be left out (all of the file's cases). `own` names a run that has hidden cases
+        of its own, which no other run has. ConfigError when files are missing, wrong, have fewer cases than asked for, or
+        hidden cases of its own are asked for where cases come from files.
         """
         if self._data is None:
-            return EnvironmentSplits(
-                env=env, secret=True, **_by_field(derive(self._secret, suite, env, counts))
+            cases = derive(self._secret, suite, env, counts)
+            if own:
+                key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
+                shared = {case.seed for members in cases.values() for case in members}
+                cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
+            return EnvironmentSplits(env=env, secret=True, **_by_field(cases))
+        if own:
+            raise ConfigError(
+                "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes them from"
+                f" {self._data}, so all runs share them"
             )
         folder = folder_of(self._data, env)
         splits, findings = load(folder)

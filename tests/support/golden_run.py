@@ -69,8 +69,8 @@ class Case(msgspec.Struct, frozen=True):
 class GoldenCluster:
     """A tapped coordinator, and a worker behind a wiretap."""
 
-    def __init__(self, root: Path, *options: str, slots: int = 2) -> None:
-        """`options`: more of the coordinator's."""
+    def __init__(self, root: Path, *options: str, slots: int = 2, worker: tuple[str, ...] = ()) -> None:
+        """`options`: more of the coordinator's; `worker`: of the worker's."""
         self.root = root
         self.tap = root / "tap"
         self.leak = root / "leak"
@@ -95,6 +95,7 @@ class GoldenCluster:
         self._start(
             *("-m", "evopolicy_worker.cli", "--env", "toy", "--slots", str(slots), "--grace", "0"),
             *("--credentials", str(through)),
+            *worker,
         )
 
     def through(self, wiretap: Wiretap, role: credentials.Role, file: Path) -> Path:

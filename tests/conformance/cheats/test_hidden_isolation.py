@@ -1,8 +1,9 @@
-"""A jailed agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none is
+"""An agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none is
 played there before it is gone. With the rule switched off the same agent hears which cases are played.
 
-The channel is one of many (memory shared by processes, which the kernel counts for the whole machine); the records of who was
-where hold for all of them.
+The channel stands for all that sandbox and jail cannot close: memory shared by processes, which the kernel counts for the whole
+machine. They do close this one, so policies and agents have neither here: the rule holds without them, and the records of who was
+where hold for every channel.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class Listening:
 @contextlib.contextmanager
 def listening(cluster: GoldenCluster, name: str, n_submits: int, *options: str) -> Iterator[Listening]:
     agent = f"command:{sys.executable} {HERE / 'hearing_agent.py'} {POLICY} {n_submits}"
-    found = Listening(cluster, name, agent, *options)
+    found = Listening(cluster, name, agent, "--jail", "none", "--tier", "none", *options)
     try:
         yield found
     finally:
@@ -100,7 +101,7 @@ def listening(cluster: GoldenCluster, name: str, n_submits: int, *options: str) 
 @contextlib.contextmanager
 def cluster_of(root: Path, *options: str) -> Iterator[GoldenCluster]:
     # One slot, so that one pulse is one episode.
-    cluster = GoldenCluster(root, *options, slots=1)
+    cluster = GoldenCluster(root, *options, slots=1, worker=("--unsandboxed",))
     try:
         yield cluster
     finally:
@@ -200,7 +201,7 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
     """The policy that plays a hidden case would tell one that plays a train case, whose feedback goes anywhere."""
     kernel = str(uuid.uuid4())
     words = ("--http", "127.0.0.1:0", "--agent-host", kernel)
-    far = Listening(isolated, "far", "remote", *words)
+    far = Listening(isolated, "far", "remote", "--tier", "none", *words)
     try:
         far.wait_for(lambda: far.folder.bearer.exists() and "served at" in far.said.read_text())
         elsewhere = run_of(far)

@@ -74,6 +74,24 @@ def test_making_a_split_longer_changes_no_case(longer: dict[Any, int]) -> None:
         assert long[split][:5] == short[split]
 
 
+def test_run_with_hidden_cases_of_its_own_shares_none_but_all_train_cases(folder: Path) -> None:
+    source = SplitSource(data=None, secret=b"s" * 32)
+    shared, first, second = (source.splits("toy", "toy/line", COUNTS, own) for own in ("", "run-1", "run-2"))
+    assert first == source.splits("toy", "toy/line", COUNTS, "run-1")
+    assert shared.train == first.train == second.train
+    seeds = [
+        {case.seed for case in (*one.validation, *one.heldout)} | {case.seed for case in shared.train}
+        for one in (shared, first, second)
+    ]
+    trained = {case.seed for case in shared.train}
+    assert len({case.seed for case in (*first.validation, *first.heldout)} - trained) == len(
+        (*first.validation, *first.heldout)
+    )
+    assert seeds[0] & seeds[1] == seeds[0] & seeds[2] == seeds[1] & seeds[2] == trained
+    with pytest.raises(ConfigError, match="per-run"):
+        SplitSource(data=folder.parent, secret=b"s" * 32).splits("toy", "toy/line", {}, "run-1")
+
+
 def test_hash_is_of_canonical_json_of_the_cases() -> None:
     cases = [Case(seed=3), Case(seed=4, options={"b": 1, "a": [0.5]})]
     text = '[{"seed":3},{"options":{"a":[0.5],"b":1},"seed":4}]'

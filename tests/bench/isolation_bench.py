@@ -1,0 +1,99 @@
+"""What it costs that hidden episodes and agents never share a machine: the same sweep with the rule and without, on one machine.
+
+    make bench-isolation
+    make bench-isolation ARGS="--agents 2 --environments toy --parallel 2"
+
+Agents are uniform random ones with tiny budgets, so nearly all of a run is starting, waiting and scoring: the rule's worst case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from evopolicy_common.run_record import RunRecord, decode_run_record
+
+SUITE = """
+name = "isolation"
+environments = [{environments}]
+[defaults]
+budget = {budget}
+validation = {validation}
+heldout = {heldout}
+[parallel]
+machine = {parallel}
+"""
+AGENT = '[[agents]]\nname = "{}"\nagent = "random"\n'
+PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "permit_s", "held_s", "finalise_s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--agents", type=int, default=4)
+    parser.add_argument("--environments", nargs="+", default=["core16"])
+    parser.add_argument("--parallel", type=int, default=4, help="agents at once")
+    parser.add_argument("--slots", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--budget", type=int, default=4)
+    parser.add_argument("--validation", type=int, default=2)
+    parser.add_argument("--heldout", type=int, default=4)
+    options = parser.parse_args()
+    text = SUITE.format(
+        **{**vars(options), "environments": ", ".join(f'"{name}"' for name in options.environments)}
+    ) + "".join(AGENT.format(f"random-{number}") for number in range(options.agents))
+    load = os.getloadavg()[0]
+    walls: dict[str, float] = {}
+    records: dict[str, list[RunRecord]] = {}
+    with tempfile.TemporaryDirectory(prefix="evp-isolation-") as root:
+        for rule in ("off", "related"):
+            walls[rule], records[rule] = sweep(Path(root) / rule, text, rule, options.slots)
+    n = len(records["related"])
+    print(
+        f"{n} runs of {options.agents} agents, {options.parallel} at once, {options.slots} slots, {os.cpu_count()} cores"
+    )
+    print(f"load average before: {load:.1f}")
+    print(
+        f"wall time: {walls['related']:.0f} s with the rule, {walls['off']:.0f} s without: {walls['related'] / walls['off']:.2f}"
+    )
+    print("seconds a run, in the mean:")
+    for phase in PHASES:
+        told = "  ".join(
+            f"{name} {sum(getattr(one.timing, phase) for one in records[rule]) / n:7.2f}"
+            for name, rule in (("rule", "related"), ("off", "off"))
+        )
+        print(f"  {phase:<11}{told}")
+    retries = {
+        rule: sum(int(one.outcome.auxiliary.get("infrastructure_retries", 0)) for one in found)
+        for rule, found in records.items()
+    }
+    print(f"episodes played again: {retries['related']} with the rule, {retries['off']} without")
+
+
+def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[RunRecord]]:
+    """Wall seconds, and what came of the runs."""
+    root.mkdir(parents=True)
+    (root / "suite.toml").write_text(text)
+    started = time.monotonic()
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "evopolicy_gateway.cli", "suite", str(root / "suite.toml"), "--local"),
+            *("--slots", str(slots), "--hidden-isolation", rule, "--runs", str(root / "runs"), "--json"),
+        ],
+        env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+    wall = time.monotonic() - started
+    files = sorted((root / "runs").glob("*/*/*/run.json"))
+    found = [decode_run_record(file.read_bytes()) for file in files]
+    stamp = {"off": "shared", "related": "exclusive"}[rule]
+    assert {one.hidden_isolation for one in found} == {stamp}
+    return wall, found
+
+
+if __name__ == "__main__":
+    main()
