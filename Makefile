@@ -6,7 +6,7 @@
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
 # make bench-report       a report over 1,024 runs
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
-# make faults real processes killed, frozen and starved through whole runs
+# make faults real processes killed, frozen and starved through whole runs; ARGS="--chaos 3600": several at once, at random
 # make sim    the coordinator's core under a simulated network with faults
 VENV := .venv
 BIN := $(VENV)/bin

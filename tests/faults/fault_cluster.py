@@ -53,7 +53,7 @@ Site = Literal["one host", "two hosts", "clock that jumps"]
 """One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable."""
 
 AGENT = '''
-import json, os, pathlib, sys, time, urllib.error, urllib.request
+import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request
 
 POLICY = """
 import random, time
@@ -75,7 +75,7 @@ def submit(ids, key):
         try:
             with urllib.request.urlopen(request) as answer:
                 return json.load(answer)
-        except (OSError, ValueError):
+        except (OSError, ValueError, http.client.HTTPException):
             time.sleep(0.1)
 
 for number in range(%d):

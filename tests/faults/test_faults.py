@@ -90,3 +90,14 @@ def test_nothing_is_left_of_the_clusters(matrices: list[Matrix]) -> None:
         assert matrix.process.stdout is not None
         assert [line for line in matrix.process.stdout if json.loads(line)["wrong"]] == []
         matrix.process.wait()
+
+
+def test_runs_and_sweeps_come_to_the_same_through_several_faults_at_once(tmp_path: Path) -> None:
+    program = [sys.executable, str(Path(__file__).with_name("fault_matrix.py"))]
+    played = subprocess.run(
+        [*program, "--chaos", "15", "--keep", str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
+    )
+    assert played.returncode == 0, played.stdout

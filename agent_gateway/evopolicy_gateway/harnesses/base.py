@@ -12,6 +12,7 @@ import json
 import urllib.request
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Literal
 
@@ -146,6 +147,9 @@ _opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
 def _get_json(url: str) -> dict[str, Any]:
-    with _opener.open(url, timeout=_INFO_TIMEOUT_S) as answer:
-        document = json.load(answer)
+    try:
+        with _opener.open(url, timeout=_INFO_TIMEOUT_S) as answer:
+            document = json.load(answer)
+    except HTTPException as error:  # a gateway that was killed while it answered
+        raise OSError(f"{url} did not answer to the end: {error!r}") from error
     return dict(document)

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,6 +55,21 @@ def test_info_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(base, "_INFO_TIMEOUT_S", SOON_S)
     with mute_server() as url, pytest.raises(OSError, match="timed out"):
         base._get_json(url)
+
+
+def test_info_of_a_gateway_that_is_killed_while_it_answers_did_not_come() -> None:
+    def begin_to_answer(listening: socket.socket) -> None:
+        link, _ = listening.accept()
+        with link:
+            link.recv(1000)
+            link.sendall(b'HTTP/1.1 200 OK\r\ncontent-length: 700\r\n\r\n{"state"')
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=begin_to_answer, args=(listening,))
+        thread.start()
+        with pytest.raises(OSError, match="did not answer to the end"):
+            base._get_json(f"http://127.0.0.1:{listening.getsockname()[1]}")
+        thread.join()
 
 
 def test_a_program_that_has_said_stop_and_stays_is_not_waited_for(
