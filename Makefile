@@ -54,7 +54,7 @@ bench-throughput: install
 
 # How long a report over 1,024 runs takes, and its memory.
 bench-channels: install
-	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channels.py $(ARGS)
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channel_bench.py $(ARGS)
 
 bench-report: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/report_scale.py $(ARGS)
