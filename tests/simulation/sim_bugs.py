@@ -12,7 +12,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from evopolicy_coordinator.core import audit, finalisation, handin, loading, machine, membership, runs
+from evopolicy_coordinator.core import (
+    audit,
+    finalisation,
+    handin,
+    loading,
+    machine,
+    membership,
+    precedence,
+    runs,
+)
+from evopolicy_coordinator.core.isolation import Families, Isolation
 from evopolicy_coordinator.core.jobs import JobGroup
 from evopolicy_coordinator.core.leases import LeaseBook
 from evopolicy_coordinator.core.ledger import Ledger
@@ -171,6 +181,87 @@ BUGS = (
         "set_state",
         "self.quarantined[name] = reason",
         "pass",
+    ),
+    Bug(
+        "play hidden episodes beside an agent",
+        Isolation,
+        "hidden_bar",
+        "if self._permits(kernel, family):",
+        "if False:",
+    ),
+    Bug(
+        "play hidden episodes beside train episodes",
+        Isolation,
+        "hidden_bar",
+        "if related(kernel.train, family) or related(self.everywhere.train, family):",
+        "if False:",
+    ),
+    Bug(
+        "play train episodes beside hidden ones",
+        Isolation,
+        "train_bar",
+        "if related(kernel.hidden, family) or related(self.everywhere.hidden, family):",
+        "if False:",
+    ),
+    Bug(
+        "play hidden episodes on a kernel that is not known",
+        Isolation,
+        "hidden_bar",
+        "if kernel is self.everywhere:",
+        "if False:",
+    ),
+    Bug(
+        "take an agent that may be anywhere for one that is nowhere",
+        Isolation,
+        "_permits",
+        "or related(self.everywhere.permits, family)",
+        "",
+    ),
+    Bug(
+        "let an agent start before hidden episodes have stopped",
+        Isolation,
+        "permit_bar",
+        "if not stays:",
+        "if not any(stay.lease is not None and stay.lease.live for stay in stays):",
+    ),
+    Bug("take siblings for strangers", Families, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
+    Bug("forget permits at a restart", Isolation, "load", "row.ended_at is not None", "True"),
+    Bug("forget what a silent worker may play", Isolation, "left", "if sure:", "if True:"),
+    Bug(
+        "take a lease on its way for one that was let go of",
+        Isolation,
+        "surely",
+        "stay is None or settled == 0",
+        "True",
+    ),
+    Bug(
+        "take all kernels for free after a restart",
+        Isolation,
+        "load",
+        "for hidden in (True, False):",
+        "for hidden in ():",
+    ),
+    Bug("keep a closed run's permit", finalisation, "close", "core.isolation.end(", "(lambda *_: None)("),
+    Bug(
+        "never turn a kernel over to hidden episodes",
+        precedence,
+        "_hidden",
+        "kept_s >= core.settings.hidden_wait_s",
+        "False",
+    ),
+    Bug(
+        "never turn a kernel back",
+        precedence,
+        "_hidden",
+        "lane.done_looks[family] >= DONE_LOOKS",
+        "False",
+    ),
+    Bug(
+        "hold the submits of an agent that hidden episodes wait for",
+        Isolation,
+        "_reversed",
+        "and not self._permits(kernel, family)",
+        "",
     ),
     Bug("draw episodes anew at a restart", audit, "sample", "run.row.audit_share", "0.5"),
 )

@@ -12,11 +12,12 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_common.refusals import NOT_NOW
+from evopolicy_common.refusals import NOT_NOW, RUN_OVER
 from evopolicy_coordinator.core import events
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
+    from sim_truth import Machine
 
 
 class SimOperator(Asker):
@@ -26,6 +27,7 @@ class SimOperator(Asker):
         super().__init__(simulation, f"operator-{plan.name}")
         self.plan = plan
         self.result: operator.RunFinished | None = None
+        self.started = False
         self.later(start_s, self._create)
         if plan.cancel_at is not None:
             self.later(start_s + plan.cancel_at, self._cancel)
@@ -59,7 +61,9 @@ class SimOperator(Asker):
 
     def _created(self, message: Any) -> None:
         assert isinstance(message, operator.RunCreated), message
-        self.simulation.gateways.append(SimGateway(self.simulation, self.plan))
+        if not self.started:
+            self.started = True
+            self.simulation.gateways.append(SimGateway(self.simulation, self.plan))
         self._wait()
 
     def _wait(self) -> None:
@@ -73,7 +77,12 @@ class SimOperator(Asker):
             self._wait()
 
     def _cancel(self) -> None:
-        self.ask(events.RunCancelled, {"run": self.plan.name}, lambda message: None)
+        def cancelled(message: Any) -> None:
+            # The command that cancels ends the agent too, within what it is given for that.
+            agents = self.simulation.truth
+            self.world.after(self.world.chance.random() * 20.0, agents.agent_ends, self.plan)
+
+        self.ask(events.RunCancelled, {"run": self.plan.name}, cancelled)
 
 
 class SimGateway(Asker):
@@ -85,7 +94,33 @@ class SimGateway(Asker):
         self.position = 0
         """Submits of the plan that are over; durable."""
         self.closed = False
+        self.machine, self.tells_kernel = simulation.machine_of(plan)
+        self.asks_permit = simulation.asks_permit(plan)
+        self.boot_id = self.machine.boot_id
         self._open()
+
+    def machine_starts_anew(self) -> None:
+        """It and its agent are gone, and come back on another kernel."""
+        self.simulation.truth.agent_ends(self.plan, self.boot_id)
+        self.crash()
+
+    def moves(self, machine: Machine) -> None:
+        """Its machine is given up: an operator sees to it that the agent is not alive, says so, and goes on elsewhere."""
+        self.world.note(f"{self.name} is lost on {self.machine.name}")
+        self.life += 1
+        life = self.life
+
+        def resumed(message: Any) -> None:
+            if life == self.life and not self.closed:
+                self.machine = machine
+                self._open()
+
+        def vouch() -> None:
+            self.simulation.truth.agent_ends(self.plan)
+            voucher = self.simulation.operators[0]
+            voucher.ask(events.AgentGone, {"run": self.plan.name}, resumed)
+
+        self.world.after(20.0 + self.world.chance.random() * 60.0, vouch)
 
     def crash(self) -> None:
         self.world.note(f"{self.name} dies")
@@ -99,19 +134,50 @@ class SimGateway(Asker):
         self.world.after(self.world.chance.random() * 5.0, back)
 
     def _open(self) -> None:
-        self.ask(events.RunOpened, {"run": self.plan.name}, self._opened)
+        self.boot_id = self.machine.boot_id
+        fields = {"run": self.plan.name, "asks_permit": self.asks_permit}
+        self.ask(events.RunOpened, fields, self._opened)
 
     def _opened(self, message: Any) -> None:
         if isinstance(message, wire.Refused):
             if message.status in NOT_NOW:
                 self.later(1.0, self._open)
                 return
-            self.closed = True  # finished, or cancelled
+            self._over()  # finished, or cancelled
             return
-        self._next()
+        self.simulation.truth.asked_at.setdefault(self.plan.name, self.world.now)
+        self._ask_permit()
+
+    def _over(self) -> None:
+        self.simulation.truth.agent_ends(self.plan)
+        self.ask(events.RunClosed, {"run": self.plan.name, "reason": "cancelled"}, self._run_closed)
+
+    def _ask_permit(self) -> None:
+        if not self.asks_permit:
+            self._permitted(gateway.Permit(granted=True))
+            return
+        told = self.tells_kernel
+        fields = {
+            "run": self.plan.name,
+            "boot_id": self.boot_id if told else "",
+            "machine_id": self.machine.name if told else "",
+            "wait_s": 5.0,
+        }
+        self.ask(events.PermitRequested, fields, self._permitted, 5.0)
+
+    def _permitted(self, message: Any) -> None:
+        if isinstance(message, wire.Refused):
+            self._over()
+        elif not message.granted:
+            self._ask_permit()
+        else:
+            if self.position < len(self.plan.submits):
+                self.simulation.truth.agent_starts(self.plan, self.boot_id)
+            self._next()
 
     def _next(self) -> None:
         if self.position == len(self.plan.submits):
+            self.simulation.truth.agent_ends(self.plan)
             self.ask(events.RunClosed, {"run": self.plan.name, "reason": "done"}, self._run_closed)
             return
         submit = self.plan.submits[self.position]
@@ -136,6 +202,7 @@ class SimGateway(Asker):
 
     def _run_closed(self, message: Any) -> None:
         self.closed = True
+        self.simulation.truth.closed(self.plan)
         if self.world.chance.random() < 0.3:
             late = {**self._fields(0), "key": "too-late"}
             self.ask(events.SubmitRequested, late, self.simulation.checkers.refused)
@@ -143,6 +210,9 @@ class SimGateway(Asker):
     def _submitted(self, message: Any) -> None:
         if isinstance(message, wire.Refused) and message.status in NOT_NOW:
             self.later(1.0, self._next)
+            return
+        if isinstance(message, wire.Refused) and message.status in RUN_OVER:
+            self._over()
             return
         if isinstance(message, wire.Refused):
             self.simulation.checkers.submit_refused(self.plan, self.position, message)
@@ -173,4 +243,5 @@ class SimGateway(Asker):
 
     def _after_submit(self) -> None:
         self.position += 1
-        self.later(self.world.chance.random(), self._next)
+        thinks_s = self.simulation.thinks_s
+        self.later(thinks_s + self.world.chance.random(), self._next)

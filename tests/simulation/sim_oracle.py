@@ -45,6 +45,15 @@ class PlannedRun:
     submits: tuple[PlannedSubmit, ...]
     cancel_at: float | None = None
     """When an operator cancels it, seconds after the start; None for never."""
+    kin: str = ""
+    """Runs of one kin have the same hidden cases; its own where it has none."""
+
+    def related(self, other: PlannedRun) -> bool:
+        """Whether they share a hidden case."""
+        if self.env != other.env:
+            return False
+        splits = ("validation", "heldout")
+        return any(not set(self.cases(split)).isdisjoint(other.cases(split)) for split in splits)
 
     @property
     def secret(self) -> bytes:
@@ -53,6 +62,8 @@ class PlannedRun:
     def cases(self, split: str) -> list[int]:
         """The seeds of a split's cases."""
         salt = zlib.crc32(self.name.encode()) % 50
+        if split != "train" and self.kin:
+            salt = zlib.crc32(self.kin.encode()) % 50
         if split == "train":
             return [salt + index for index in range(64)]
         if split == "validation":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sim_checkers import Checkers, ViolationError
 from sim_clients import SimGateway, SimOperator
@@ -12,6 +12,7 @@ from sim_coordinator import SimCoordinator
 from sim_faults import HARMLESS, Faults, draw
 from sim_oracle import PlannedRun, PlannedSubmit, kills
 from sim_store import Disk
+from sim_truth import Machine, Truth
 from sim_worker import SimWorker
 from sim_world import World
 
@@ -22,6 +23,9 @@ from evopolicy_coordinator.core.settings import CoreSettings
 HORIZON_S = 1500.0
 """Simulated seconds after which what is not finished never will be."""
 AUDIT_WAIT_S = 60.0
+HIDDEN_WAIT_S = 20.0
+PERMIT_S = 400.0
+"""Without faults no agent waits longer for its permit."""
 ENVS = ("toy/line", "toy/maze")
 KINDS = ("good", "good", "good", "good", "raises", "none", "late", "kills", "twice", "hides", "holds")
 
@@ -45,6 +49,10 @@ class Simulation:
     ) -> None:
         chance = random.Random(seed * 7919 + 1)
         faults = draw(chance) if faults is None else faults
+        self.crowd = seed % 16 == 3
+        """Six siblings on one machine with one slot, each beside the next; without faults in every other such seed."""
+        if seed % 32 == 3:
+            faults = Faults()
         self.faults = faults
         self.harmless = faults == Faults() or all(
             getattr(faults, name) == getattr(Faults(), name)
@@ -56,6 +64,29 @@ class Simulation:
             self.world.trace = []
         self.disk = Disk()
         self.plans = [_plan(f"r{index}", size, chance) for index in range(chance.randint(1, size.runs))]
+        self.places = random.Random(seed * 6007 + 3)
+        """Who is on which machine, and what becomes of machines."""
+        self.near = seed % 2 == 1
+        """Agents are on the workers' machines, and runs have siblings; else each is on a machine of its own."""
+        if self.crowd:
+            env = ENVS[0]
+            self.plans = [
+                replace(_plan(f"r{index}", size, chance), env=env, cancel_at=None) for index in range(6)
+            ]
+        if self.near and (self.crowd or self.places.random() < 0.7):
+            self.plans = [replace(plan, kin=f"kin-{seed}") for plan in self.plans]
+        self.thinks_s = 12.0 if self.crowd else 0.0
+        """How long agents are alive between submits, at least."""
+        self.truth = Truth(self)
+        self.orderly = self.crowd and faults == Faults()
+        """Whether nothing but the rules decides who waits for how long."""
+        self.machines = [
+            Machine(f"m{index}") for index in range(1 if self.crowd else self.places.randint(1, 3))
+        ]
+        self._of_run: dict[str, tuple[Machine, bool]] = {}
+        self._older = {
+            plan.name for plan in self.plans if self.near and not self.crowd and self.places.random() < 0.12
+        }
         if any("twice" in submit.bundle or kills_any(plan) for plan in self.plans for submit in plan.submits):
             self.harmless = False
         self._horizon_s = HORIZON_S * max(1.0, size.episodes / Size.episodes)
@@ -71,16 +102,60 @@ class Simulation:
         """How all workers are away when the runs are opened."""
         self.slanderer = "w1" if seed % 8 == 4 else None
         """The worker that lies about what it plays again; players are honest, so all runs come to what they must."""
-        settings = CoreSettings(audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S)
+        settings = CoreSettings(
+            audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=HIDDEN_WAIT_S
+        )
         self.coordinator = SimCoordinator(self.world, self.disk, self.checkers, settings)
-        for index in range(chance.randint(1, size.workers)):
+        for index in range(1 if self.crowd else chance.randint(1, size.workers)):
             envs = ENVS if index == 0 or chance.random() < 0.6 else ENVS[:1]
             version = "1" if index == 0 or chance.random() < 0.8 else "2"
             name = f"w{index}"
-            self.workers[name] = SimWorker(self, name, chance.randint(1, 3), envs, version)
+            slots = chance.randint(1, 3)
+            machine = self.places.choice(self.machines) if self.near else Machine(f"m-of-{name}")
+            # The first tells, so that somewhere there is a kernel for hidden episodes.
+            tells = not self.near or index == 0 or version != "1" or self.places.random() < 0.8
+            self.workers[name] = SimWorker(
+                self, name, 1 if self.crowd else slots, envs, version, machine, tells_kernel=tells
+            )
         opened_s = 30.0 if self.absent else 0.0
-        self.operators = [SimOperator(self, plan, opened_s + chance.random() * 3.0) for plan in self.plans]
+        self.operators = [
+            SimOperator(self, plan, opened_s + chance.random() * 3.0 + (20.0 * index if self.crowd else 0.0))
+            for index, plan in enumerate(self.plans)
+        ]
         self._plan_faults()
+
+    # ---- where ----
+
+    def machine_of(self, plan: PlannedRun) -> tuple[Machine, bool]:
+        """The machine of a run's gateway and agent, and whether it is told."""
+        if plan.name not in self._of_run:
+            apart = not self.near or (not self.crowd and self.places.random() < 0.25)
+            machine = Machine(f"m-of-{plan.name}") if apart else self.places.choice(self.machines)
+            told = not self.near or self.crowd or self.places.random() < 0.85
+            self._of_run[plan.name] = machine, told
+        return self._of_run[plan.name]
+
+    def asks_permit(self, plan: PlannedRun) -> bool:
+        """Whether its gateway is of a version that asks for permits."""
+        return plan.name not in self._older
+
+    def _reboot(self) -> None:
+        """A machine starts anew: its workers, gateways and agents end."""
+        machine = self.places.choice(self.machines)
+        self.world.note(f"{machine.name} starts anew")
+        machine.boots += 1
+        for worker in self.workers.values():
+            if worker.machine is machine:
+                worker.crash()
+        for each in self.gateways:
+            if each.machine is machine:
+                each.machine_starts_anew()
+
+    def _move(self) -> None:
+        """A gateway's machine is lost for good."""
+        movable = [each for each in self.gateways if each.asks_permit and not each.closed]
+        if movable:
+            self.places.choice(movable).moves(Machine(f"another-{len(self.machines)}"))
 
     # ---- how long, and how ----
 
@@ -119,7 +194,11 @@ class Simulation:
             world.after(at, lambda: self.coordinator.stall(chance.random() * 40.0))
         for at in times(faults.liveness_flap):
             world.after(at, self._flap)
-        if not self.harmless and chance.random() < 0.3:
+        if self.near and not self.harmless and not self.orderly:
+            for fault, rate in ((self._reboot, 0.3), (self._move, 0.3)):
+                if self.places.random() < rate:
+                    world.after(self.places.random() * faults.until_s, fault)
+        if not self.harmless and not self.orderly and chance.random() < 0.3:
             world.after(chance.random() * faults.until_s, self._drain)
         for worker in self.workers.values():
             if self.absent == "frozen":
@@ -172,6 +251,12 @@ class Simulation:
         self.world.calm_at = self.world.now
         self.world.run(self.world.now + 20.0, lambda: False)
         self.checkers.ended(self.coordinator.core)
+        if (
+            self.faults == Faults()
+            and not self.truth.agents
+            and max(self.truth.waited_s, default=0.0) > PERMIT_S
+        ):
+            raise ViolationError(f"an agent waits {max(self.truth.waited_s):.0f} s for its permit")
 
     def _all_done(self) -> bool:
         return len(self.checkers.finished_runs) == len(self.plans) and all(

@@ -19,9 +19,12 @@ from evopolicy_coordinator.core import events
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
+    from sim_truth import Machine
 
 POLL_S = 5.0
 BEAT_S = 2.0
+SILENCE_S = 15.0
+"""What is to be stopped in silence is, when no beat was answered for so long."""
 FROZEN_LIMIT_S = 18.0
 """An episode during which the worker stood still for so long ends with a false verdict about a time limit."""
 
@@ -91,10 +94,23 @@ class SimWorker(Asker):
     """One supervisor with its slots."""
 
     def __init__(
-        self, simulation: Simulation, name: str, slots: int, envs: tuple[str, ...], version: str
+        self,
+        simulation: Simulation,
+        name: str,
+        slots: int,
+        envs: tuple[str, ...],
+        version: str,
+        machine: Machine,
+        *,
+        tells_kernel: bool,
     ) -> None:
         super().__init__(simulation, name)
         self.slots, self.envs, self.version = slots, envs, version
+        self.machine = machine
+        self.tells_kernel = tells_kernel
+        self.boot_id = machine.boot_id
+        """Of the kernel that this process runs on."""
+        self.serial = 0
         faults = self.world.faults
         self._reset()
         self.beat_wait_s = self.world.chance.choice((0.0, 1.5))
@@ -108,11 +124,22 @@ class SimWorker(Asker):
         self.outbox: list[wire.JobResult] = []
         self.stopped: set[str] = set()
         self.polling = self.handing = False
+        self.outstanding: set[int] = set()
+        """Numbers of polls that are not answered yet."""
+        self.answered_at = self.world.now
+        self.boot_id = self.machine.boot_id
+        self.simulation.truth.worker_dies(self.name)
+
+    @property
+    def settled(self) -> int:
+        """Number of the last poll that is over, as all before it are."""
+        return min(self.outstanding) - 1 if self.outstanding else self.serial
 
     def crash(self) -> None:
         self.world.note(f"{self.name} dies holding {list(self.running)}")
         self.life += 1
         life = self.life
+        self.simulation.truth.worker_dies(self.name)
 
         def back() -> None:
             if life == self.life:
@@ -142,7 +169,8 @@ class SimWorker(Asker):
             "tiers": ("bwrap",),
             "environments": descriptions,
             "fingerprint": print_of,
-            "boot_id": f"kernel-of-{self.name}",
+            "boot_id": self.boot_id if self.tells_kernel else "",
+            "machine_id": self.machine.name if self.tells_kernel else "",
         }
 
         def registered(message: Any) -> None:
@@ -152,6 +180,7 @@ class SimWorker(Asker):
             self.session = message.session
             if first:
                 self._beat()
+                self._look_at_silence()
             self._poll()
             self._hand_in()
 
@@ -182,13 +211,14 @@ class SimWorker(Asker):
             wire.HeldLease(lease_id=each.lease_id, job_id=each.job_id, attempt=each.attempt, running=False)
             for each in self.outbox
         ]
-        life = self.life
+        life, sent_at = self.life, self.world.now
 
         def answered(message: Any) -> None:
             if life == self.life and isinstance(message, wire.HeartbeatReply):
                 if self.world.now < self.frozen_until:
                     self.world.after(self.frozen_until - self.world.now, answered, message)
                     return
+                self.answered_at = max(self.answered_at, sent_at)
                 for lease_id in message.cancelled:
                     self._stop(lease_id)
 
@@ -196,6 +226,7 @@ class SimWorker(Asker):
             "worker": self.name,
             "session": self.session,
             "held": tuple(held),
+            "settled": self.settled,
             "wait_s": self.beat_wait_s,
         }
         self.world.send(
@@ -207,8 +238,16 @@ class SimWorker(Asker):
             answered,
         )
 
+    def _look_at_silence(self) -> None:
+        self.later(0.5, self._look_at_silence)
+        if self.world.now - self.answered_at > SILENCE_S:
+            for lease in (*self.queue.values(), *self.running.values()):
+                if lease.stop_in_silence:
+                    self._stop(lease.lease_id)
+
     def _stop(self, lease_id: str) -> None:
         lease = self.queue.pop(lease_id, None) or self.running.pop(lease_id, None)
+        self.simulation.truth.play_ends(self.name, lease_id)
         if lease is not None:
             self._put(lease, "returned")
             self._start()
@@ -218,10 +257,20 @@ class SimWorker(Asker):
         if self.polling or wanted <= 0 or not self.session:
             return
         self.polling = True
-        fields = {"worker": self.name, "session": self.session, "n": wanted, "wait_s": POLL_S}
+        self.serial += 1
+        serial = self.serial
+        self.outstanding.add(serial)
+        fields = {
+            "worker": self.name,
+            "session": self.session,
+            "n": wanted,
+            "wait_s": POLL_S,
+            "serial": serial,
+        }
 
         def answered(message: Any) -> None:
             self.polling = False
+            self.outstanding.discard(serial)
             if self._lost_session(message):
                 return
             for lease_id in message.cancelled:
@@ -272,11 +321,13 @@ class SimWorker(Asker):
             self.running[lease.lease_id] = lease
             seconds = sum(self.simulation.seconds_of(lease.job, spec) for spec in lease.job.episodes)
             self.simulation.checkers.playing(self.name, lease)
+            self.simulation.truth.play_starts(self.name, lease, self.boot_id)
             self.later(seconds * self.slowness, self._played, lease, self.world.now)
 
     def _played(self, lease: wire.Lease, started: float) -> None:
         if self.running.pop(lease.lease_id, None) is None:
             return
+        self.simulation.truth.play_ends(self.name, lease.lease_id)
         job, chance = lease.job, self.world.chance
         stormy = self.world.now < self.world.calm_at
         frozen_s = (

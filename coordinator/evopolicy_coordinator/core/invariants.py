@@ -45,9 +45,10 @@ def _isolation(core: Core) -> None:
             if stay.lease is None or not stay.lease.live:
                 continue
             others = (kernel, isolation.everywhere)
-            apart = not any(
-                related(each.permits, stay.family) or related(each.train, stay.family) for each in others
-            )
+            beside = [each for there in others for each in all_related(there.train, stay.family)]
+            # What a worker may have played besides, before it was heard, it has told when its lease was adopted.
+            train = any(each.lease is not None or each.worker != stay.worker for each in beside)
+            apart = not train and not any(related(there.permits, stay.family) for there in others)
             want(core, stay.id, apart, "a hidden job is apart from related agents and train jobs")
             want(core, stay.id, kernel is not isolation.everywhere, "a hidden job's kernel is known")
     for worker in core.fleet.workers.values():

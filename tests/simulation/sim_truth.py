@@ -1,0 +1,130 @@
+"""What is truly on which kernel: machines that start anew, agents that are alive, episodes that are being played.
+
+The coordinator is told of it by messages that are lost, late or false by omission; what it believes is not asked here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sim_oracle import PlannedRun
+
+from evopolicy_common.messages import worker as wire
+
+if TYPE_CHECKING:
+    from sim_scenario import Simulation
+
+
+LONGEST_S = 30.0
+"""A closed run may be kept waiting for so long by agents that start after its closing: `HIDDEN_WAIT_S`, and some."""
+
+
+@dataclass(eq=False)
+class Machine:
+    """A machine, with as many kernels one after another as it was started times."""
+
+    name: str
+    boots: int = 1
+
+    @property
+    def boot_id(self) -> str:
+        return f"{self.name}-boot-{self.boots}"
+
+
+class SharedKernelError(AssertionError):
+    """A hidden episode was played where it must not be."""
+
+
+class Truth:
+    """Agents and episodes by kernel."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.agents: dict[tuple[str, str], PlannedRun] = {}
+        """Those that are alive, by run and boot id."""
+        self.plays: dict[tuple[str, str], tuple[str, PlannedRun, str]] = {}
+        """By worker and lease: boot id, run, and whether it is `hidden` or `train`."""
+        self.kept_since: dict[str, float] = {}
+        """Closed runs that are not finished to since when related agents were alive without a break."""
+        self.asked_at: dict[str, float] = {}
+        """When a run's gateway first asked for its permit."""
+        self.waited_s: list[float] = []
+        """How long agents waited for permits."""
+
+    # ---- agents ----
+
+    def agent_starts(self, plan: PlannedRun, boot_id: str) -> None:
+        if (plan.name, boot_id) in self.agents:
+            return
+        world = self._simulation.world
+        world.note(f"the agent of {plan.name} starts on {boot_id}")
+        self._not_after_others(plan)
+        self.agents[plan.name, boot_id] = plan
+        self._look()
+        self.waited_s.append(world.now - self.asked_at.pop(plan.name, world.now))
+        for (worker, lease), (where, run, kind) in self.plays.items():
+            if where == boot_id and kind == "hidden" and plan.related(run):
+                raise SharedKernelError(
+                    f"the agent of {plan.name} starts on {boot_id} while {worker} plays {lease}"
+                )
+
+    def agent_ends(self, plan: PlannedRun, boot_id: str | None = None) -> None:
+        for key in [key for key in self.agents if key[0] == plan.name and boot_id in (None, key[1])]:
+            self._simulation.world.note(f"the agent of {plan.name} on {key[1]} ends")
+            del self.agents[key]
+        self._look()
+
+    def closed(self, plan: PlannedRun) -> None:
+        """A run's closing was answered."""
+        self.kept_since.setdefault(plan.name, self._simulation.world.now)
+        self._look()
+
+    def _look(self) -> None:
+        finished = self._simulation.checkers.finished_runs
+        for plan in self._simulation.plans:
+            if plan.name not in self.kept_since:
+                continue
+            if plan.name in finished:
+                del self.kept_since[plan.name]
+            elif not any(agent.related(plan) for agent in self.agents.values()):
+                self.kept_since[plan.name] = self._simulation.world.now
+
+    def _not_after_others(self, plan: PlannedRun) -> None:
+        """Where all are on one machine no agent starts when hidden cases have waited for long."""
+        self._look()
+        for name, since in self.kept_since.items() if self._simulation.orderly else ():
+            waited_s = self._simulation.world.now - since
+            if waited_s > LONGEST_S:
+                raise SharedKernelError(
+                    f"the agent of {plan.name} starts; {name} has waited for {waited_s:.0f} s"
+                )
+
+    # ---- episodes ----
+
+    def play_starts(self, worker: str, lease: wire.Lease, boot_id: str) -> None:
+        name, _, rest = lease.job.job_id.partition("/")
+        plan = next((each for each in self._simulation.plans if each.name == name), None)
+        hidden = "/validation/" in f"/{rest}" or "/heldout/" in f"/{rest}"
+        train = "/train/" in f"/{rest}" and "/audit-" not in rest
+        if plan is None or not (hidden or train):
+            return
+        kind = "hidden" if hidden else "train"
+        self.plays[worker, lease.lease_id] = boot_id, plan, kind
+        for (other, at), agent in self.agents.items():
+            if hidden and at == boot_id and agent.related(plan):
+                raise SharedKernelError(
+                    f"{worker} plays {lease.lease_id} on {boot_id}, where the agent of {other} is alive"
+                )
+        for (beside, each), (where, run, other_kind) in self.plays.items():
+            if where == boot_id and other_kind != kind and run.related(plan):
+                raise SharedKernelError(
+                    f"{worker} plays {lease.lease_id} while {beside} plays {each} on {boot_id}"
+                )
+
+    def play_ends(self, worker: str, lease_id: str) -> None:
+        self.plays.pop((worker, lease_id), None)
+
+    def worker_dies(self, worker: str) -> None:
+        for key in [key for key in self.plays if key[0] == worker]:
+            del self.plays[key]
