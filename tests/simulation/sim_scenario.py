@@ -16,6 +16,7 @@ from sim_truth import Machine, Truth
 from sim_worker import SimWorker
 from sim_world import World
 
+from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.settings import CoreSettings
@@ -229,6 +230,8 @@ class Simulation:
         operator = self.operators[0]
 
         def drained(message: object) -> None:
+            if isinstance(message, wire.Refused):
+                return  # it is quarantined, and stays so
             self.checkers.drained_at[name] = self.world.now
             operator.later(for_s, back)
 

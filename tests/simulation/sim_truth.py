@@ -82,12 +82,14 @@ class Truth:
 
     def _look(self) -> None:
         finished = self._simulation.checkers.finished_runs
+        core = self._simulation.coordinator.core
+        hidden = {group.run for group in core.groups.values() if group.hidden} if core is not None else set()
         for plan in self._simulation.plans:
             if plan.name not in self.kept_since:
                 continue
             if plan.name in finished:
                 del self.kept_since[plan.name]
-            elif not any(agent.related(plan) for agent in self.agents.values()):
+            elif plan.name not in hidden or not any(agent.related(plan) for agent in self.agents.values()):
                 self.kept_since[plan.name] = self._simulation.world.now
 
     def _not_after_others(self, plan: PlannedRun) -> None:

@@ -142,6 +142,11 @@ class Stay:
     until: float | None = None
     """When it has surely ended, once its lease was given up."""
 
+    @property
+    def key(self) -> str:
+        """One lease may be in the hands of several workers, when it was given up."""
+        return f"{self.worker} {self.id}"
+
 
 Stays = dict[Family | None, dict[str, Stay]]
 
@@ -354,8 +359,11 @@ class Isolation:
 
     # ---- stays ----
 
-    def leased(self, lease: Lease, worker: Worker, serial: int) -> None:
-        """A worker was given a lease."""
+    def leased(self, lease: Lease, worker: Worker, serial: int, turn: Turn) -> None:
+        """A worker was given a lease, or goes on with one."""
+        before = self.lingering.get(worker.name, {}).get(lease.id)
+        if before is not None:
+            self._forget(before, turn)
         group = lease.job.group
         if not (group.hidden or group.kind == "train"):
             return
@@ -378,7 +386,7 @@ class Isolation:
             family.users += 1
             if stay.hidden:
                 family.hidden_on[stay.kernel] = family.hidden_on.get(stay.kernel, 0) + 1
-        _put(stay.kernel.hidden if stay.hidden else stay.kernel.train, stay.family, stay.id, stay)
+        _put(stay.kernel.hidden if stay.hidden else stay.kernel.train, stay.family, stay.key, stay)
 
     def left(self, lease: Lease, worker: Worker, turn: Turn, *, sure: bool) -> None:
         """A lease is a worker's no more: surely, or by our word alone."""
@@ -397,7 +405,7 @@ class Isolation:
         """A stay has ended: what it barred may go on."""
         index = stay.kernel.hidden if stay.hidden else stay.kernel.train
         family = stay.family
-        _take(index, family, stay.id)
+        _take(index, family, stay.key)
         if stay.hidden and family is not None:
             left = family.hidden_on[stay.kernel] - 1
             if left:

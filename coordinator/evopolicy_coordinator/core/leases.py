@@ -131,7 +131,7 @@ class LeaseBook:
         group.n_leased += 1
         group.flow.n_leased += 1
         self.n_live += 1
-        self._core.isolation.leased(lease, worker, serial)
+        self._core.isolation.leased(lease, worker, serial, turn)
         precedence.let_go(self._core, group, now)
         self.list_hidden(lease, worker, turn)
         if group.first_leased_at is None:
