@@ -18,7 +18,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GoldenCluster]:
-    cluster = GoldenCluster(tmp_path_factory.mktemp("golden"))
+    # Hidden episodes are played while the agent's side is open, as they would be on machines without agents.
+    cluster = GoldenCluster(tmp_path_factory.mktemp("golden"), "--hidden-isolation", "off")
     try:
         yield cluster
     finally:
