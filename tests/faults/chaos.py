@@ -22,9 +22,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 from fault_cluster import EPISODES, HIDDEN, SUBMITS, FaultCluster, command_line, fault_cluster, record
 
+from evopolicy_common import scratch
 from evopolicy_common.run_difference import differences
 from evopolicy_gateway import processes
 
@@ -159,12 +161,13 @@ def chaos(seconds: float, seed: int, root: Path, tell: Tell) -> bool:
         while (strays := cluster.strays()) and time.monotonic() < end:
             time.sleep(0.1)
         wrong += [f"left over: {stray}" for stray in strays]
-        # What killed owners have left goes when anything of its kind is started: so they are, once more.
-        for worker in cluster.workers:
-            worker.process.kill()
-        time.sleep(CALM_S)
         temporary = cluster.temporary
         wrong += _tracebacks(root, root)
+    # What killed owners have left goes when anything of its kind is started.
+    with patch.object(tempfile, "tempdir", str(temporary)):
+        for folder in temporary.glob("evopolicy-*"):
+            os.utime(folder, (0, 0))
+            scratch.clear_stale(folder.name.split("-")[1])
     left = processes.descendants(os.getpid())
     wrong += [f"left over: {pid} {command_line(pid)[:120]}" for pid in left]
     wrong += [

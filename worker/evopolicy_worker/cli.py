@@ -108,6 +108,8 @@ def work(
             raise ConfigError(
                 f"{', '.join(missing)}: not installed here; install the worker's extra: pip install 'evopolicy[worker]'"
             )
+        # Until the worker can drain, SIGTERM ends it as an exception does: what it has begun is cleared away.
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         found = credentials.find("worker", tuple(connect or ()), credentials_file)
         check_scratch()
         tiers = available_tiers(unsandboxed=unsandboxed)
