@@ -20,7 +20,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common import credentials, host
+from evopolicy_common import child_process, credentials, host
 from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
@@ -208,9 +208,12 @@ class RunPlay:
 
     async def _play(self) -> RunRecord:
         plan = self._plan
-        plan.check_held()
+        # Checking starts programs to try the jail, which a search for another run's orphans would take for strays.
+        async with child_process.starting():
+            plan.check_held()
         await self._operations.drop(self._folder)
-        plan.claim()
+        async with child_process.starting():
+            plan.claim()
         self._folder.state.mkdir(mode=0o700)
         key = uuid.uuid4().hex
         save(self._folder.intended, IntendedRun(key=key, settings=plan.settings))

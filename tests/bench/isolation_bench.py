@@ -78,15 +78,17 @@ def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[Run
     root.mkdir(parents=True)
     (root / "suite.toml").write_text(text)
     started = time.monotonic()
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "evopolicy_gateway.cli", "suite", str(root / "suite.toml"), "--local"),
-            *("--slots", str(slots), "--hidden-isolation", rule, "--runs", str(root / "runs"), "--json"),
-        ],
-        env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
-        stdout=subprocess.DEVNULL,
-        check=True,
-    )
+    words = ["suite", str(root / "suite.toml"), "--local", "--slots", str(slots), "--hidden-isolation", rule]
+    with (root / "events.jsonl").open("wb") as events:
+        code = subprocess.run(
+            [sys.executable, "-m", "evopolicy_gateway.cli", *words, "--runs", str(root / "runs"), "--json"],
+            env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
+            stdout=events,
+            check=False,
+        ).returncode
+    if code:
+        told = [line for line in (root / "events.jsonl").read_text().splitlines() if '"error":"' in line]
+        raise SystemExit(f"the sweep ended with exit code {code}: " + "\n".join(told[:5]))
     wall = time.monotonic() - started
     files = sorted((root / "runs").glob("*/*/*/run.json"))
     found = [decode_run_record(file.read_bytes()) for file in files]
