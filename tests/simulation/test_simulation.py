@@ -9,7 +9,7 @@ from sim_scenario import Simulation
 from simulate import play, replay_command
 
 SEEDS = 1000
-SEEDS_PER_BUG = 400
+SEEDS_PER_BUG = 500
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, 100))
