@@ -62,8 +62,9 @@ def test_a_process_that_is_no_subreaper_ends_nobodys_children() -> None:
 
 BREEDER = """
 import os, sys, time
-# Starts a process at every moment, and tells if one of them was touched.
-while not os.path.exists(sys.argv[1]):
+# Starts a process at every moment, and tells if one of them was touched. It ends with its parent, too.
+parent = os.getppid()
+while not os.path.exists(sys.argv[1]) and os.getppid() == parent:
     pid = os.fork()
     if pid == 0:
         time.sleep(0.002)
