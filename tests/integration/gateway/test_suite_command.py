@@ -32,6 +32,7 @@ environments = ["toy/line"]
 budget = 4
 validation = 2
 heldout = 2
+hidden_cases = "{hidden}"
 [parallel]
 machine = 3
 claim_ttl_s = 3.0
@@ -59,10 +60,10 @@ read = ["{fakes}"]
 """
 
 
-def write_suite(folder: Path, codex: str = "work", claude: str = "work") -> None:
+def write_suite(folder: Path, codex: str = "work", claude: str = "work", hidden: str = "shared") -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "t.toml").write_text(
-        SUITE.format(python=sys.executable, fakes=FAKES, codex=codex, claude=claude)
+        SUITE.format(python=sys.executable, fakes=FAKES, codex=codex, claude=claude, hidden=hidden)
     )
 
 
@@ -77,7 +78,8 @@ def index_in(root: Path) -> dict[str, Any]:
 
 def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
     # The second turn of either fake never ends, until the third start, which works.
-    write_suite(tmp_path, codex="work,endless,work", claude="work,endless,work")
+    # One run is scored while the agents of the others are at work on the same machine, so they share no hidden case.
+    write_suite(tmp_path, codex="work,endless,work", claude="work,endless,work", hidden="per-run")
     root = tmp_path / "runs" / "t"
     played = [root / "fake codex/toy_line/t-0", root / "fake claude/toy_line/t-0"]
     with sweep(tmp_path, "--local") as first:
