@@ -476,7 +476,7 @@ class Policy:
     def act(self, obs):
         self.n += 1
         if self.n == 4:
-            time.sleep(0.3)
+            time.sleep(PAUSE)
             OTHERS
             end = time.thread_time() + MINE
             while time.thread_time() < end:
@@ -489,11 +489,11 @@ def test_no_wall_limit_counts_the_time_for_which_a_policy_waits_for_a_processor(
     slots: Slots, cpu_group: Path
 ) -> None:
     slot = slots.slot()
-    source = COMPUTES.replace("OTHERS", "pass").replace("MINE", "0.02")
+    # Long enough to be moved in, well within what an answer may take.
+    source = COMPUTES.replace("PAUSE", "1.5").replace("OTHERS", "pass").replace("MINE", "0.02")
 
     async def work() -> tuple[EpisodeOutcome, ...]:
         task = await begun(slot, slots, source, limits=LESS_TIGHT)
-        await asyncio.sleep(0.2)
         pid = family(pid_of(slot))[-1]
         (cpu_group / "cgroup.procs").write_text(str(pid))
         os.sched_setaffinity(pid, {0})
@@ -508,13 +508,13 @@ def test_no_wall_limit_counts_the_time_for_which_a_policy_waits_for_a_processor(
         hog.kill()
         hog.wait()
     # Its fiftieth of a second took longer than an answer may.
-    assert outcome.wall_s > 0.3 + LESS_TIGHT.act_wall_s
+    assert outcome.wall_s > 1.5 + LESS_TIGHT.act_wall_s
     assert outcome.failure is None
 
 
 def test_a_policy_that_waits_for_its_own_threads_is_not_excused(slots: Slots) -> None:
     threads = "[threading.Thread(target=lambda: [None for _ in iter(int, 1)], daemon=True).start() for _ in range(6)]"
-    source = COMPUTES.replace("OTHERS", threads).replace("MINE", "30")
+    source = COMPUTES.replace("PAUSE", "0.3").replace("OTHERS", threads).replace("MINE", "30")
     failure = slots.play(source, limits=TIGHT).failure
     assert failure is not None
     assert failure.category in ("act_timeout", "cpu_limit")
