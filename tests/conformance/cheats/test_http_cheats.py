@@ -143,6 +143,7 @@ def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> N
         await w.submit_honestly(0)
         own = await w.ask(f"{w.path}/submit/submit_000")
         assert status(own) == 200
+        assert await w.ask(f"{w.path}/submit/0") == own
         nothing = await w.ask(f"{w.path}/nothing")
         guesses = [
             "submit_001",
@@ -159,7 +160,7 @@ def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> N
             "..",
             "%2e%2e",
             "*",
-            "0",
+            *("1", "00", "-0", "+0", "0.0", "%D9%A0"),
             "submit_%D9%A0%D9%A0%D9%A0",
             "x" * 20_000,
         ]
