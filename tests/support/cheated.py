@@ -92,7 +92,10 @@ class Cheated:
         self._log = (root / "log").open("wb")
         ready = root / "ready.json"
         self.coordinator = self._start(
-            "evopolicy_coordinator.cli", "--state", str(self.state), "--ready-file", str(ready)
+            "evopolicy_coordinator.cli",
+            *("--state", str(self.state), "--ready-file", str(ready)),
+            # Runs of one environment stand beside each other here, and one is scored while another's agent listens.
+            *("--hidden-isolation", "off"),
         )
         deadline = time.monotonic() + PATIENCE_S
         while not ready.exists():

@@ -39,7 +39,7 @@ def certs(tmp_path: Path) -> OwnCerts:
 
 @pytest.fixture
 def coordinator(certs: OwnCerts) -> Iterator[Coordinator]:
-    coordinator = Coordinator(certs.state, "--listen", certs.endpoint)
+    coordinator = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
     yield coordinator
     coordinator.kill()
 
@@ -159,13 +159,13 @@ def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_
 ) -> None:
     async def scenario() -> None:
         boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
-        first = Coordinator(certs.state, "--listen", certs.endpoint)
+        first = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
         try:
             async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
                 one = await play_run(operator, boss)
                 certs.issue("worker", "late")
                 first.kill()
-                second = Coordinator(certs.state, "--listen", certs.endpoint)
+                second = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
                 try:
                     created = await operator.create("again")
                     async with connect(of(boss, "gateway"), timeout_s=PATIENCE_S) as link:
