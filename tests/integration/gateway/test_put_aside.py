@@ -97,7 +97,7 @@ submits.episode_files = episode_files
 
 async def main():
     gateway = Gateway(RunFolder(Path(sys.argv[1])), on_ready=lambda urls, desk: None, on_change=on_change,
-                      close_when_spent=False)
+                      alone=True)
     await gateway.run()
 
 def on_change(desk):
