@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common import catalogue, codec, keys
 from evopolicy_common.blobs import BlobStore, is_digest
@@ -177,55 +178,34 @@ class Intake:
 
         Not for blob and status requests. What `reads_files` belongs on a thread.
         """
-        make: Callable[[Any, int, str], AnyEvent] = _EVENTS[type(parsed.message)]
-        return make(self, parsed.message, request, stimulus_id)  # type: ignore[call-arg, arg-type]
+        message = parsed.message
+        if isinstance(message, _WITH_CURSOR):
+            message = replace(message, cursor=finite_cursor(message.cursor))
+        if isinstance(message, _WITH_WAIT):
+            message = replace(message, wait_s=finite_wait(message.wait_s))
+        make = _EVENTS.get(type(message))
+        if make is not None:
+            return make(self, message, request, stimulus_id)
+        checked = _CHECKS[type(message)](self, message)
+        return events.Asked(stimulus_id=stimulus_id, request=request, message=checked)
+
+    def _as_it_is(self, m: Message) -> Message:
+        return m
 
     # Workers.
 
-    def registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
-        holder = None if self._machines is None else self._machines.holder("worker", m.token)
+    def _registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
+        machines = self._machines
+        holder = None if machines is None else machines.holder("worker", m.token)
         return events.WorkerRegistered(
             stimulus_id=stimulus,
             request=request,
-            worker=m.worker,
-            session=secrets.token_urlsafe(16)
-            if self._machines is None
-            else self._machines.session_for(m.token),
-            slots=m.slots,
-            tiers=m.tiers,
-            environments=m.environments,
-            fingerprint=m.fingerprint,
-            host=m.host,
+            message=m,
+            session=secrets.token_urlsafe(16) if machines is None else machines.session_for(m.token),
             machine="" if holder is None else holder.name,
-            boot_id=m.boot_id,
-            machine_id=m.machine_id,
         )
 
-    def lease_requested(self, m: worker.LeaseRequest, request: int, stimulus: str) -> AnyEvent:
-        return events.LeaseRequested(
-            stimulus_id=stimulus,
-            request=request,
-            worker=m.worker,
-            session=m.session,
-            n=m.n,
-            wait_s=finite_wait(m.wait_s),
-            warm_bundles=m.warm_bundles,
-            warm_environments=m.warm_environments,
-            serial=m.serial,
-        )
-
-    def heartbeat_received(self, m: worker.Heartbeat, request: int, stimulus: str) -> AnyEvent:
-        return events.HeartbeatReceived(
-            stimulus_id=stimulus,
-            request=request,
-            worker=m.worker,
-            session=m.session,
-            held=m.held,
-            wait_s=finite_wait(m.wait_s),
-            settled=m.settled,
-        )
-
-    def results_handed_in(self, m: worker.HandIn, request: int, stimulus: str) -> AnyEvent:
+    def _checked_results(self, m: worker.HandIn) -> worker.HandIn:
         results = tuple(map(self._unpacked, m.results))
         for result in results:
             for outcome in result.episodes:
@@ -233,9 +213,7 @@ class Intake:
                     check_inline(ref)
                 for ref in stored_blobs(outcome):
                     self._check_stored(ref)
-        return events.ResultsHandedIn(
-            stimulus_id=stimulus, request=request, worker=m.worker, session=m.session, results=results
-        )
+        return replace(m, results=results)
 
     def _unpacked(self, result: worker.JobResult) -> worker.JobResult:
         """The result with its outcomes, where these came as a blob."""
@@ -246,7 +224,7 @@ class Intake:
             outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
         except ProtocolError as error:
             raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
-        return msgspec.structs.replace(result, episodes=outcomes, packed=None)
+        return replace(result, episodes=outcomes, packed=None)
 
     def _check_stored(self, ref: BlobRef) -> None:
         if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
@@ -254,59 +232,28 @@ class Intake:
 
     # Gateways.
 
-    def run_opened(self, m: gateway.OpenRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunOpened(stimulus_id=stimulus, request=request, run=m.run, asks_permit=m.asks_permit)
-
-    def permit_requested(self, m: gateway.RequestPermit, request: int, stimulus: str) -> AnyEvent:
+    def _checked_permit(self, m: gateway.RequestPermit) -> gateway.RequestPermit:
         check_place(m.boot_id, m.machine_id, m.host)
-        return events.PermitRequested(
-            stimulus_id=stimulus,
-            request=request,
-            run=m.run,
-            boot_id=m.boot_id,
-            machine_id=m.machine_id,
-            host=m.host,
-            wait_s=finite_wait(m.wait_s),
-        )
+        return m
 
-    def state_requested(self, m: gateway.StateRequest, request: int, stimulus: str) -> AnyEvent:
-        return events.StateRequested(stimulus_id=stimulus, request=request, run=m.run)
-
-    def submit_requested(self, m: gateway.Submit, request: int, stimulus: str) -> AnyEvent:
+    def _checked_submit(self, m: gateway.Submit) -> gateway.Submit:
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle, m.run)
         if (m.bundle is None) == (m.bundle_error is None):
             raise RefusedError(Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
-        return events.SubmitRequested(
-            stimulus_id=stimulus,
-            request=request,
-            run=m.run,
-            key=m.key,
-            env_instances=m.env_instances,
-            bundle=m.bundle,
-            bundle_error=m.bundle_error,
-        )
+        return m
 
-    def results_requested(self, m: gateway.ResultsRequest, request: int, stimulus: str) -> AnyEvent:
+    def _checked_poll(self, m: gateway.ResultsRequest) -> gateway.ResultsRequest:
         if not 0 <= m.submit_index <= MAX_COUNT:
             raise RefusedError(Refusal.UNKNOWN_SUBMIT, f"this run has no submit {m.submit_index}")
-        return events.ResultsRequested(
-            stimulus_id=stimulus,
-            request=request,
-            run=m.run,
-            submit_index=m.submit_index,
-            cursor=finite_cursor(m.cursor),
-            wait_s=finite_wait(m.wait_s),
-        )
+        return m
 
-    def run_closed(self, m: gateway.CloseRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunClosed(
-            stimulus_id=stimulus, request=request, run=m.run, reason=m.reason, agent=bounded_agent(m.agent)
-        )
+    def _checked_close(self, m: gateway.CloseRun) -> gateway.CloseRun:
+        return replace(m, agent=bounded_agent(m.agent))
 
     # Operators.
 
-    def run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
+    def _run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
         check_idempotency_key(m.key)
         wanted = m.settings
         check_limits(wanted.limits)
@@ -329,11 +276,10 @@ class Intake:
         return events.RunCreated(
             stimulus_id=stimulus,
             request=request,
+            message=m,
             run=f"r-{secrets.token_hex(8)}",
-            key=m.key,
             capability=secrets.token_urlsafe(32),
             secret=secrets.token_bytes(32),
-            settings=wanted,
             budget=budget,
             min_episodes_per_submit=least,
             max_episodes_per_submit=most,
@@ -346,7 +292,7 @@ class Intake:
             denied_imports=self._denied_imports,
         )
 
-    def evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
+    def _evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
         check_limits(m.limits)
@@ -373,19 +319,11 @@ class Intake:
         return events.EvaluationRequested(
             stimulus_id=stimulus,
             request=request,
+            message=m,
             evaluation=f"e-{secrets.token_hex(8)}",
-            key=m.key,
-            env=m.env,
-            bundle=m.bundle,
-            split=m.split,
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
             secret=secrets.token_bytes(32),
-            record=m.record,
-            tier=m.sandbox_tier,
-            limits=m.limits,
-            replays=m.replays,
-            as_in=m.as_in,
         )
 
     def split_hashes(self, m: operator.DescribeEnvironment) -> dict[str, str]:
@@ -398,39 +336,10 @@ class Intake:
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
 
-    def run_waited(self, m: operator.WaitRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunWaited(
-            stimulus_id=stimulus, request=request, run=m.run, wait_s=finite_wait(m.wait_s)
-        )
-
-    def evaluation_polled(self, m: operator.EvaluationPoll, request: int, stimulus: str) -> AnyEvent:
-        return events.EvaluationPolled(
-            stimulus_id=stimulus,
-            request=request,
-            evaluation=m.evaluation,
-            cursor=finite_cursor(m.cursor),
-            wait_s=finite_wait(m.wait_s),
-        )
-
-    def run_cancelled(self, m: operator.CancelRun, request: int, stimulus: str) -> AnyEvent:
-        return events.RunCancelled(stimulus_id=stimulus, request=request, run=m.run)
-
-    def agent_gone(self, m: operator.AgentGone, request: int, stimulus: str) -> AnyEvent:
-        return events.AgentGone(stimulus_id=stimulus, request=request, run=m.run)
-
-    def run_repinned(self, m: operator.RepinRun, request: int, stimulus: str) -> AnyEvent:
+    def _checked_repin(self, m: operator.RepinRun) -> operator.RepinRun:
         if not m.reason.strip():
             raise RefusedError(Refusal.BAD_MESSAGE, "an override of a run's fingerprint class needs a reason")
-        return events.RunRepinned(
-            stimulus_id=stimulus,
-            request=request,
-            run=m.run,
-            fingerprint_class=m.fingerprint_class,
-            reason=m.reason,
-        )
-
-    def worker_state_set(self, m: operator.SetWorker, request: int, stimulus: str) -> AnyEvent:
-        return events.WorkerStateSet(stimulus_id=stimulus, request=request, worker=m.worker, state=m.state)
+        return m
 
     def _counts(
         self, suite: catalogue.Suite, n_validation: int | None, n_heldout: int | None
@@ -482,26 +391,39 @@ class Intake:
             )
 
 
-_EVENTS: dict[type[Message], Callable[..., AnyEvent]] = {
-    worker.Register: Intake.registered,
-    worker.LeaseRequest: Intake.lease_requested,
-    worker.Heartbeat: Intake.heartbeat_received,
-    worker.HandIn: Intake.results_handed_in,
-    gateway.OpenRun: Intake.run_opened,
-    gateway.RequestPermit: Intake.permit_requested,
-    gateway.StateRequest: Intake.state_requested,
-    gateway.Submit: Intake.submit_requested,
-    gateway.ResultsRequest: Intake.results_requested,
-    gateway.CloseRun: Intake.run_closed,
-    operator.CreateRun: Intake.run_created,
-    operator.Evaluate: Intake.evaluation_requested,
-    operator.WaitRun: Intake.run_waited,
-    operator.EvaluationPoll: Intake.evaluation_polled,
-    operator.CancelRun: Intake.run_cancelled,
-    operator.AgentGone: Intake.agent_gone,
-    operator.RepinRun: Intake.run_repinned,
-    operator.SetWorker: Intake.worker_state_set,
+_WITH_CURSOR = (gateway.ResultsRequest, operator.EvaluationPoll)
+_WITH_WAIT = (
+    worker.LeaseRequest,
+    worker.Heartbeat,
+    gateway.RequestPermit,
+    gateway.ResultsRequest,
+    operator.WaitRun,
+    operator.EvaluationPoll,
+)
+_CHECKS: dict[type[Message], Callable[[Intake, Any], Message]] = {
+    worker.LeaseRequest: Intake._as_it_is,
+    worker.Heartbeat: Intake._as_it_is,
+    worker.HandIn: Intake._checked_results,
+    gateway.OpenRun: Intake._as_it_is,
+    gateway.StateRequest: Intake._as_it_is,
+    gateway.RequestPermit: Intake._checked_permit,
+    gateway.Submit: Intake._checked_submit,
+    gateway.ResultsRequest: Intake._checked_poll,
+    gateway.CloseRun: Intake._checked_close,
+    operator.WaitRun: Intake._as_it_is,
+    operator.EvaluationPoll: Intake._as_it_is,
+    operator.CancelRun: Intake._as_it_is,
+    operator.AgentGone: Intake._as_it_is,
+    operator.RepinRun: Intake._checked_repin,
+    operator.SetWorker: Intake._as_it_is,
 }
+"""What is checked of a request before an event carries it."""
+_EVENTS: dict[type[Message], Callable[[Intake, Any, int, str], AnyEvent]] = {
+    worker.Register: Intake._registered,
+    operator.CreateRun: Intake._run_created,
+    operator.Evaluate: Intake._evaluation_requested,
+}
+"""Requests that the shell adds something to: ids, secrets, cases."""
 
 
 def _or(value: int | None, otherwise: int) -> int:

@@ -29,7 +29,7 @@ import structlog
 from evopolicy_common import bundles, codec
 from evopolicy_common.errors import PartFailedError, ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, Message, Refused
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, LeaseRequest, Message, Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.transport import IncomingQuery
 from evopolicy_coordinator.answers import Answers, answer_bytes, answer_to, lane_of
@@ -39,7 +39,6 @@ from evopolicy_coordinator.core.events import (
     AnyEvent,
     AuditEvent,
     EvaluationRequested,
-    LeaseRequested,
     LivenessLost,
 )
 from evopolicy_coordinator.core.machine import Core
@@ -219,7 +218,7 @@ class Service:
             except BaseException:
                 self._pending.take(request)
                 raise
-            if isinstance(event, LeaseRequested):
+            if isinstance(message, LeaseRequest):
                 event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
             self._handle(event)
 
@@ -255,9 +254,10 @@ class Service:
 
     def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
         event = self._intake.event(parsed, request, stimulus)
-        if isinstance(event, EvaluationRequested) and event.as_in is not None and event.as_in.run:
+        as_in = event.message.as_in if isinstance(event, EvaluationRequested) else None
+        if as_in is not None and as_in.run:
             # The policy seeds of the run itself; the secret they come from does not leave.
-            secret = self._answers.finished_secret(event.as_in.run)
+            secret = self._answers.finished_secret(as_in.run)
             return event if secret is None else msgspec.structs.replace(event, secret=secret)
         return event
 

@@ -20,12 +20,15 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(1, str(Path(__file__).parents[1] / "support"))
 
+from asking import asked
+
+from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import Effect, ReadResults, Reply
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import Snapshot
@@ -115,7 +118,8 @@ class Load:
         fingerprint = wire.Fingerprint(code_version="1", python="3", packages={}, cpu="")
         for index, name in enumerate(self._names):
             self.tell(
-                events.WorkerRegistered(
+                asked(
+                    wire.Register,
                     request=self.request(),
                     worker=name,
                     session=self._sessions[index],
@@ -138,7 +142,8 @@ class Load:
         # The first runs are staggered, so that at any time as many are trained as are scored.
         self._submitted[run] = self._created % SUBMITS if self._created <= self._runs else 0
         self.tell(
-            events.RunCreated(
+            asked(
+                operator.CreateRun,
                 request=self.request(),
                 run=run,
                 key=f"key-{run}",
@@ -155,14 +160,15 @@ class Load:
                 split_secret=True,
             )
         )
-        self.tell(events.PermitRequested(request=self.request(), run=run, boot_id=f"agent-of-{run}"))
+        self.tell(asked(gateway.RequestPermit, request=self.request(), run=run, boot_id=f"agent-of-{run}"))
         self._submit(run)
 
     def _submit(self, run: str) -> None:
         index = self._submitted[run]
         self._submitted[run] = index + 1
         self.tell(
-            events.SubmitRequested(
+            asked(
+                gateway.Submit,
                 request=self.request(),
                 run=run,
                 key=f"submit-{index}",
@@ -175,7 +181,8 @@ class Load:
         request = self.request()
         self._polls[request] = worker
         self.tell(
-            events.LeaseRequested(
+            asked(
+                wire.LeaseRequest,
                 request=request,
                 worker=self._names[worker],
                 session=self._sessions[worker],
@@ -187,8 +194,12 @@ class Load:
     def _beat(self, worker: int) -> None:
         held = tuple(self._held[worker].values())
         self.tell(
-            events.HeartbeatReceived(
-                request=self.request(), worker=self._names[worker], session=self._sessions[worker], held=held
+            asked(
+                wire.Heartbeat,
+                request=self.request(),
+                worker=self._names[worker],
+                session=self._sessions[worker],
+                held=held,
             )
         )
 
@@ -213,7 +224,8 @@ class Load:
             episodes=outcomes,
         )
         self.tell(
-            events.ResultsHandedIn(
+            asked(
+                wire.HandIn,
                 request=self.request(),
                 worker=self._names[worker],
                 session=self._sessions[worker],
@@ -234,7 +246,7 @@ class Load:
         if self._submitted[run] < SUBMITS:
             self._submit(run)
         else:
-            self.tell(events.RunClosed(request=self.request(), run=run, reason="budget_spent"))
+            self.tell(asked(gateway.CloseRun, request=self.request(), run=run, reason="budget_spent"))
 
     def run(self) -> None:
         """Until so many jobs are done, train and hidden; workers beat in turn, each every `BEAT_S` simulated seconds."""

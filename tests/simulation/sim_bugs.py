@@ -122,7 +122,7 @@ BUGS = (
         "lease to a poll that was given up unread",
         Scheduler,
         "poll",
-        "event.waited_s > event.wait_s + core.settings.late_s",
+        "event.waited_s > message.wait_s + core.settings.late_s",
         "False",
     ),
     Bug(

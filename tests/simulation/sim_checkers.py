@@ -13,6 +13,7 @@ from sim_oracle import ExpectedRun, PlannedRun, expect
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import Log
 from evopolicy_coordinator.core.jobs import EARLY_VALIDATION, TRAIN
@@ -181,18 +182,18 @@ class Checkers:
 
     def asking(self, event: events.Event) -> None:
         """A request reached the core."""
-        if isinstance(event, events.ResultsHandedIn):
-            self._handed_in.update(result.lease_id for result in event.results)
+        if isinstance(event, events.Asked) and isinstance(event.message, wire.HandIn):
+            self._handed_in.update(result.lease_id for result in event.message.results)
 
-    def answering(self, event: events.AnyEvent, message: Any) -> None:
+    def answering(self, request: Message, message: Any) -> None:
         """An answer is about to be sent: is what it tells durable, and may it be told?"""
         disk = self._disk
-        if isinstance(message, gateway.SubmitAccepted) and isinstance(event, events.SubmitRequested):
-            row = disk.submits.get((event.run, message.submit_index))
-            want(row is not None and row.key == event.key, "an accepted submit is durable", event, row)
-        elif isinstance(message, wire.Refused) and isinstance(event, events.SubmitRequested):
+        if isinstance(message, gateway.SubmitAccepted) and isinstance(request, gateway.Submit):
+            row = disk.submits.get((request.run, message.submit_index))
+            want(row is not None and row.key == request.key, "an accepted submit is durable", request, row)
+        elif isinstance(message, wire.Refused) and isinstance(request, gateway.Submit):
             running = [
-                row for (run, _), row in disk.submits.items() if run == event.run and row.status is None
+                row for (run, _), row in disk.submits.items() if run == request.run and row.status is None
             ]
             gone = message.status in ("run_finished", "run_closed")
             want(
@@ -200,25 +201,25 @@ class Checkers:
             )
         elif isinstance(message, operator.RunCreated):
             want(message.run in disk.runs, "a created run is durable", message)
-        elif isinstance(message, gateway.RunClosed) and isinstance(event, events.RunClosed):
-            want(disk.states[event.run].phase != "open", "a closed run is durably closed", event)
-        elif isinstance(message, wire.HandInReply) and isinstance(event, events.ResultsHandedIn):
-            for result in event.results:
+        elif isinstance(message, gateway.RunClosed) and isinstance(request, gateway.CloseRun):
+            want(disk.states[request.run].phase != "open", "a closed run is durably closed", request)
+        elif isinstance(message, wire.HandInReply) and isinstance(request, wire.HandIn):
+            for result in request.results:
                 self._taken(result)
-        elif isinstance(event, events.ResultsRequested) and getattr(message, "rows", None):
-            gate = disk.outcome(train_group(event.run, event.submit_index), 0)
+        elif isinstance(request, gateway.ResultsRequest) and getattr(message, "rows", None):
+            gate = disk.outcome(train_group(request.run, request.submit_index), 0)
             category = None if gate is None or gate.outcome.failure is None else gate.outcome.failure.category
             shown = gate is not None and category != "init_error"
-            want(shown, "nothing is shown before index 0 shows a Policy", event, gate)
-        elif isinstance(message, wire.HeartbeatReply) and isinstance(event, events.HeartbeatReceived):
-            for held in event.held:
+            want(shown, "nothing is shown before index 0 shows a Policy", request, gate)
+        elif isinstance(message, wire.HeartbeatReply) and isinstance(request, wire.Heartbeat):
+            for held in request.held:
                 group, _, first = held.job_id.rpartition("/")
                 row = disk.outcome(group, int(first))
                 told = row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
                 want(told, "who plays what is done already is told to stop", held, row)
-        elif isinstance(message, wire.Leases) and isinstance(event, events.LeaseRequested):
+        elif isinstance(message, wire.Leases) and isinstance(request, wire.LeaseRequest):
             for lease in message.leases:
-                self._leased(event.worker, lease)
+                self._leased(request.worker, lease)
 
     def _taken(self, result: wire.JobResult) -> None:
         """A result was acknowledged, so the worker forgets it."""

@@ -13,7 +13,6 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.refusals import NOT_NOW, RUN_OVER
-from evopolicy_coordinator.core import events
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -57,7 +56,7 @@ class SimOperator(Asker):
             "split_secret": True,
             **cases,
         }
-        self.ask(events.RunCreated, fields, self._created)
+        self.ask(operator.CreateRun, fields, self._created)
 
     def _created(self, message: Any) -> None:
         assert isinstance(message, operator.RunCreated), message
@@ -67,7 +66,7 @@ class SimOperator(Asker):
         self._wait()
 
     def _wait(self) -> None:
-        self.ask(events.RunWaited, {"run": self.plan.name, "wait_s": 10.0}, self._waited, 10.0)
+        self.ask(operator.WaitRun, {"run": self.plan.name, "wait_s": 10.0}, self._waited, 10.0)
 
     def _waited(self, message: Any) -> None:
         if isinstance(message, operator.RunFinished):
@@ -82,7 +81,7 @@ class SimOperator(Asker):
             agents = self.simulation.truth
             self.world.after(self.world.chance.random() * 20.0, agents.agent_ends, self.plan)
 
-        self.ask(events.RunCancelled, {"run": self.plan.name}, cancelled)
+        self.ask(operator.CancelRun, {"run": self.plan.name}, cancelled)
 
 
 class SimGateway(Asker):
@@ -118,7 +117,7 @@ class SimGateway(Asker):
         def vouch() -> None:
             self.simulation.truth.agent_ends(self.plan)
             voucher = self.simulation.operators[0]
-            voucher.ask(events.AgentGone, {"run": self.plan.name}, resumed)
+            voucher.ask(operator.AgentGone, {"run": self.plan.name}, resumed)
 
         self.world.after(20.0 + self.world.chance.random() * 60.0, vouch)
 
@@ -136,7 +135,7 @@ class SimGateway(Asker):
     def _open(self) -> None:
         self.boot_id = self.machine.boot_id
         fields = {"run": self.plan.name, "asks_permit": self.asks_permit}
-        self.ask(events.RunOpened, fields, self._opened)
+        self.ask(gateway.OpenRun, fields, self._opened)
 
     def _opened(self, message: Any) -> None:
         if isinstance(message, wire.Refused):
@@ -150,7 +149,7 @@ class SimGateway(Asker):
 
     def _over(self) -> None:
         self.simulation.truth.agent_ends(self.plan)
-        self.ask(events.RunClosed, {"run": self.plan.name, "reason": "cancelled"}, self._run_closed)
+        self.ask(gateway.CloseRun, {"run": self.plan.name, "reason": "cancelled"}, self._run_closed)
 
     def _ask_permit(self) -> None:
         if not self.asks_permit:
@@ -163,7 +162,7 @@ class SimGateway(Asker):
             "machine_id": self.machine.name if told else "",
             "wait_s": 5.0,
         }
-        self.ask(events.PermitRequested, fields, self._permitted, 5.0)
+        self.ask(gateway.RequestPermit, fields, self._permitted, 5.0)
 
     def _permitted(self, message: Any) -> None:
         if isinstance(message, wire.Refused):
@@ -178,18 +177,18 @@ class SimGateway(Asker):
     def _next(self) -> None:
         if self.position == len(self.plan.submits):
             self.simulation.truth.agent_ends(self.plan)
-            self.ask(events.RunClosed, {"run": self.plan.name, "reason": "done"}, self._run_closed)
+            self.ask(gateway.CloseRun, {"run": self.plan.name, "reason": "done"}, self._run_closed)
             return
         submit = self.plan.submits[self.position]
         fields = self._fields(self.position)
-        self.ask(events.SubmitRequested, fields, self._submitted)
+        self.ask(gateway.Submit, fields, self._submitted)
         if self.world.chance.random() < 0.2 and submit.ids:
             other = {
                 **fields,
                 "key": f"other-{self.position}-{self.world.chance.random()}",
                 "env_instances": (999,),
             }
-            self.ask(events.SubmitRequested, other, self.simulation.checkers.refused)
+            self.ask(gateway.Submit, other, self.simulation.checkers.refused)
 
     def _fields(self, position: int) -> dict[str, Any]:
         submit = self.plan.submits[position]
@@ -205,7 +204,7 @@ class SimGateway(Asker):
         self.simulation.truth.closed(self.plan)
         if self.world.chance.random() < 0.3:
             late = {**self._fields(0), "key": "too-late"}
-            self.ask(events.SubmitRequested, late, self.simulation.checkers.refused)
+            self.ask(gateway.Submit, late, self.simulation.checkers.refused)
 
     def _submitted(self, message: Any) -> None:
         if isinstance(message, wire.Refused) and message.status in NOT_NOW:
@@ -225,12 +224,12 @@ class SimGateway(Asker):
                 "key": f"second-{self.position}",
                 "env_instances": (999,),
             }
-            self.ask(events.SubmitRequested, second, self.simulation.checkers.refused)
+            self.ask(gateway.Submit, second, self.simulation.checkers.refused)
         self._read(message.submit_index, 0, [])
 
     def _read(self, index: int, cursor: int, seen: list[Any]) -> None:
         fields = {"run": self.plan.name, "submit_index": index, "cursor": cursor, "wait_s": 8.0}
-        self.ask(events.ResultsRequested, fields, lambda message: self._page(index, seen, message), 8.0)
+        self.ask(gateway.ResultsRequest, fields, lambda message: self._page(index, seen, message), 8.0)
 
     def _page(self, index: int, seen: list[Any], message: Any) -> None:
         assert isinstance(message, Page), message

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from asking import asked
 from sim_checkers import Checkers
 from sim_store import Disk
 from sim_world import World
 
+from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import (
@@ -52,7 +54,7 @@ class SimCoordinator:
         self.world, self.disk, self.checkers, self.settings = world, disk, checkers, settings
         self.core: Core | None = None
         self.life = 0
-        self._asks: dict[int, tuple[str, Callable[[Any], None], events.AnyEvent]] = {}
+        self._asks: dict[int, tuple[str, Callable[[Any], None], wire.Message]] = {}
         self._handles = 0
         self._queue: list[Effect] = []
         self._flushing = False
@@ -100,7 +102,7 @@ class SimCoordinator:
     def receive(
         self,
         endpoint: str,
-        kind: type[events.Event],
+        kind: type[wire.Message | events.LivenessLost],
         fields: dict[str, Any],
         answer: Callable[[Any], None],
         arrived: float | None = None,
@@ -109,17 +111,17 @@ class SimCoordinator:
         arrived = self.world.now if arrived is None else arrived
         if self._later(self.receive, endpoint, kind, fields, answer, arrived):
             return
-        if kind is events.LeaseRequested:
+        if kind is wire.LeaseRequest:
             fields = {**fields, "waited_s": self.world.now - arrived}
         if self.core is None:
             return
         self._handles += 1
         stimulus = f"{kind.__name__}-{self._handles}"
-        if kind is events.LivenessLost:
-            event = kind(stimulus_id=stimulus, **fields)
+        if issubclass(kind, wire.Message):
+            event = asked(kind, request=self._handles, stimulus_id=stimulus, **fields)
+            self._asks[self._handles] = (endpoint, answer, event.message)
         else:
-            event = kind(request=self._handles, stimulus_id=stimulus, **fields)  # type: ignore[call-arg]
-            self._asks[self._handles] = (endpoint, answer, event)  # type: ignore[assignment]
+            event = kind(stimulus_id=stimulus, **fields)
         self.world.note(f"{endpoint} → {event}")
         self.checkers.asking(event)
         self._take(self.core.handle(event, self.world.now))  # type: ignore[arg-type]
@@ -208,13 +210,13 @@ class SimCoordinator:
         self.world.after(0.2, self.start)
 
     def _carry_out(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> None:
-        asked = self._asks.pop(int(effect.request), None)
-        if asked is None:
+        who = self._asks.pop(int(effect.request), None)
+        if who is None:
             return
-        endpoint, answer, event = asked
+        endpoint, answer, request = who
         message = self._message(effect)
         self.world.note(f"{endpoint} ← {message}")
-        self.checkers.answering(event, message)
+        self.checkers.answering(request, message)
         self.world.send(endpoint, answer, message)
 
     def _message(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> Any:

@@ -18,6 +18,7 @@ from sim_world import World
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeSpec, Job
+from evopolicy_common.messages.operator import SetWorker
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.settings import CoreSettings
 
@@ -237,9 +238,9 @@ class Simulation:
 
         def back() -> None:
             self.checkers.drained_at.pop(name, None)
-            operator.ask(events.WorkerStateSet, {"worker": name, "state": "active"}, lambda message: None)
+            operator.ask(SetWorker, {"worker": name, "state": "active"}, lambda message: None)
 
-        operator.ask(events.WorkerStateSet, {"worker": name, "state": state}, drained)
+        operator.ask(SetWorker, {"worker": name, "state": state}, drained)
 
     # ---- running ----
 

@@ -15,7 +15,6 @@ from sim_oracle import failure_of, return_of
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job, PolicyFailure
-from evopolicy_coordinator.core import events
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -39,7 +38,7 @@ class Asker:
 
     def ask(
         self,
-        kind: type[events.Event],
+        kind: type[wire.Message],
         fields: dict[str, Any],
         then: Callable[[Any], None],
         wait_s: float = 0.0,
@@ -184,7 +183,7 @@ class SimWorker(Asker):
             self._poll()
             self._hand_in()
 
-        self.ask(events.WorkerRegistered, fields, registered)
+        self.ask(wire.Register, fields, registered)
 
     def _lost_session(self, message: Any) -> bool:
         if isinstance(message, wire.Refused):
@@ -233,7 +232,7 @@ class SimWorker(Asker):
             self.name,
             self.simulation.coordinator.receive,
             self.name,
-            events.HeartbeatReceived,
+            wire.Heartbeat,
             fields,
             answered,
         )
@@ -280,7 +279,7 @@ class SimWorker(Asker):
             self._start()
             self._poll()
 
-        self.ask(events.LeaseRequested, fields, answered, POLL_S)
+        self.ask(wire.LeaseRequest, fields, answered, POLL_S)
 
     def _put(
         self, lease: wire.Lease, kind: wire.ResultKind, episodes: tuple[EpisodeOutcome, ...] = ()
@@ -311,7 +310,7 @@ class SimWorker(Asker):
             self._hand_in()
             self._poll()
 
-        self.ask(events.ResultsHandedIn, fields, answered)
+        self.ask(wire.HandIn, fields, answered)
 
     # ---- play ----
 

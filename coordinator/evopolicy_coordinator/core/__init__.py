@@ -39,8 +39,8 @@ waiting lease poll, a heartbeat that is held back (`wait_s`), or the next heartb
 each event with a `request` is answered by exactly one effect that names it. A second lease poll of a worker answers
 its first with no leases.
 
-*Bundles and blobs.* The shell makes sure that a submit's bundle is stored before it raises `SubmitRequested`, and that the
-blobs an outcome names are stored before it raises `ResultsHandedIn`. Inline trajectories travel in the outcome; whether a
+*Bundles and blobs.* The shell makes sure that a submit's bundle is stored before it hands a `Submit` in, and that the
+blobs an outcome names are stored before it hands a `HandIn` in. Inline trajectories travel in the outcome; whether a
 row keeps them inline or as a blob is the store's business, as long as digests stay.
 
 *Status* is read, not an event: `core.status(now)` gives workers, runs, stalls, episodes done and their rate as the parts of

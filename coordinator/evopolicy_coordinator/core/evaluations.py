@@ -47,7 +47,8 @@ class Ended:
 
 def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
     """Queue an operator's cases, once for each key."""
-    known = core.evaluation_keys.get(event.key)
+    message = event.message
+    known = core.evaluation_keys.get(message.key)
     if known is not None:
         turn.reply(event.request, operator.EvaluationStarted(evaluation=known))
         return
@@ -56,18 +57,18 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
         return
     row = EvaluationRow(
         evaluation=event.evaluation,
-        key=event.key,
-        env=event.env,
-        bundle=event.bundle,
-        split=event.split,
+        key=message.key,
+        env=message.env,
+        bundle=message.bundle,
+        split=message.split,
         case_ids=event.case_ids,
         cases=event.cases,
         secret=event.secret,
-        record=event.record,
-        tier=event.tier,
-        limits=event.limits,
-        replays=event.replays,
-        as_in=event.as_in,
+        record=message.record,
+        tier=message.sandbox_tier,
+        limits=message.limits,
+        replays=message.replays,
+        as_in=message.as_in,
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )
@@ -175,16 +176,17 @@ def _answer_polls(core: Core, group: JobGroup, turn: Turn, *, finished: bool) ->
         turn.add(_page(core, poll, group, turn, finished=finished))
 
 
-def polled(core: Core, event: events.EvaluationPolled, turn: Turn) -> None:
+def polled(core: Core, event: events.Asked[operator.EvaluationPoll], turn: Turn) -> None:
     """An operator asks for outcomes: answered at once, or when there are more than it has."""
-    poll = Poll(event.request, "evaluation", evaluation_group(event.evaluation), event.cursor)
-    ended = core.ended_evaluations.get(event.evaluation)
+    message = event.message
+    poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)
+    ended = core.ended_evaluations.get(message.evaluation)
     if ended is not None:
         turn.add(
             ReadEvaluation(
                 request=event.request,
-                evaluation=event.evaluation,
-                cursor=max(0, event.cursor),
+                evaluation=message.evaluation,
+                cursor=max(0, message.cursor),
                 upto=ended.total,
                 total=ended.total,
                 finished=True,
@@ -194,8 +196,10 @@ def polled(core: Core, event: events.EvaluationPolled, turn: Turn) -> None:
         return
     group = core.groups.get(poll.target)
     if group is None:
-        turn.refuse(event.request, Refusal.UNKNOWN_EVALUATION, f"there is no evaluation {event.evaluation!r}")
-    elif group.done > event.cursor or not core.polls.wait(poll, event.wait_s, turn.now):
+        turn.refuse(
+            event.request, Refusal.UNKNOWN_EVALUATION, f"there is no evaluation {message.evaluation!r}"
+        )
+    elif group.done > message.cursor or not core.polls.wait(poll, message.wait_s, turn.now):
         turn.add(_page(core, poll, group, turn, finished=False))
 
 

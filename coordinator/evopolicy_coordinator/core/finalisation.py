@@ -134,18 +134,19 @@ def quarantine(core: Core, group: JobGroup, turn: Turn) -> None:
 # ---- stages ----
 
 
-def close(core: Core, event: events.RunClosed, turn: Turn) -> None:
+def close(core: Core, event: events.Asked[gateway.CloseRun], turn: Turn) -> None:
     """The agent is gone: no more submits, and the hidden cases are played. Closing twice is closing once."""
-    run = core.runs.get(event.run)
-    if run is None and event.run not in core.capabilities:
-        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
+    message = event.message
+    run = core.runs.get(message.run)
+    if run is None and message.run not in core.capabilities:
+        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
         return
-    core.isolation.end(event.run, turn, "its run was closed")
-    core.isolation.drop_asks(event.run, Refusal.RUN_CLOSED, f"run {event.run!r} is closed", turn)
+    core.isolation.end(message.run, turn, "its run was closed")
+    core.isolation.drop_asks(message.run, Refusal.RUN_CLOSED, f"run {message.run!r} is closed", turn)
     if run is not None and run.state.phase == "open":
-        run.change(turn, phase="closed", closed_at=turn.now, close_reason=event.reason, agent=event.agent)
+        run.change(turn, phase="closed", closed_at=turn.now, close_reason=message.reason, agent=message.agent)
         core.queue.close(run.flow)
-        turn.log("info", "run_closed", run=run.id, reason=event.reason, submits=len(run.submits))
+        turn.log("info", "run_closed", run=run.id, reason=message.reason, submits=len(run.submits))
         advance(core, run, turn)
     turn.reply(event.request, gateway.RunClosed())
 
@@ -188,14 +189,15 @@ def select(run: Run) -> SubmitRow | None:
     return best
 
 
-def cancel(core: Core, event: events.RunCancelled, turn: Turn) -> None:
+def cancel(core: Core, event: events.Asked[operator.CancelRun], turn: Turn) -> None:
     """An operator ends a run here and now: nothing of it is scored."""
-    run = core.runs.get(event.run)
+    message = event.message
+    run = core.runs.get(message.run)
     if run is None:
-        if core.cancel_evaluation(event.run, turn) or event.run in core.capabilities:
+        if core.cancel_evaluation(message.run, turn) or message.run in core.capabilities:
             turn.reply(event.request, operator.Done())
         else:
-            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
         return
     if run.open is not None:
         index, run.open = run.open, None
@@ -313,17 +315,18 @@ def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
 # ---- waiting for the end ----
 
 
-def waited(core: Core, event: events.RunWaited, turn: Turn) -> None:
+def waited(core: Core, event: events.Asked[operator.WaitRun], turn: Turn) -> None:
     """An operator waits for the end of a run."""
-    run = core.runs.get(event.run)
+    message = event.message
+    run = core.runs.get(message.run)
     if run is None:
-        if event.run in core.capabilities:
-            turn.add(finished_effect(event.request, event.run, turn))
+        if message.run in core.capabilities:
+            turn.add(finished_effect(event.request, message.run, turn))
         else:
-            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
         return
     poll = Poll(event.request, "run", run.id)
-    if not core.polls.wait(poll, event.wait_s, turn.now):
+    if not core.polls.wait(poll, message.wait_s, turn.now):
         turn.reply(event.request, progress(core, run))
 
 

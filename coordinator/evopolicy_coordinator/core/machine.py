@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, cast
 
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
 from evopolicy_common.refusals import Refusal
@@ -116,7 +118,7 @@ class Core:
         """Take in what happened; the effects are to be carried out in order."""
         self._watch(now)
         turn = Turn(now, event.stimulus_id)
-        _HANDLERS[type(event)](self, event, turn)
+        _HANDLERS[type(event.message if isinstance(event, events.Asked) else event)](self, event, turn)
         self.scheduler.dispatch(turn)
         return turn.effects()
 
@@ -432,26 +434,26 @@ class Core:
 
 
 _HANDLERS: dict[type, Callable[[Core, Any, Turn], None]] = {
-    events.RunCreated: runs.create,
-    events.RunWaited: finalisation.waited,
-    events.RunCancelled: finalisation.cancel,
-    events.RunRepinned: membership.repinned,
-    events.EvaluationRequested: evaluations.request,
-    events.EvaluationPolled: evaluations.polled,
-    events.WorkerStateSet: membership.worker_state,
-    events.RunOpened: runs.opened,
-    events.PermitRequested: permits.requested,
-    events.AgentGone: permits.agent_gone,
-    events.StateRequested: runs.state_requested,
-    events.SubmitRequested: runs.submit,
-    events.ResultsRequested: runs.results,
-    events.RunClosed: finalisation.close,
-    events.WorkerRegistered: membership.registered,
-    events.LeaseRequested: membership.lease_requested,
-    events.HeartbeatReceived: membership.heartbeat,
-    events.ResultsHandedIn: membership.handed_in,
+    operator.CreateRun: runs.create,
+    operator.WaitRun: finalisation.waited,
+    operator.CancelRun: finalisation.cancel,
+    operator.RepinRun: membership.repinned,
+    operator.Evaluate: evaluations.request,
+    operator.EvaluationPoll: evaluations.polled,
+    operator.SetWorker: membership.worker_state,
+    operator.AgentGone: permits.agent_gone,
+    gateway.OpenRun: runs.opened,
+    gateway.RequestPermit: permits.requested,
+    gateway.StateRequest: runs.state_requested,
+    gateway.Submit: runs.submit,
+    gateway.ResultsRequest: runs.results,
+    gateway.CloseRun: finalisation.close,
+    wire.Register: membership.registered,
+    wire.LeaseRequest: membership.lease_requested,
+    wire.Heartbeat: membership.heartbeat,
+    wire.HandIn: membership.handed_in,
     events.LivenessLost: membership.liveness_lost,
     events.AuditPrepared: audit.prepared,
     events.AuditCompared: audit.compared,
-    events.RequestAbandoned: membership.abandoned,
 }
+"""Who takes an event: by the message that it carries, or by its own type where it carries none."""

@@ -12,7 +12,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
@@ -30,20 +30,21 @@ if TYPE_CHECKING:
 
 def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
     """A worker joins, or joins again under a new session."""
-    if _refused_as_forger(core, event.worker, event.machine, event.request, turn):
+    message = event.message
+    if _refused_as_forger(core, message.worker, event.machine, event.request, turn):
         return
-    old = core.fleet.workers.get(event.worker)
+    old = core.fleet.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Else one machine could play under another's name, and have it blamed.
-        text = f"a worker of another machine is called {event.worker!r}; choose another --name"
+        text = f"a worker of another machine is called {message.worker!r}; choose another --name"
         turn.refuse(event.request, Refusal.NAME_TAKEN, text)
         return
     if old is not None:
         core.scheduler.drop_poll(old, turn)
         if old.beat is not None:
             core.fleet.answer_beat(old, (), turn)
-    core.timers.disarm(("forget", event.worker))
-    worker = core.fleet.register(event, core.isolation.kernel(event.boot_id), turn)
+    core.timers.disarm(("forget", message.worker))
+    worker = core.fleet.register(event, core.isolation.kernel(message.boot_id), turn)
     core.isolation.joined(worker, turn)
     if old is not None and old.kernel is not worker.kernel:
         core.isolation.forgotten(old)
@@ -52,7 +53,7 @@ def registered(core: Core, event: events.WorkerRegistered, turn: Turn) -> None:
         lease_ttl_s=core.settings.lease_ttl_s,
         heartbeat_s=core.settings.heartbeat_s,
         refused=status.refused_runs(core, worker),
-        hidden_bar="" if event.boot_id or not core.isolation.on else NO_BOOT_ID,
+        hidden_bar="" if message.boot_id or not core.isolation.on else NO_BOOT_ID,
     )
     turn.reply(event.request, reply)
     name = worker.profile.fingerprint_class
@@ -78,15 +79,18 @@ def _refused_as_forger(core: Core, name: str, machine: str, request: events.Requ
     return True
 
 
-def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
+def worker_of(
+    core: Core, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.HandIn], turn: Turn
+) -> Worker | None:
     """Who speaks; None, and the request is refused, when its session is unknown or it is quarantined."""
-    known = core.fleet.workers.get(event.worker)
-    if _refused_as_forger(core, event.worker, known.machine if known else "", event.request, turn):
+    message = event.message
+    known = core.fleet.workers.get(message.worker)
+    if _refused_as_forger(core, message.worker, known.machine if known else "", event.request, turn):
         return None
     was_lost = known is not None and known.state == "lost"
-    worker = core.fleet.of_session(event.worker, event.session, turn.now)
+    worker = core.fleet.of_session(message.worker, message.session, turn.now)
     if worker is None:
-        text = f"session of worker {event.worker!r} is not known here; register again"
+        text = f"session of worker {message.worker!r} is not known here; register again"
         turn.refuse(event.request, Refusal.UNKNOWN_WORKER, text)
     else:
         core.timers.arm_once(("worker", worker.name), turn.now + core.settings.lease_ttl_s)
@@ -95,36 +99,37 @@ def worker_of(core: Core, event: Any, turn: Turn) -> Worker | None:
     return worker
 
 
-def lease_requested(core: Core, event: events.LeaseRequested, turn: Turn) -> None:
+def lease_requested(core: Core, event: events.Asked[wire.LeaseRequest], turn: Turn) -> None:
     """A worker asks for work."""
     worker = worker_of(core, event, turn)
     if worker is not None:
         core.scheduler.poll(worker, event, turn)
 
 
-def heartbeat(core: Core, event: events.HeartbeatReceived, turn: Turn) -> None:
+def heartbeat(core: Core, event: events.Asked[wire.Heartbeat], turn: Turn) -> None:
     """Renew the leases that a worker lists, and tell it which to stop."""
+    message = event.message
     worker = worker_of(core, event, turn)
     if worker is None:
         return
     if worker.beat is not None:
         core.fleet.answer_beat(worker, (), turn)
-    stop = core.book.hear(worker, event.held, turn, settled=event.settled)
+    stop = core.book.hear(worker, message.held, turn, settled=message.settled)
     worker.beat = event.request
-    if stop or not event.wait_s > 0.0:
+    if stop or not message.wait_s > 0.0:
         core.fleet.answer_beat(worker, stop, turn)
     else:
-        core.timers.arm(("beat", worker.name), turn.now + min(event.wait_s, core.settings.max_wait_s))
+        core.timers.arm(("beat", worker.name), turn.now + min(message.wait_s, core.settings.max_wait_s))
 
 
-def handed_in(core: Core, event: events.ResultsHandedIn, turn: Turn) -> None:
+def handed_in(core: Core, event: events.Asked[wire.HandIn], turn: Turn) -> None:
     """Take results, and answer once they are durable."""
     worker = worker_of(core, event, turn)
     if worker is None:
         return
-    for result in event.results:
+    for result in event.message.results:
         handin.take(core, worker, result, turn)
-    turn.reply(event.request, wire.HandInReply(n=len(event.results)))
+    turn.reply(event.request, wire.HandInReply(n=len(event.message.results)))
 
 
 def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
@@ -135,17 +140,18 @@ def liveness_lost(core: Core, event: events.LivenessLost, turn: Turn) -> None:
         core.timers.arm(("worker", worker.name), turn.now + core.settings.liveness_grace_s)
 
 
-def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
+def worker_state(core: Core, event: events.Asked[operator.SetWorker], turn: Turn) -> None:
     """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
-    if event.state != "active" and event.worker in core.fleet.quarantined:
-        text = f"{event.worker} is quarantined: {core.fleet.quarantined[event.worker]}"
+    message = event.message
+    if message.state != "active" and message.worker in core.fleet.quarantined:
+        text = f"{message.worker} is quarantined: {core.fleet.quarantined[message.worker]}"
         turn.refuse(event.request, Refusal.QUARANTINED, text)
         return
-    turn.persist(WorkerRow(worker=event.worker, state=event.state))
-    worker = core.fleet.workers.get(event.worker)
-    if worker is not None and event.state != "active":
+    turn.persist(WorkerRow(worker=message.worker, state=message.state))
+    worker = core.fleet.workers.get(message.worker)
+    if worker is not None and message.state != "active":
         core.scheduler.drop_poll(worker, turn)
-    core.fleet.set_state(event.worker, event.state)
+    core.fleet.set_state(message.worker, message.state)
     if worker is not None:
         if worker.beat is not None:
             core.fleet.answer_beat(worker, (), turn)
@@ -156,35 +162,31 @@ def worker_state(core: Core, event: events.WorkerStateSet, turn: Turn) -> None:
     turn.reply(event.request, operator.Done())
 
 
-def repinned(core: Core, event: events.RunRepinned, turn: Turn) -> None:
+def repinned(core: Core, event: events.Asked[operator.RepinRun], turn: Turn) -> None:
     """Pin an unfinished run to another class of workers, as an operator says."""
-    run = core.runs.get(event.run)
+    message = event.message
+    run = core.runs.get(message.run)
     offered = {
         profile.fingerprint_class: profile
         for profile in core.queue.profiles.values()
         if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
     }
     if run is None:
-        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no unfinished run {event.run!r}")
-    elif event.fingerprint_class not in offered:
-        text = f"no worker of class {event.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
+        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no unfinished run {message.run!r}")
+    elif message.fingerprint_class not in offered:
+        text = f"no worker of class {message.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
         turn.refuse(event.request, Refusal.UNKNOWN_CLASS, text)
     else:
-        text = f"{run.state.fingerprint_class} → {event.fingerprint_class}: {event.reason}"
-        profile = offered[event.fingerprint_class]
+        text = f"{run.state.fingerprint_class} → {message.fingerprint_class}: {message.reason}"
+        profile = offered[message.fingerprint_class]
         run.change(
             turn,
-            fingerprint_class=event.fingerprint_class,
+            fingerprint_class=message.fingerprint_class,
             overrides=(*run.state.overrides, text),
             description=run.state.description or profile.descriptions[run.flow.env],
             fingerprint=run.state.fingerprint or profile.fingerprint,
         )
         run.flow.description = run.state.description
-        core.place(run.flow, event.fingerprint_class, turn)
+        core.place(run.flow, message.fingerprint_class, turn)
         turn.log("warning", "run_repinned", run=run.id, override=text)
         turn.reply(event.request, operator.Done())
-
-
-def abandoned(core: Core, event: events.RequestAbandoned, turn: Turn) -> None:
-    """Who asked is gone: nothing is kept for it."""
-    core.polls.take(event.request)

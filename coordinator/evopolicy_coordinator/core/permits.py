@@ -18,32 +18,33 @@ if TYPE_CHECKING:
     from .machine import Core
 
 
-def requested(core: Core, event: events.PermitRequested, turn: Turn) -> None:
+def requested(core: Core, event: events.Asked[gateway.RequestPermit], turn: Turn) -> None:
     """A gateway asks that its agent may be alive on a kernel."""
-    run = core.runs.get(event.run)
+    message = event.message
+    run = core.runs.get(message.run)
     if run is None or run.state.phase != "open":
-        turn.refuse(event.request, *over(core, event.run))
+        turn.refuse(event.request, *over(core, message.run))
         return
     isolation = core.isolation
-    isolation.booted(event.machine_id, event.boot_id, turn)
-    kernel = isolation.place(run, event.boot_id)
+    isolation.booted(message.machine_id, message.boot_id, turn)
+    kernel = isolation.place(run, message.boot_id)
     if kernel is None:
         turn.reply(event.request, gateway.Permit(granted=True))
         return
-    same = kernel == event.boot_id
+    same = kernel == message.boot_id
     row = PermitRow(
         run=run.id,
         boot_id=kernel,
-        machine_id=event.machine_id if same else "",
-        host=event.host if same else "",
+        machine_id=message.machine_id if same else "",
+        host=message.host if same else "",
     )
     waits_for = isolation.ask(run, row, turn)
     if not waits_for:
         turn.reply(event.request, gateway.Permit(granted=True))
         return
-    core.timers.arm(("ask", (run.id, kernel)), turn.now + max(0.0, event.wait_s) + ASK_AGAIN_S)
+    core.timers.arm(("ask", (run.id, kernel)), turn.now + max(0.0, message.wait_s) + ASK_AGAIN_S)
     poll = Poll(event.request, "permit", poll_target(run.id, kernel))
-    if not core.polls.wait(poll, event.wait_s, turn.now):
+    if not core.polls.wait(poll, message.wait_s, turn.now):
         turn.reply(event.request, gateway.Permit(granted=False, waits_for=waits_for))
 
 
@@ -55,12 +56,13 @@ def answer(core: Core, poll: Poll, turn: Turn) -> None:
     turn.reply(poll.request, gateway.Permit(granted=False, waits_for=waits_for))
 
 
-def agent_gone(core: Core, event: events.AgentGone, turn: Turn) -> None:
+def agent_gone(core: Core, event: events.Asked[operator.AgentGone], turn: Turn) -> None:
     """An operator vouches that a run's agent is not alive any more."""
-    if event.run not in core.capabilities:
-        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
+    message = event.message
+    if message.run not in core.capabilities:
+        turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
         return
-    core.isolation.end(event.run, turn, "by an operator's word")
+    core.isolation.end(message.run, turn, "by an operator's word")
     turn.reply(event.request, operator.Done())
 
 

@@ -87,7 +87,8 @@ class Run:
 
 def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
     """Make a run, once for each key."""
-    known = core.run_keys.get(event.key)
+    message = event.message
+    known = core.run_keys.get(message.key)
     if known is not None:
         turn.reply(event.request, operator.RunCreated(run=known, capability=core.capabilities[known]))
         return
@@ -99,10 +100,10 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
         return
     row = RunRow(
         run=event.run,
-        key=event.key,
+        key=message.key,
         capability=event.capability,
         secret=event.secret,
-        settings=event.settings,
+        settings=message.settings,
         budget=event.budget,
         min_episodes_per_submit=event.min_episodes_per_submit,
         max_episodes_per_submit=event.max_episodes_per_submit,
@@ -124,7 +125,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
     turn.persist(state)
     core.pin(run.flow, turn)
     turn.reply(event.request, operator.RunCreated(run=event.run, capability=event.capability))
-    turn.log("info", "run_created", run=event.run, env=event.settings.env, budget=event.budget)
+    turn.log("info", "run_created", run=event.run, env=message.settings.env, budget=event.budget)
 
 
 def enter(core: Core, row: RunRow, state: RunStateRow) -> Run:
@@ -157,9 +158,9 @@ def _fault(event: events.RunCreated) -> str | None:
 # ---- what a gateway asks ----
 
 
-def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
+def opened(core: Core, event: events.Asked[gateway.OpenRun], turn: Turn) -> None:
     """Tell a gateway all that is fixed of its run; refused until some worker has offered the environment."""
-    run = _live(core, event.request, event.run, turn)
+    run = _live(core, event.request, event.message.run, turn)
     if run is None:
         return
     if run.flow.pin is None:
@@ -170,7 +171,7 @@ def opened(core: Core, event: events.RunOpened, turn: Turn) -> None:
         text = f"the run waits for {core.waits_for_workers(run.flow)}"
         turn.refuse(event.request, Refusal.NO_WORKER, text)
         return
-    if not event.asks_permit and _without_permit(core, event.request, run, turn):
+    if not event.message.asks_permit and _without_permit(core, event.request, run, turn):
         return
     turn.reply(
         event.request,
@@ -203,13 +204,13 @@ def _without_permit(core: Core, request: events.RequestId, run: Run, turn: Turn)
     return bool(waits_for)
 
 
-def state_requested(core: Core, event: events.StateRequested, turn: Turn) -> None:
+def state_requested(core: Core, event: events.Asked[gateway.StateRequest], turn: Turn) -> None:
     """Tell a gateway how its run stands, also after it is finished."""
-    last = core.finished.get(event.run)
+    last = core.finished.get(event.message.run)
     if last is not None:
         turn.reply(event.request, gateway.StateReply(state=last))
         return
-    run = _live(core, event.request, event.run, turn)
+    run = _live(core, event.request, event.message.run, turn)
     if run is not None:
         turn.reply(event.request, gateway.StateReply(state=run_state(core, run, turn.now)))
 
@@ -270,12 +271,13 @@ def over(core: Core, name: str) -> tuple[Refusal, str]:
     return Refusal.UNKNOWN_RUN, f"there is no run {name[:64]!r}"
 
 
-def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
+def submit(core: Core, event: events.Asked[gateway.Submit], turn: Turn) -> None:
     """Take a submit, or refuse it for the first cause in the protocol's order; a known key is answered as before."""
-    run = _live(core, event.request, event.run, turn)
+    message = event.message
+    run = _live(core, event.request, message.run, turn)
     if run is None:
         return
-    known = run.keys.get(event.key)
+    known = run.keys.get(message.key)
     if known is not None:
         _again(event, run.submits[known], turn)
         return
@@ -286,7 +288,7 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
         turn.refuse(event.request, Refusal.BUSY, f"submit {run.open} is still running; one runs at a time")
         return
     refused = refusal(
-        event.env_instances,
+        message.env_instances,
         n_cases=len(run.row.train),
         minimum=run.row.min_episodes_per_submit,
         maximum=run.row.max_episodes_per_submit,
@@ -295,7 +297,7 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
     if refused is not None:
         turn.refuse(event.request, *refused)
         return
-    if event.bundle is None and event.bundle_error is None:
+    if message.bundle is None and message.bundle_error is None:
         turn.refuse(event.request, Refusal.BAD_REQUEST, "a submit names a bundle, or says why there is none")
         return
     if _without_permit(core, event.request, run, turn):
@@ -303,10 +305,11 @@ def submit(core: Core, event: events.SubmitRequested, turn: Turn) -> None:
     _accept(core, run, event, turn)
 
 
-def _again(event: events.SubmitRequested, row: SubmitRow, turn: Turn) -> None:
+def _again(event: events.Asked[gateway.Submit], row: SubmitRow, turn: Turn) -> None:
     """The answer to a key that is known: the same as the first time, if the request is."""
-    if (event.env_instances, event.bundle) != (row.env_instances, row.bundle):
-        text = f"key {event.key!r} was used for submit {row.submit_index} with another request"
+    message = event.message
+    if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
+        text = f"key {message.key!r} was used for submit {row.submit_index} with another request"
         turn.refuse(event.request, Refusal.KEY_CONFLICT, text)
         return
     turn.reply(event.request, _accepted(row))
@@ -320,26 +323,27 @@ def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
     )
 
 
-def _accept(core: Core, run: Run, event: events.SubmitRequested, turn: Turn) -> None:
-    index, n = len(run.submits), len(event.env_instances)
+def _accept(core: Core, run: Run, event: events.Asked[gateway.Submit], turn: Turn) -> None:
+    message = event.message
+    index, n = len(run.submits), len(message.env_instances)
     first_global_episode = run.ledger.spent
     run.ledger.reserve(index, n)
     row = SubmitRow(
         run=run.id,
         submit_index=index,
-        key=event.key,
-        env_instances=event.env_instances,
-        bundle=event.bundle,
+        key=message.key,
+        env_instances=message.env_instances,
+        bundle=message.bundle,
         first_global_episode=first_global_episode,
         remaining_budget=run.ledger.available,
         accepted_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )
     run.submits.append(row)
-    run.keys[event.key] = index
+    run.keys[message.key] = index
     turn.reply(event.request, _accepted(row))
     turn.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
-    failure = event.bundle_error
+    failure = message.bundle_error
     if failure is not None:
         run.ledger.settle(index)
         status: SubmitStatus = "import_error"
@@ -470,24 +474,27 @@ def end(
 # ---- long polls ----
 
 
-def results(core: Core, event: events.ResultsRequested, turn: Turn) -> None:
+def results(core: Core, event: events.Asked[gateway.ResultsRequest], turn: Turn) -> None:
     """A gateway asks for outcomes: answered at once, or when there are more than it has."""
-    run = core.runs.get(event.run)
+    message = event.message
+    run = core.runs.get(message.run)
     if run is None:
-        if event.run in core.capabilities:
-            turn.add(_page(event.request, event.run, event.submit_index, event.cursor, None, "", 0.0, turn))
+        if message.run in core.capabilities:
+            turn.add(
+                _page(event.request, message.run, message.submit_index, message.cursor, None, "", 0.0, turn)
+            )
         else:
-            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {event.run!r}")
+            turn.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
         return
-    if not 0 <= event.submit_index < len(run.submits):
-        text = f"run {run.id!r} has {len(run.submits)} submits, none of index {event.submit_index}"
+    if not 0 <= message.submit_index < len(run.submits):
+        text = f"run {run.id!r} has {len(run.submits)} submits, none of index {message.submit_index}"
         turn.refuse(event.request, Refusal.UNKNOWN_SUBMIT, text)
         return
-    target = train_group(run.id, event.submit_index)
-    poll = Poll(event.request, "results", target, event.cursor)
-    closed = run.submits[event.submit_index].status is not None
-    ready = closed or _released(core, target) > event.cursor
-    if ready or not core.polls.wait(poll, event.wait_s, turn.now):
+    target = train_group(run.id, message.submit_index)
+    poll = Poll(event.request, "results", target, message.cursor)
+    closed = run.submits[message.submit_index].status is not None
+    ready = closed or _released(core, target) > message.cursor
+    if ready or not core.polls.wait(poll, message.wait_s, turn.now):
         answer(core, run, poll, turn)
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from evopolicy_common.messages import worker as wire
 
 from . import precedence
-from .events import LeaseRequested
+from .events import Asked
 from .jobs import AUDIT, EARLY_VALIDATION, HELDOUT, HIDDEN_AUDIT, REFERENCE, TRAIN, JobState
 from .queue import Lane
 from .turn import Turn
@@ -89,19 +89,20 @@ class Scheduler:
 
     # ---- polls ----
 
-    def poll(self, worker: Worker, event: LeaseRequested, turn: Turn) -> None:
+    def poll(self, worker: Worker, event: Asked[wire.LeaseRequest], turn: Turn) -> None:
         """A worker asks for leases; an older poll of it is answered with none."""
+        message = event.message
         core = self._core
         self.drop_poll(worker, turn)
-        if event.n < 1 or event.waited_s > event.wait_s + core.settings.late_s:
+        if message.n < 1 or event.waited_s > message.wait_s + core.settings.late_s:
             turn.reply(event.request, wire.Leases(leases=()))
             return
-        wait_s = min(max(event.wait_s - event.waited_s, 0.0), core.settings.max_wait_s)
-        warm = frozenset(event.warm_bundles) | frozenset(event.warm_environments)
-        n = max(1, min(event.n, 2 * worker.slots))
-        worker.poll = LeasePoll(event.request, n, warm, until=turn.now + wait_s, serial=event.serial)
+        wait_s = min(max(message.wait_s - event.waited_s, 0.0), core.settings.max_wait_s)
+        warm = frozenset(message.warm_bundles) | frozenset(message.warm_environments)
+        n = max(1, min(message.n, 2 * worker.slots))
+        worker.poll = LeasePoll(event.request, n, warm, until=turn.now + wait_s, serial=message.serial)
         if worker.first_serial is None:
-            worker.first_serial = event.serial
+            worker.first_serial = message.serial
         if not self._serve(worker, turn):
             core.timers.arm(("lease", worker.name), turn.now + wait_s)
             self._park(worker, turn)

@@ -134,19 +134,20 @@ class Fleet:
 
     def register(self, event: WorkerRegistered, kernel: Kernel, turn: Turn) -> Worker:
         """Take a worker in, or take it in again under a new session."""
+        message = event.message
         profile = self._profile(event)
-        old = self.workers.get(event.worker)
+        old = self.workers.get(message.worker)
         worker = Worker(
-            name=event.worker,
+            name=message.worker,
             session=event.session,
-            slots=max(1, event.slots),
-            host=event.host,
+            slots=max(1, message.slots),
+            host=message.host,
             profile=profile,
             last_seen=turn.now,
             kernel=kernel,
-            machine_id=event.machine_id,
+            machine_id=message.machine_id,
             machine=event.machine,
-            numerics=fingerprint_class(event.fingerprint, cpu=True),
+            numerics=fingerprint_class(message.fingerprint, cpu=True),
             state="lost",
         )
         if old is not None:
@@ -157,7 +158,7 @@ class Fleet:
             for lease in worker.leases.values():
                 lease.orphan_until = turn.now + self._settings.adoption_s
             self.sessions.pop(old.session, None)
-        self.workers[event.worker] = worker
+        self.workers[message.worker] = worker
         self.sessions[worker.session] = worker.name
         self._count_in(worker)
         if worker.benched_until > turn.now:
@@ -166,16 +167,17 @@ class Fleet:
         return worker
 
     def _profile(self, event: WorkerRegistered) -> Profile:
-        name = fingerprint_class(event.fingerprint, cpu=self._settings.fingerprint_cpu)
+        message = event.message
+        name = fingerprint_class(message.fingerprint, cpu=self._settings.fingerprint_cpu)
         key = (
-            frozenset(description.env for description in event.environments),
-            frozenset[Tier](event.tiers),
+            frozenset(description.env for description in message.environments),
+            frozenset[Tier](message.tiers),
             name,
         )
         profile = self._queue.profiles.get(key)
         if profile is None:
-            descriptions = {description.env: description for description in event.environments}
-            profile = Profile(key, event.fingerprint, descriptions)
+            descriptions = {description.env: description for description in message.environments}
+            profile = Profile(key, message.fingerprint, descriptions)
             self._queue.add_profile(profile)
         return profile
 

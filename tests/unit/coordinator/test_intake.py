@@ -19,7 +19,6 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFai
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator import request_checks
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.intake import Intake
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.state import ROLES, Identity
@@ -157,7 +156,7 @@ def test_what_an_agent_is_said_to_have_done_is_bounded_and_closes_its_run_all_th
         made = event(
             intake, key, gateway.CloseRun(run="r", token="capable", reason="agent_stopped", agent=facts)
         )
-        assert made.agent == (
+        assert made.message.agent == (
             facts if len(facts) == 1 else {"left_out": "300,917 bytes; 262,144 are the limit"}
         )
 
@@ -182,7 +181,7 @@ def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
     intake: Intake, blobs: BlobStore, uploads: Uploads
 ) -> None:
     failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
-    assert event(intake, SUBMIT, submit(bundle_error=failure)).bundle_error == failure
+    assert event(intake, SUBMIT, submit(bundle_error=failure)).message.bundle_error == failure
     assert refused(intake, SUBMIT, submit(bundle="a" * 64)).status == "missing_bundle"
     assert refused(intake, SUBMIT, submit(bundle="../../identity.json")).status == "missing_bundle"
     stored = blobs.put(b"bundle")
@@ -190,14 +189,14 @@ def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
     uploads.note("another", stored)
     assert refused(intake, SUBMIT, submit(bundle=stored)).status == "missing_bundle"
     uploads.note("r", stored)
-    assert event(intake, SUBMIT, submit(bundle=stored)).bundle == stored
+    assert event(intake, SUBMIT, submit(bundle=stored)).message.bundle == stored
     assert refused(intake, SUBMIT, submit()).status == "bad_message"
     assert refused(intake, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"
 
 
 def test_override_of_a_runs_class_needs_a_reason(intake: Intake) -> None:
     values = {"token": "operate", "run": "r", "fingerprint_class": "c"}
-    assert event(intake, OPS, operator.RepinRun(**values, reason="gone")).reason == "gone"
+    assert event(intake, OPS, operator.RepinRun(**values, reason="gone")).message.reason == "gone"
     assert refused(intake, OPS, operator.RepinRun(**values, reason=" ")).status == "bad_message"
 
 
@@ -218,11 +217,11 @@ def hand_in(**blobs_of_outcome: BlobRef) -> worker.HandIn:
 def test_results_must_hold_or_have_stored_the_blobs_they_name(intake: Intake, blobs: BlobStore) -> None:
     key = keys.worker_key("c", "done")
     data = b"trajectory"
-    assert isinstance(event(intake, key, hand_in(trajectory=blob(data))), events.ResultsHandedIn)
+    assert event(intake, key, hand_in(trajectory=blob(data))).message == hand_in(trajectory=blob(data))
     named = blob(data, inline=False)
     assert refused(intake, key, hand_in(trajectory=named)).status == "missing_blob"
     blobs.put(data)
-    assert isinstance(event(intake, key, hand_in(trajectory=named)), events.ResultsHandedIn)
+    assert event(intake, key, hand_in(trajectory=named)).message == hand_in(trajectory=named)
     wrong = BlobRef(digest=named.digest, size=len(data), inline=b"trajectorY")
     assert refused(intake, key, hand_in(video=wrong)).status == "bad_blob"
     assert refused(intake, key, hand_in(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
@@ -262,8 +261,8 @@ def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
     intake = make_intake(BlobStore(tmp_path_factory.getbasetemp()))
     message = gateway.ResultsRequest(run="r", token="capable", submit_index=0, cursor=cursor, wait_s=wait)
     made = event(intake, keys.gateway_key("c", "r", "results"), message)
-    assert 0 <= made.wait_s <= 60
-    assert 0 <= made.cursor < 2**31
+    assert 0 <= made.message.wait_s <= 60
+    assert 0 <= made.message.cursor < 2**31
 
 
 @pytest.mark.parametrize("index", [-1, 2**31, 2**63 - 1])

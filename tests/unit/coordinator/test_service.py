@@ -97,7 +97,7 @@ def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
     handle = Core.handle
 
     def stumble(core: Core, event: Any, now: float) -> Any:
-        if getattr(event, "key", "") == "poison":
+        if getattr(getattr(event, "message", None), "key", "") == "poison":
             raise ZeroDivisionError("planted")
         return handle(core, event, now)
 

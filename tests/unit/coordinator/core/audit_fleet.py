@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+from asking import asked
 from core_rig import ENV, Rig, describe, fingerprint, outcome_of, result
 
 from evopolicy_common.errors import RefusedError
@@ -42,7 +43,8 @@ class Fleet:
         self.adds.setdefault(name, 0.0)
         session = f"{name}-s{self.rig.request()}"
         reply = self.rig.tell(
-            events.WorkerRegistered(
+            asked(
+                wire.Register,
                 request=self.rig.request(),
                 worker=name,
                 session=session,

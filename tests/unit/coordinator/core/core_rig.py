@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
+from asking import asked
+
+from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import (
@@ -186,7 +189,8 @@ class Rig:
                hidden_from: int = 1000, **settings: Any) -> Any:  # fmt: skip
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
         reply = self.tell(
-            events.RunCreated(
+            asked(
+                operator.CreateRun,
                 request=self.request(),
                 stimulus_id=f"create-{run}",
                 run=run,
@@ -211,7 +215,9 @@ class Rig:
     def permit(self, run: str = "r1", boot_id: str = "agents", wait_s: float = 0.0, **more: Any) -> Any:
         """Ask for a permit; None while it waits."""
         return self.tell(
-            events.PermitRequested(request=self.request(), run=run, boot_id=boot_id, wait_s=wait_s, **more)
+            asked(
+                gateway.RequestPermit, request=self.request(), run=run, boot_id=boot_id, wait_s=wait_s, **more
+            )
         )
 
     def register(
@@ -225,7 +231,8 @@ class Rig:
     ) -> str:
         session = f"{worker}-s{self.request()}"
         reply = self.tell(
-            events.WorkerRegistered(
+            asked(
+                wire.Register,
                 request=self.request(),
                 worker=worker,
                 session=session,
@@ -246,7 +253,8 @@ class Rig:
         self, *ids: int, run: str = "r1", key: str = "k0", bundle: str | None = BUNDLE, **more: Any
     ) -> Any:
         return self.tell(
-            events.SubmitRequested(
+            asked(
+                gateway.Submit,
                 request=self.request(),
                 stimulus_id=f"submit-{key}",
                 run=run,
@@ -260,7 +268,8 @@ class Rig:
     def poll(self, session: str, n: int = 2, wait_s: float = 0.0, **more: Any) -> Any:
         """The leases that a poll gets; None while it waits."""
         reply = self.tell(
-            events.LeaseRequested(
+            asked(
+                wire.LeaseRequest,
                 request=self.request(),
                 worker=session.split("-")[0],
                 session=session,
@@ -283,7 +292,8 @@ class Rig:
             for each in held
         )
         return self.tell(
-            events.HeartbeatReceived(
+            asked(
+                wire.Heartbeat,
                 request=self.request(),
                 worker=session.split("-")[0],
                 session=session,
@@ -294,8 +304,12 @@ class Rig:
 
     def hand_in(self, session: str, *results: wire.JobResult) -> Any:
         return self.tell(
-            events.ResultsHandedIn(
-                request=self.request(), worker=session.split("-")[0], session=session, results=results
+            asked(
+                wire.HandIn,
+                request=self.request(),
+                worker=session.split("-")[0],
+                session=session,
+                results=results,
             )
         )
 
@@ -307,13 +321,18 @@ class Rig:
 
     def results(self, submit_index: int = 0, cursor: int = 0, wait_s: float = 0.0, run: str = "r1") -> Any:
         return self.tell(
-            events.ResultsRequested(
-                request=self.request(), run=run, submit_index=submit_index, cursor=cursor, wait_s=wait_s
+            asked(
+                gateway.ResultsRequest,
+                request=self.request(),
+                run=run,
+                submit_index=submit_index,
+                cursor=cursor,
+                wait_s=wait_s,
             )
         )
 
     def close(self, run: str = "r1") -> Any:
-        return self.tell(events.RunClosed(request=self.request(), run=run, reason="budget_spent"))
+        return self.tell(asked(gateway.CloseRun, request=self.request(), run=run, reason="budget_spent"))
 
     def work_off(self, session: str, values: Any = lambda job: 1.0, rounds: int = 10_000) -> int:
         """Let one worker play all there is; gives the number of jobs."""

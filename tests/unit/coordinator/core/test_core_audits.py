@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 
 import pytest
+from asking import asked
 from audit_fleet import WAIT_S, Fleet, told
 from core_rig import BUNDLE, outcome_of, result
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import audit, events
+from evopolicy_coordinator.core import audit
 from evopolicy_coordinator.core.leases import lease_id
 
 # ---- who plays what again ----
@@ -65,7 +67,7 @@ def test_a_run_waits_for_a_busy_second_worker_up_to_its_bound() -> None:
             rig.pass_time(1.0)
             rig.beat(fleet.sessions["w2"])
 
-    waits = rig.tell(events.RunWaited(request="w", run="r1", wait_s=0.0))
+    waits = rig.tell(asked(operator.WaitRun, request="w", run="r1", wait_s=0.0))
     assert "audits" in waits.waits_for
     beat_for(WAIT_S - 10.0)
     assert "r1" in rig.core.runs
@@ -118,7 +120,7 @@ def test_a_cancelled_run_plays_no_more_audits() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
     fleet.train(0, 1)
     fleet.turn("w1")
-    fleet.rig.tell(events.RunCancelled(request="c", run="r1"))
+    fleet.rig.tell(asked(operator.CancelRun, request="c", run="r1"))
     assert told(fleet.rig.finished()).not_audited == {audit.CANCELLED: 2}
     assert not fleet.rig.core.groups
 
@@ -182,8 +184,13 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
     name = lease_id(fleet.rig.core.secret_of(job.group), job.job_id, 1, "w1")
     claimed = wire.HeldLease(lease_id=name, job_id=job.job_id, attempt=1, running=True)
     reply = fleet.rig.tell(
-        events.HeartbeatReceived(
-            request="beat", worker="w1", session=fleet.sessions["w1"], held=(claimed,), wait_s=0.0
+        asked(
+            wire.Heartbeat,
+            request="beat",
+            worker="w1",
+            session=fleet.sessions["w1"],
+            held=(claimed,),
+            wait_s=0.0,
         )
     )
     assert reply.cancelled == (claimed.lease_id,)

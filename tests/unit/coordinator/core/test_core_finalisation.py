@@ -8,13 +8,14 @@ import core_rig
 import hypothesis.strategies as st
 import msgspec
 import pytest
+from asking import asked
 from core_rig import BUNDLE, Rig, done, result, split_of
 from hypothesis import given, settings
 
+from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadEvaluation
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
 from evopolicy_coordinator.core.seeds import policy_seed
@@ -145,13 +146,13 @@ def test_a_checkpoint_quarantined_while_hidden_is_ineligible_and_only_the_end_te
     rig.create(n_valid=1)
     rig.submit(0)
     rig.play(session, *rig.poll(session, 8))
-    before = rig.tell(events.StateRequested(request="s1", run="r1"))
+    before = rig.tell(asked(gateway.StateRequest, request="s1", run="r1"))
     for _ in range(3):
         rig.pass_time(10.0)
         rig.beat(session)
         rig.hand_in(session, *(result(each, "slot_died") for each in rig.poll(session, 8)))
     assert rig.row(SubmitRow, "r1", 0).status == "ok"
-    assert rig.tell(events.StateRequested(request="s2", run="r1")) == before
+    assert rig.tell(asked(gateway.StateRequest, request="s2", run="r1")) == before
     rig.close()
     rig.work_off(session)
     finished = rig.finished()
@@ -196,7 +197,7 @@ def test_progress_tells_an_operator_which_phase_a_run_is_in() -> None:
     seen = []
 
     def look() -> None:
-        progress = rig.tell(events.RunWaited(request=rig.request(), run="r1", wait_s=0.0))
+        progress = rig.tell(asked(operator.WaitRun, request=rig.request(), run="r1", wait_s=0.0))
         assert isinstance(progress, RunProgress)
         seen.append((progress.phase, progress.done, progress.total))
 
@@ -266,15 +267,15 @@ def ask(rig: Rig, key: str = "e", **changes: Any) -> object:
         "cases": (Case(seed=4), Case(seed=4)),
         "secret": b"x",
         "record": "full",
-        "tier": "bwrap",
+        "sandbox_tier": "bwrap",
         "limits": ResourceLimits(),
     }
-    return rig.tell(events.EvaluationRequested(**values | changes))
+    return rig.tell(asked(operator.Evaluate, **values | changes))
 
 
 def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:
     answer = rig.tell(
-        events.EvaluationPolled(request=rig.request(), evaluation="ev-e", cursor=cursor, wait_s=wait_s)
+        asked(operator.EvaluationPoll, request=rig.request(), evaluation="ev-e", cursor=cursor, wait_s=wait_s)
     )
     assert isinstance(answer, ReadEvaluation)
     return answer
@@ -303,7 +304,7 @@ def test_an_evaluation_plays_cases_outside_any_run() -> None:
 
 def test_an_unknown_evaluation_is_refused() -> None:
     rig = Rig()
-    answer = rig.tell(events.EvaluationPolled(request="p", evaluation="none", cursor=0, wait_s=0.0))
+    answer = rig.tell(asked(operator.EvaluationPoll, request="p", evaluation="none", cursor=0, wait_s=0.0))
     assert answer.status == "unknown_evaluation"
 
 

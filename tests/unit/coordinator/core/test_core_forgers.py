@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from asking import asked
 from audit_fleet import WAIT_S, Fleet, told
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -124,10 +125,10 @@ def test_an_operator_takes_a_quarantined_worker_back() -> None:
     fleet = Fleet(w1=0.0, w2=5.0, w3=0.0)
     fleet.whole_run()
     rig = fleet.rig
-    drained = rig.tell(events.WorkerStateSet(request="d", worker="w2", state="draining"))
+    drained = rig.tell(asked(operator.SetWorker, request="d", worker="w2", state="draining"))
     assert isinstance(drained, wire.Refused)
     assert isinstance(
-        rig.tell(events.WorkerStateSet(request="a", worker="w2", state="active")), operator.Done
+        rig.tell(asked(operator.SetWorker, request="a", worker="w2", state="active")), operator.Done
     )
     fleet.join("w2")
     assert rig.core.fleet.quarantined == {}

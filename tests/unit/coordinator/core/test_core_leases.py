@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+from asking import asked
 from core_rig import Rig, done, outcome_of, result
 
+from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_coordinator.core import events
@@ -181,7 +183,8 @@ def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_n
     leases = rig.poll(first, 1)
     assert len(leases) == 3  # short episodes come in a batch
     rig.tell(
-        events.HeartbeatReceived(
+        asked(
+            wire.Heartbeat,
             request="beat",
             worker="w1",
             session=first,
@@ -389,7 +392,7 @@ def test_a_held_back_heartbeat_is_answered_at_once_when_a_lease_is_to_stop() -> 
     rig, (first,), lease = one_job("w1")
     assert rig.beat(first, lease, wait_s=5.0) is None
     request = rig._requests
-    rig.tell(events.RunCancelled(request="cancel", run="r1"))
+    rig.tell(asked(operator.CancelRun, request="cancel", run="r1"))
     assert rig.replies[request].cancelled == (lease.lease_id,)
 
 
@@ -415,7 +418,7 @@ def test_no_poll_waits_longer_than_the_longest_wait() -> None:
     rig.create()
     assert rig.poll(session, 1, wait_s=1000.0) is None
     lease = rig._requests
-    assert rig.tell(events.RunWaited(request="wait", run="r1", wait_s=1000.0)) is None
+    assert rig.tell(asked(operator.WaitRun, request="wait", run="r1", wait_s=1000.0)) is None
     assert rig.beat(session, wait_s=1000.0) is None
     beat = rig._requests
     rig.pass_time(5.0)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from asking import asked
 from core_rig import Rig, result, split_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.operator import ELSEWHERE
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.records import PermitRow
 
 HERE = "kernel-of-w1"
@@ -27,7 +27,7 @@ def scored(rig: Rig, session: str, run: str = "r0") -> None:
 
 
 def gone(rig: Rig, run: str = "r1") -> Any:
-    return rig.tell(events.AgentGone(request=rig.request(), run=run))
+    return rig.tell(asked(operator.AgentGone, request=rig.request(), run=run))
 
 
 def reboot(rig: Rig, name: str = "w1", boot_id: str = "another", machine_id: str = "m") -> str:
@@ -190,10 +190,10 @@ def test_a_lease_that_is_on_its_way_is_not_taken_for_one_that_was_let_go_of() ->
     rig.poll(session, 8, serial=7)
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
-    before = events.HeartbeatReceived(request=rig.request(), worker="w1", session=session, held=(), settled=6)
+    before = asked(wire.Heartbeat, request=rig.request(), worker="w1", session=session, held=(), settled=6)
     rig.tell(before)
     assert not rig.permit("r1", HERE).granted
-    after = events.HeartbeatReceived(request=rig.request(), worker="w1", session=session, held=(), settled=7)
+    after = asked(wire.Heartbeat, request=rig.request(), worker="w1", session=session, held=(), settled=7)
     rig.tell(after)
     assert rig.permit("r1", HERE).granted
 
@@ -248,7 +248,7 @@ def test_a_cancelled_runs_permit_ends_when_its_gateway_says_so_or_after_a_while(
     session = rig.register(slots=8)
     scored(rig, session)
     rig.create("r1", agent=HERE)
-    rig.tell(events.RunCancelled(request=rig.request(), run="r1"))
+    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
     if restart:
         rig.load()
         session = rig.register(slots=8)
@@ -334,7 +334,7 @@ def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> N
     def speak() -> Any:
         if by == "submit":
             return rig.submit(0, run="r1")
-        return rig.tell(events.RunOpened(request=rig.request(), run="r1"))
+        return rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1"))
 
     assert speak().status == Refusal.UNAVAILABLE
     rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
@@ -346,7 +346,7 @@ def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:
     rig = Rig()
     rig.register()
     rig.create("r1", agent=None)
-    opened = rig.tell(events.RunOpened(request=rig.request(), run="r1", asks_permit=True))
+    opened = rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1", asks_permit=True))
     assert isinstance(opened, gateway.RunOpened)
     assert rig.core.isolation.held("r1") == []
 
@@ -406,7 +406,7 @@ def test_closed_runs_and_cancelled_ones_get_no_permit() -> None:
     rig.create("r1", agent=None)
     assert rig.permit("r1", HERE, wait_s=9.0) is None
     request = rig._requests
-    rig.tell(events.RunCancelled(request=rig.request(), run="r1"))
+    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
     assert rig.replies[request].status == Refusal.RUN_CANCELLED
     rig.hand_in(session, *(result(lease, "returned") for lease in leases))
     assert splits(rig.poll(session, 8)) == {"random", "validation"}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from asking import asked
 from audit_fleet import WAIT_S as AUDIT_WAIT_S
 from audit_fleet import Fleet
 from core_rig import Rig, split_of
 
+from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_coordinator.core import events
 
 HERE = "kernel-of-w1"
 WAIT_S = 60.0
@@ -130,7 +131,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     (hidden,) = rig.poll(session, 1)
     assert split_of(hidden.job) == "validation"
     keep_alive(rig, session, 10.0, hidden)
-    state = rig.tell(events.StateRequested(request=rig.request(), run="r1")).state
+    state = rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state
     assert state.in_flight.waits_for == "hidden cases of another run are being scored"
     assert 7.0 <= state.in_flight.held_s <= 11.0
     assert state.held_s == state.in_flight.held_s
@@ -144,7 +145,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     assert held_s >= 7.0
     rig.load()
     rig.register(slots=1)
-    assert rig.tell(events.StateRequested(request=rig.request(), run="r1")).state.held_s == held_s
+    assert rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state.held_s == held_s
 
 
 def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() -> None:
@@ -196,7 +197,7 @@ def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
     waiting(rig, session)
     assert rig.core.isolation.kernel(HERE).reversals
     if why == "draining":
-        rig.tell(events.WorkerStateSet(request=rig.request(), worker="w1", state="draining"))
+        rig.tell(asked(operator.SetWorker, request=rig.request(), worker="w1", state="draining"))
         keep_alive(rig, session, 4.0)
     else:
         rig.pass_time(20.0)

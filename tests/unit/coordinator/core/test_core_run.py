@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from asking import asked
 from core_rig import Rig, split_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.worker import Refused
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
 from evopolicy_coordinator.core.records import SubmitRow, submit_done
 
@@ -15,7 +15,7 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
     rig = Rig()
     session = rig.register()
     assert isinstance(rig.create(), operator.RunCreated)
-    opened = rig.tell(events.RunOpened(request="open", run="r1"))
+    opened = rig.tell(asked(gateway.OpenRun, request="open", run="r1"))
     assert isinstance(opened, gateway.RunOpened)
     assert opened.state.remaining_budget == 16
 
@@ -34,7 +34,7 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
     rig.work_off(session, lambda job: 5.0)
     rig.submit(4, key="k2")
     rig.work_off(session, lambda job: 5.0)
-    waiting = rig.tell(events.RunWaited(request="wait", run="r1", wait_s=60.0))
+    waiting = rig.tell(asked(operator.WaitRun, request="wait", run="r1", wait_s=60.0))
     assert waiting is None
     rig.close()
     rig.work_off(session, lambda job: {"heldout": 7.0, "random": -1.0}[split_of(job)])
@@ -56,7 +56,7 @@ def test_a_request_of_an_unknown_run_is_refused() -> None:
         rig.submit(0),
         rig.results(),
         rig.close(),
-        rig.tell(events.StateRequested(request="s", run="r1")),
+        rig.tell(asked(gateway.StateRequest, request="s", run="r1")),
     ):
         assert isinstance(answer, Refused)
         assert answer.status == "unknown_run"

@@ -6,11 +6,12 @@ from collections import Counter
 from typing import Literal
 
 import pytest
+from asking import asked
 from core_rig import BUNDLE, Rig, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import events, scheduler
+from evopolicy_coordinator.core import scheduler
 
 
 def validating(rig: Rig, session: str, n: int = 1) -> None:
@@ -256,10 +257,12 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     worker = next(each for each in rig.core.status(rig.now).workers if each.worker == "w2")
     assert "r1" in worker.refused
     named = worker.fingerprint
-    wrong = rig.tell(events.RunRepinned(request="a", run="r1", fingerprint_class="nope", reason="x"))
+    wrong = rig.tell(asked(operator.RepinRun, request="a", run="r1", fingerprint_class="nope", reason="x"))
     assert wrong.status == "unknown_class"
     rig.tell(
-        events.RunRepinned(request="b", run="r1", fingerprint_class=named, reason="the old host is gone")
+        asked(
+            operator.RepinRun, request="b", run="r1", fingerprint_class=named, reason="the old host is gone"
+        )
     )
     rig.play(other, *rig.poll(other))
     rig.close()
@@ -277,7 +280,7 @@ def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
     rig.create()
     rig.submit(0, 1)
     (lease, _) = rig.poll(session, 2)
-    answer = rig.tell(events.WorkerStateSet(request="out", worker="w1", state=state))
+    answer = rig.tell(asked(operator.SetWorker, request="out", worker="w1", state=state))
     assert isinstance(answer, operator.Done)
     assert rig.beat(session, lease).drain is ends
     rig.play(session, lease)
@@ -288,7 +291,7 @@ def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
     assert rig.beat(session).drain is ends
     assert rig.poll(session) == []
     assert [each.state for each in rig.core.status(rig.now).workers] == [state]
-    rig.tell(events.WorkerStateSet(request="back", worker="w1", state="active"))
+    rig.tell(asked(operator.SetWorker, request="back", worker="w1", state="active"))
     assert len(rig.poll(session)) == 1
 
 
@@ -299,7 +302,7 @@ def test_a_run_opened_while_its_only_worker_was_away_is_played_when_it_is_back(
     rig = Rig()
     session = rig.register()
     if how == "paused":
-        rig.tell(events.WorkerStateSet(request="out", worker="w1", state="paused"))
+        rig.tell(asked(operator.SetWorker, request="out", worker="w1", state="paused"))
     else:
         rig.pass_time(60.0)
     assert [each.state for each in rig.core.status(rig.now).workers] == [how]
@@ -307,7 +310,7 @@ def test_a_run_opened_while_its_only_worker_was_away_is_played_when_it_is_back(
     rig.submit(0)
     if how == "paused":
         assert rig.poll(session) == []
-        rig.tell(events.WorkerStateSet(request="back", worker="w1", state="active"))
+        rig.tell(asked(operator.SetWorker, request="back", worker="w1", state="active"))
     assert len(rig.poll(session)) == 1
 
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import msgspec
 import pytest
+from asking import asked
 from core_rig import BUNDLE, Rig, done, outcome_of, result
 
-from evopolicy_common.messages import gateway
+from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.worker import Refused
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadResults
 from evopolicy_coordinator.core.records import SubmitRow, submit_done
 
@@ -37,7 +37,7 @@ def test_rejected_request_costs_no_budget(ids: tuple[int, ...], status: str) -> 
     answer = rig.submit(*ids)
     assert isinstance(answer, Refused)
     assert answer.status == status
-    state = rig.tell(events.StateRequested(request="state", run="r1")).state
+    state = rig.tell(asked(gateway.StateRequest, request="state", run="r1")).state
     assert (state.remaining_budget, state.n_submits) == (16, 0)
     assert not [row for row in rig.rows.values() if isinstance(row, SubmitRow)]
 
@@ -63,9 +63,9 @@ def test_a_second_submit_while_one_runs_is_refused_and_names_the_first() -> None
 def test_a_run_without_a_worker_waits_to_be_opened() -> None:
     rig = Rig()
     rig.create()
-    assert rig.tell(events.RunOpened(request="early", run="r1")).status == "no_worker"
+    assert rig.tell(asked(gateway.OpenRun, request="early", run="r1")).status == "no_worker"
     rig.register()
-    assert isinstance(rig.tell(events.RunOpened(request="late", run="r1")), gateway.RunOpened)
+    assert isinstance(rig.tell(asked(gateway.OpenRun, request="late", run="r1")), gateway.RunOpened)
 
 
 def test_nothing_is_released_before_the_episode_at_index_0_shows_a_policy() -> None:
@@ -75,7 +75,7 @@ def test_nothing_is_released_before_the_episode_at_index_0_shows_a_policy() -> N
     rig.play(session, leases[1])
     assert rig.results().upto == 0
     poll = rig.request()
-    waiting = events.ResultsRequested(request=poll, run="r1", submit_index=0, cursor=0, wait_s=9.0)
+    waiting = asked(gateway.ResultsRequest, request=poll, run="r1", submit_index=0, cursor=0, wait_s=9.0)
     assert rig.tell(waiting) is None
     rig.play(session, leases[0])
     page = rig.replies[poll]
@@ -194,9 +194,9 @@ def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None
     rig, session = started()
     rig.submit(0, 1)
     (first, _) = rig.poll(session, 2)
-    waiting = events.ResultsRequested(request="page", run="r1", submit_index=0, cursor=0, wait_s=9.0)
+    waiting = asked(gateway.ResultsRequest, request="page", run="r1", submit_index=0, cursor=0, wait_s=9.0)
     assert rig.tell(waiting) is None
-    rig.tell(events.RunCancelled(request="cancel", run="r1"))
+    rig.tell(asked(operator.CancelRun, request="cancel", run="r1"))
     assert isinstance(rig.replies["page"], ReadResults)
     assert (rig.finished().status, rig.finished().budget_used) == ("cancelled", 0)
     row = rig.row(SubmitRow, "r1", 0)
@@ -205,5 +205,5 @@ def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None
     assert (done.n_episodes, done.remaining_budget) == (0, 16)
     assert rig.beat(session, first).cancelled == (first.lease_id,)
     assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_cancelled"
-    state = rig.tell(events.StateRequested(request="state", run="r1")).state
+    state = rig.tell(asked(gateway.StateRequest, request="state", run="r1")).state
     assert (state.is_finalized, state.cancelled, state.remaining_budget) == (True, True, 16)
