@@ -62,11 +62,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 _decoder = msgspec.json.Decoder(Summary)
 
 
-def encode_summary(summary: Summary) -> bytes:
-    """The file's bytes: JSON, two-space indent, fields in declared order, one newline at the end."""
-    return msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
-
-
 def decode_summary(data: bytes) -> Summary:
     """The summary in `data`, unknown fields skipped; ProtocolError when it is none that this version reads."""
     try:

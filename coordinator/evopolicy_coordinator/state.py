@@ -7,7 +7,7 @@
       passwords                   the same passwords, for Zenoh's router
       credentials/<role>.json     what workers, gateways and operators of this machine connect with
       coordinator.sqlite          everything that must be true
-      blobs/, bundles/            trajectories and videos; policy bundles
+      blobs/                      trajectories, videos and policy bundles
       coordinator.sock            where processes of this machine connect
 
 All that grants anything is made once, has mode 0600, and survives restarts, so that workers reconnect by themselves.

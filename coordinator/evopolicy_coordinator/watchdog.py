@@ -29,8 +29,6 @@ class LoopWatchdog:
         self._loop_thread = threading.get_ident()
         self._beat = time.monotonic()
         self._stop = threading.Event()
-        self.gaps = 0
-        """How often the loop stood still for longer than `gap_s`."""
         self._handle = self._loop.call_later(_BEAT_S, self._tick)
         self._thread = threading.Thread(target=self._watch, name="loop-watchdog", daemon=True)
         self._thread.start()
@@ -44,7 +42,6 @@ class LoopWatchdog:
         now = time.monotonic()
         gap = now - self._beat - _BEAT_S
         if gap > self._gap_s:
-            self.gaps += 1
             log.warning("the event loop stood still", gap_s=round(gap, 2))
         self._beat = now
         self._handle = self._loop.call_later(_BEAT_S, self._tick)

@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import fmean, pstdev
 from typing import Any, Literal
 
+import msgspec
 from agent_logs import LOGS
 from invented_policies import Version
 
@@ -28,7 +29,7 @@ from evopolicy_common.run_record import (
     encode_checkpoint_metrics,
     encode_run_record,
 )
-from evopolicy_common.summary import Summary, encode_summary, utc_text
+from evopolicy_common.summary import Summary, utc_text
 
 START = 1_760_000_000.0
 
@@ -192,7 +193,7 @@ def _write_submit(
     )
     feedback = folder / "workspace" / "feedback" / f"submit_{index:03d}"
     feedback.mkdir(parents=True)
-    (feedback / "summary.json").write_bytes(encode_summary(summary))
+    (feedback / "summary.json").write_bytes(msgspec.json.encode(summary))
     checkpoint = folder / "checkpoints" / f"submit_{index:03d}"
     digest = hashlib.sha256()
     for name, data in sorted({**{k: v.encode() for k, v in version.files.items()}, **version.images}.items()):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
@@ -156,7 +156,3 @@ def how(status: int) -> How:
     if number == signal.SIGKILL:
         return "SIGKILL"
     return "fault" if number in FAULTS else "signal"
-
-
-FIRSTS: tuple[First, ...] = get_args(First)
-HOWS: tuple[How, ...] = get_args(How)

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 import pytest
@@ -23,7 +24,7 @@ from slots import HONEST, QUICK, Slots, begun, family, make_job, misbehaving, pi
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker import endings, monitor
-from evopolicy_worker.endings import FAULTS, FIRSTS, HOWS, TABLE, Ending
+from evopolicy_worker.endings import FAULTS, TABLE, Ending, First, How
 from evopolicy_worker.slot import Slot
 
 PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)
@@ -58,7 +59,7 @@ def test_each_row_of_the_table_gives_its_verdict(row: endings.Row) -> None:
 def every_ending() -> Iterator[Ending]:
     limits = (None, "oom", "cpu_limit", "act_timeout", "episode_timeout", "process_limit")
     for first, how, limit, began, held in itertools.product(
-        FIRSTS, HOWS, limits, (True, False), (True, False)
+        get_args(First), get_args(How), limits, (True, False), (True, False)
     ):
         yield Ending(first, how, limit, began, held)  # type: ignore[arg-type]
 
@@ -81,7 +82,7 @@ def test_whatever_a_policy_can_bring_about_is_its_own() -> None:
             assert ours, ending
 
 
-@given(st.integers(0, 0xFFFF), st.sampled_from(FIRSTS), st.booleans(), st.booleans())
+@given(st.integers(0, 0xFFFF), st.sampled_from(get_args(First)), st.booleans(), st.booleans())
 def test_every_status_of_a_process_has_a_verdict(
     status: int, first: endings.First, began: bool, held: bool
 ) -> None:
