@@ -26,10 +26,10 @@ import evopolicy_common
 import evopolicy_worker
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.seccomp.numbers import SECCOMP
 from evopolicy_worker.environments import process_environment
 from evopolicy_worker.sandbox import jail, seccomp
 from evopolicy_worker.sandbox.inside import zygote as inside
-from evopolicy_worker.sandbox.syscall_numbers import SECCOMP
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64")
 _ETC = ("ld.so.cache", "alternatives", "fonts", "glvnd", "drirc", "localtime", "nvidia", "vulkan", "OpenCL")

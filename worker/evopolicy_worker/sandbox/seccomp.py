@@ -21,16 +21,25 @@ from __future__ import annotations
 import errno
 import os
 import platform
-import struct
 
 from evopolicy_common.errors import SandboxError
-from evopolicy_worker.sandbox.syscall_numbers import NUMBERS, REACHING_OUT, REFUSED, SOCKET
+from evopolicy_common.seccomp import (
+    ALLOWED,
+    AND,
+    JUMP_AT_LEAST,
+    JUMP_EQUAL,
+    KILLED,
+    LOAD,
+    Instruction,
+    argument,
+    one_of,
+    program,
+    refuse,
+)
+from evopolicy_common.seccomp.numbers import NUMBERS, REACHING_OUT, REFUSED, SOCKET
 
 PID_MARK = 0x7FFFABCD
 """Stands in the filter for the pid of the process that installs it; instructions are 8 bytes, this is their last word."""
-
-_AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-_X32_BIT = 0x40000000
 
 _FCNTL = (
     0,
@@ -72,18 +81,8 @@ _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
 _YOUNGEST = 450
 
-# Classic BPF: opcodes, and where `struct seccomp_data` keeps what they load.
-_LOAD, _AND = 0x20, 0x54
-_JUMP_EQUAL, _JUMP_AT_LEAST = 0x15, 0x35
-_RETURN = 0x06
-_NUMBER, _ARCHITECTURE = 0, 4
-_KILL_PROCESS, _ERRNO, _ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
-
-Instruction = tuple[int, int, int, int]
 Interval = tuple[int, list[Instruction]]
 """The first number, and what to do with it: instructions that end in a verdict."""
-
-_ALLOWED: Instruction = (_RETURN, 0, 0, _ALLOW)
 
 
 def supported() -> bool:
@@ -104,79 +103,79 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         # Its caller looks at the word again, as after any other wake, and again: the C library's join of a thread asks
         # so, and computes while it waits.
         "futex": [
-            (_LOAD, 0, 0, _argument(1)),
-            (_AND, 0, 0, _FUTEX_PRIVATE),
-            (_JUMP_EQUAL, 0, 1, _FUTEX_PRIVATE),
-            _ALLOWED,
-            (_LOAD, 0, 0, _argument(1)),
-            (_AND, 0, 0, 0x7F),
-            (_JUMP_EQUAL, 1, 0, _FUTEX_WAIT),
-            (_JUMP_EQUAL, 0, 1, _FUTEX_WAIT_BITSET),
-            _refuse(errno.EAGAIN),
-            _refuse(errno.EINVAL),
+            (LOAD, 0, 0, argument(1)),
+            (AND, 0, 0, _FUTEX_PRIVATE),
+            (JUMP_EQUAL, 0, 1, _FUTEX_PRIVATE),
+            ALLOWED,
+            (LOAD, 0, 0, argument(1)),
+            (AND, 0, 0, 0x7F),
+            (JUMP_EQUAL, 1, 0, _FUTEX_WAIT),
+            (JUMP_EQUAL, 0, 1, _FUTEX_WAIT_BITSET),
+            refuse(errno.EAGAIN),
+            refuse(errno.EINVAL),
         ],
         # Advice, which may be ignored.
-        "fadvise64": [_refuse(0)],
-        "readahead": [_refuse(0)],
-        "madvise": _one_of(2, _MADVISE, errno.EINVAL),
-        "fsync": [_refuse(0)],
-        "fdatasync": [_refuse(0)],
-        "msync": [_refuse(0)],
+        "fadvise64": [refuse(0)],
+        "readahead": [refuse(0)],
+        "madvise": one_of(2, _MADVISE, refuse(errno.EINVAL)),
+        "fsync": [refuse(0)],
+        "fdatasync": [refuse(0)],
+        "msync": [refuse(0)],
         # Pipes are for processes, of which there are no more: `subprocess` fails here as it would at `fork`.
-        "pipe": [_refuse(errno.EAGAIN)],
-        "pipe2": [_refuse(errno.EAGAIN)],
-        "statfs": [_refuse(errno.ENOSYS)],
-        "fstatfs": [_refuse(errno.ENOSYS)],
+        "pipe": [refuse(errno.EAGAIN)],
+        "pipe2": [refuse(errno.EAGAIN)],
+        "statfs": [refuse(errno.ENOSYS)],
+        "fstatfs": [refuse(errno.ENOSYS)],
         # Who asks so falls back to `newfstatat`, which shows no mount.
-        "statx": [_refuse(errno.ENOSYS)],
+        "statx": [refuse(errno.ENOSYS)],
         "mmap": [
-            (_LOAD, 0, 0, _argument(3)),
-            (_AND, 0, 0, _MAP_SHARED | _MAP_ANONYMOUS),
-            (_JUMP_EQUAL, 0, 1, _MAP_SHARED | _MAP_ANONYMOUS),
-            _refuse(errno.EPERM),
-            (_LOAD, 0, 0, _argument(3)),
-            (_AND, 0, 0, _MAP_HUGETLB),
-            (_JUMP_EQUAL, 0, 1, _MAP_HUGETLB),
-            _refuse(errno.ENOMEM),
-            _ALLOWED,
+            (LOAD, 0, 0, argument(3)),
+            (AND, 0, 0, _MAP_SHARED | _MAP_ANONYMOUS),
+            (JUMP_EQUAL, 0, 1, _MAP_SHARED | _MAP_ANONYMOUS),
+            refuse(errno.EPERM),
+            (LOAD, 0, 0, argument(3)),
+            (AND, 0, 0, _MAP_HUGETLB),
+            (JUMP_EQUAL, 0, 1, _MAP_HUGETLB),
+            refuse(errno.ENOMEM),
+            ALLOWED,
         ],
         # The C library uses `preadv` where no flag is asked for.
-        "preadv2": [_refuse(errno.ENOSYS)],
-        "pwritev2": [_refuse(errno.ENOSYS)],
-        "ioctl": _one_of(1, _IOCTL, errno.ENOTTY),
-        "fcntl": _one_of(1, _FCNTL, errno.EPERM),
-        "prctl": _one_of(0, _PRCTL, errno.EPERM),
+        "preadv2": [refuse(errno.ENOSYS)],
+        "pwritev2": [refuse(errno.ENOSYS)],
+        "ioctl": one_of(1, _IOCTL, refuse(errno.ENOTTY)),
+        "fcntl": one_of(1, _FCNTL, refuse(errno.EPERM)),
+        "prctl": one_of(0, _PRCTL, refuse(errno.EPERM)),
         "kill": _own_signals(1),
         "tgkill": _own_signals(2),
         # Its limits may be looked at. Of another CPU limit it could be killed as if from outside.
         "prlimit64": [
-            (_LOAD, 0, 0, _argument(2)),
-            (_JUMP_EQUAL, 1, 0, 0),
-            _refuse(errno.EPERM),
-            (_LOAD, 0, 0, _argument(2) + 4),
-            (_JUMP_EQUAL, 1, 0, 0),
-            _refuse(errno.EPERM),
-            *_one_of(0, (0, PID_MARK), errno.EPERM),
+            (LOAD, 0, 0, argument(2)),
+            (JUMP_EQUAL, 1, 0, 0),
+            refuse(errno.EPERM),
+            (LOAD, 0, 0, argument(2) + 4),
+            (JUMP_EQUAL, 1, 0, 0),
+            refuse(errno.EPERM),
+            *one_of(0, (0, PID_MARK), refuse(errno.EPERM)),
         ],
         # As on a file system without them: `shutil.copytree` goes on then, and with no other answer.
-        **{name: [_refuse(errno.ENOTSUP)] for name in _EXTENDED_ATTRIBUTES},
+        **{name: [refuse(errno.ENOTSUP)] for name in _EXTENDED_ATTRIBUTES},
         "clone": [
-            (_LOAD, 0, 0, _argument(0)),
-            (_AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),
-            (_JUMP_EQUAL, 0, 1, _CLONE_THREAD),
-            (_RETURN, 0, 0, _ALLOW),
-            _refuse(errno.EAGAIN),
+            (LOAD, 0, 0, argument(0)),
+            (AND, 0, 0, _CLONE_THREAD | _CLONE_NAMESPACES),
+            (JUMP_EQUAL, 0, 1, _CLONE_THREAD),
+            ALLOWED,
+            refuse(errno.EAGAIN),
         ],
-        "fork": [_refuse(errno.EAGAIN)],
-        "vfork": [_refuse(errno.EAGAIN)],
+        "fork": [refuse(errno.EAGAIN)],
+        "vfork": [refuse(errno.EAGAIN)],
         # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
-        "clone3": [_refuse(errno.ENOSYS)],
+        "clone3": [refuse(errno.ENOSYS)],
     }
     if sees_the_machines_files:
-        blocks |= {name: [_refuse(0)] for name in _MODES_AND_TIMES}
-        blocks |= {"truncate": [_refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
+        blocks |= {name: [refuse(0)] for name in _MODES_AND_TIMES}
+        blocks |= {"truncate": [refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
         # Its flags lie in memory.
-        blocks["openat2"] = [_refuse(errno.ENOSYS)]
+        blocks["openat2"] = [refuse(errno.ENOSYS)]
     return _assembled(machine, _intervals(numbers, blocks))
 
 
@@ -188,26 +187,26 @@ def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
     the lists do not cover.
     """
     machine = _machine()
-    blocks = {number: [_refuse(errno.EPERM)] for number in REFUSED[machine].values()}
+    blocks = {number: [refuse(errno.EPERM)] for number in REFUSED[machine].values()}
     numbers = NUMBERS[machine]
     if not namespaces:
-        blocks[SOCKET[machine]] = [_refuse(errno.EACCES)]
-        blocks[numbers["prlimit64"]] = _one_of(0, (0, PID_MARK), errno.EPERM)
+        blocks[SOCKET[machine]] = [refuse(errno.EACCES)]
+        blocks[numbers["prlimit64"]] = one_of(0, (0, PID_MARK), refuse(errno.EPERM))
     if not signals:
-        blocks |= {number: [_refuse(errno.EPERM)] for number in REACHING_OUT[machine].values()}
-        blocks[numbers["tgkill"]] = _one_of(0, (PID_MARK,), errno.EPERM)
+        blocks |= {number: [refuse(errno.EPERM)] for number in REACHING_OUT[machine].values()}
+        blocks[numbers["tgkill"]] = one_of(0, (PID_MARK,), refuse(errno.EPERM))
     blocks[numbers["clone"]] = [
-        (_LOAD, 0, 0, _argument(0)),
-        (_AND, 0, 0, _CLONE_NAMESPACES),
-        (_JUMP_EQUAL, 0, 1, 0),
-        _ALLOWED,
-        _refuse(errno.EPERM),
+        (LOAD, 0, 0, argument(0)),
+        (AND, 0, 0, _CLONE_NAMESPACES),
+        (JUMP_EQUAL, 0, 1, 0),
+        ALLOWED,
+        refuse(errno.EPERM),
     ]
     # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
-    blocks[numbers["clone3"]] = [_refuse(errno.ENOSYS)]
+    blocks[numbers["clone3"]] = [refuse(errno.ENOSYS)]
     intervals: list[Interval] = []
     for number in range(max(blocks) + 2):
-        code = blocks.get(number, [_ALLOWED])
+        code = blocks.get(number, [ALLOWED])
         if not intervals or intervals[-1][1] != code:
             intervals.append((number, code))
     return _assembled(machine, intervals)
@@ -224,24 +223,15 @@ def _machine() -> str:
 
 def _assembled(machine: str, intervals: list[Interval]) -> bytes:
     """The whole program: another architecture's calls end the process, the others are looked up."""
-    program: list[Instruction] = [
-        (_LOAD, 0, 0, _ARCHITECTURE),
-        (_JUMP_EQUAL, 1, 0, _AUDIT_ARCH[machine]),
-        (_RETURN, 0, 0, _KILL_PROCESS),
-        (_LOAD, 0, 0, _NUMBER),
-    ]
-    if machine == "x86_64":
-        program += [(_JUMP_AT_LEAST, 0, 1, _X32_BIT), (_RETURN, 0, 0, _KILL_PROCESS)]
-    program += _search(intervals)
-    return b"".join(struct.pack("<HBBI", *instruction) for instruction in program)
+    return program(machine, KILLED, _search(intervals))
 
 
 def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) -> list[Interval]:
     """What happens to every number, as intervals in ascending order; each lasts to where the next begins."""
-    by_number = {number: blocks.get(name, [_ALLOWED]) for name, number in numbers.items()}
+    by_number = {number: blocks.get(name, [ALLOWED]) for name, number in numbers.items()}
     found: list[Interval] = []
     for number in range(_YOUNGEST + 1):
-        code = by_number.get(number, [_refuse(errno.EPERM if number < _YOUNGEST else errno.ENOSYS)])
+        code = by_number.get(number, [refuse(errno.EPERM if number < _YOUNGEST else errno.ENOSYS)])
         if not found or found[-1][1] != code:
             found.append((number, code))
     return found
@@ -253,39 +243,23 @@ def _search(intervals: list[Interval]) -> list[Instruction]:
         return intervals[0][1]
     half = len(intervals) // 2
     below, above = _search(intervals[:half]), _search(intervals[half:])
-    return [(_JUMP_AT_LEAST, len(below), 0, intervals[half][0]), *below, *above]
+    return [(JUMP_AT_LEAST, len(below), 0, intervals[half][0]), *below, *above]
 
 
-def _argument(index: int) -> int:
-    """Offset of the low half of an argument (both architectures are little-endian)."""
-    return 16 + 8 * index
-
-
-def _refuse(number: int) -> Instruction:
-    return (_RETURN, 0, 0, _ERRNO | number)
-
-
-def _no_cutting(argument: int) -> list[Instruction]:
+def _no_cutting(index: int) -> list[Instruction]:
     """Allows opening a file unless it is opened for reading and cut off all the same."""
     return [
-        (_LOAD, 0, 0, _argument(argument)),
-        (_AND, 0, 0, os.O_TRUNC | os.O_ACCMODE),
-        (_JUMP_EQUAL, 0, 1, os.O_TRUNC),
-        _refuse(errno.EPERM),
-        _ALLOWED,
+        (LOAD, 0, 0, argument(index)),
+        (AND, 0, 0, os.O_TRUNC | os.O_ACCMODE),
+        (JUMP_EQUAL, 0, 1, os.O_TRUNC),
+        refuse(errno.EPERM),
+        ALLOWED,
     ]
 
 
-def _own_signals(argument: int) -> list[Instruction]:
+def _own_signals(index: int) -> list[Instruction]:
     """Allows a signal to itself, in that argument, unless it is one of `_NOT_TO_ITSELF`."""
-    block: list[Instruction] = [(_LOAD, 0, 0, _argument(argument))]
+    block: list[Instruction] = [(LOAD, 0, 0, argument(index))]
     for number in _NOT_TO_ITSELF:
-        block += [(_JUMP_EQUAL, 0, 1, number), _refuse(errno.EPERM)]
-    return [*block, *_one_of(0, (PID_MARK,), errno.EPERM)]
-
-
-def _one_of(argument: int, allowed: tuple[int, ...], otherwise: int) -> list[Instruction]:
-    block: list[Instruction] = [(_LOAD, 0, 0, _argument(argument))]
-    for value in allowed:
-        block += [(_JUMP_EQUAL, 0, 1, value), (_RETURN, 0, 0, _ALLOW)]
-    return [*block, _refuse(otherwise)]
+        block += [(JUMP_EQUAL, 0, 1, number), refuse(errno.EPERM)]
+    return [*block, *one_of(0, (PID_MARK,), refuse(errno.EPERM))]

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from evopolicy_common import seccomp as bpf
 from evopolicy_common.errors import SandboxError, WorkerError
+from evopolicy_common.seccomp.numbers import NUMBERS
 from evopolicy_gateway.formatting import json_bytes
 from evopolicy_worker import frames
 from evopolicy_worker.monitor import Output
 from evopolicy_worker.sandbox import seccomp
 from evopolicy_worker.sandbox.inside import player
-from evopolicy_worker.sandbox.syscall_numbers import NUMBERS
 
 SPACE: dict[str, Any] = {
     "type": "Dict",
@@ -183,22 +184,22 @@ CHECKED = {
 def allowed(program: bytes, number: int, *arguments: int) -> int:
     """What the filter says of a system call: it is run here, instruction by instruction."""
     data = struct.pack(
-        "<iIQ6Q", number, seccomp._AUDIT_ARCH["x86_64"], 0, *arguments, *([0] * (6 - len(arguments)))
+        "<iIQ6Q", number, bpf.AUDIT_ARCH["x86_64"], 0, *arguments, *([0] * (6 - len(arguments)))
     )
     at, register = 0, 0
     while True:
         code, if_true, if_false, k = struct.unpack_from("<HBBI", program, 8 * at)
         at += 1
-        if code == seccomp._LOAD:
+        if code == bpf.LOAD:
             (register,) = struct.unpack_from("<I", data, k)
-        elif code == seccomp._AND:
+        elif code == bpf.AND:
             register &= k
-        elif code == seccomp._JUMP_EQUAL:
+        elif code == bpf.JUMP_EQUAL:
             at += if_true if register == k else if_false
-        elif code == seccomp._JUMP_AT_LEAST:
+        elif code == bpf.JUMP_AT_LEAST:
             at += if_true if register >= k else if_false
         else:
-            assert code == seccomp._RETURN
+            assert code == bpf.RETURN
             return int(k)
 
 
@@ -207,31 +208,31 @@ def test_the_filter_ends_for_every_number_and_allows_what_is_listed(
     machine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: machine)
-    monkeypatch.setitem(seccomp._AUDIT_ARCH, "x86_64", seccomp._AUDIT_ARCH[machine])
+    monkeypatch.setitem(bpf.AUDIT_ARCH, "x86_64", bpf.AUDIT_ARCH[machine])
     program = seccomp.policy_filter()
     assert len(program) // 8 < 4096
     numbers = {number: name for name, number in NUMBERS[machine].items()}
     for number in range(600):
         verdict = allowed(program, number)
         if number not in numbers:
-            assert verdict & 0x7FFF0000 == seccomp._ERRNO, number
+            assert verdict & 0x7FFF0000 == bpf.ERRNO, number
         elif numbers[number] not in CHECKED:
-            assert verdict == seccomp._ALLOW, numbers[number]
+            assert verdict == bpf.ALLOW, numbers[number]
 
 
 def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
     program = seccomp.policy_filter()
     clone, fork, kill, prctl, mount = 56, 57, 62, 157, 165
-    assert allowed(program, clone, 0x3D0F00) == seccomp._ALLOW  # what pthread_create asks for
+    assert allowed(program, clone, 0x3D0F00) == bpf.ALLOW  # what pthread_create asks for
     assert allowed(program, clone, 0x1200011) & 0xFFFF == 11  # fork()
     assert allowed(program, clone, 0x10010F00) & 0xFFFF == 11  # a thread in a new namespace
     assert allowed(program, fork) & 0xFFFF == 11
-    assert allowed(program, kill, seccomp.PID_MARK, 15) == seccomp._ALLOW
+    assert allowed(program, kill, seccomp.PID_MARK, 15) == bpf.ALLOW
     assert allowed(program, kill, 1, 15) & 0xFFFF == 1
     assert allowed(program, prctl, 4, 1) & 0xFFFF == 1
     assert allowed(program, mount) & 0xFFFF == 1
-    assert allowed(program, 0x40000000) == seccomp._KILL_PROCESS
+    assert allowed(program, 0x40000000) == bpf.KILL_PROCESS
 
 
 def test_the_filter_lets_a_process_do_nothing_to_itself_that_looks_like_another(
@@ -242,10 +243,10 @@ def test_the_filter_lets_a_process_do_nothing_to_itself_that_looks_like_another(
     own, kill, tgkill, prlimit = seccomp.PID_MARK, 62, 234, 302
     for number in range(65):
         allows = number not in (9, 19, 20, 21, 22)
-        assert (allowed(program, kill, own, number) == seccomp._ALLOW) == allows
-        assert (allowed(program, tgkill, own, 5, number) == seccomp._ALLOW) == allows
+        assert (allowed(program, kill, own, number) == bpf.ALLOW) == allows
+        assert (allowed(program, tgkill, own, 5, number) == bpf.ALLOW) == allows
         assert allowed(program, tgkill, 1, 1, number) & 0xFFFF == 1
-    assert allowed(program, prlimit, 0, 0, 0, 0x7F00DEADBEEF) == seccomp._ALLOW
+    assert allowed(program, prlimit, 0, 0, 0, 0x7F00DEADBEEF) == bpf.ALLOW
     for new in (0x7F00DEADBEEF, 0x10000000000, 0x1000):
         assert allowed(program, prlimit, 0, 0, new) & 0xFFFF == 1
         assert allowed(program, prlimit, own, 0, new) & 0xFFFF == 1
@@ -259,15 +260,15 @@ def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: p
     futex, madvise, fadvise, preadv2, flock, sysinfo = 202, 28, 221, 327, 73, 99
     private, realtime = 128, 256
     for command in (0, 1, 9, 10, 13):  # wait, wake, wait and wake by bits, wait for a PI lock and requeue
-        assert allowed(program, futex, 0, command | private) == seccomp._ALLOW
-        assert allowed(program, futex, 0, command | private | realtime) == seccomp._ALLOW
+        assert allowed(program, futex, 0, command | private) == bpf.ALLOW
+        assert allowed(program, futex, 0, command | private | realtime) == bpf.ALLOW
     for wait in (0, 9, 9 | realtime):
         assert allowed(program, futex, 0, wait) & 0xFFFF == 11  # look again: what a join of a thread does
     for wake in (1, 3, 4, 5, 10, 13):
         assert allowed(program, futex, 0, wake) & 0xFFFF == 22
-    assert allowed(program, madvise, 0, 0, 4) == seccomp._ALLOW  # given back by an allocator
+    assert allowed(program, madvise, 0, 0, 4) == bpf.ALLOW  # given back by an allocator
     assert allowed(program, madvise, 0, 0, 21) & 0xFFFF == 22  # out of memory for everybody
-    assert allowed(program, fadvise) == seccomp._ERRNO  # taken, and ignored
+    assert allowed(program, fadvise) == bpf.ERRNO  # taken, and ignored
     assert allowed(program, preadv2) & 0xFFFF == 38
     for number in (flock, sysinfo):
         assert allowed(program, number) & 0xFFFF == 1
@@ -281,14 +282,14 @@ def test_the_filter_keeps_a_policy_from_what_is_counted_for_the_whole_machine(
     mmap, fsync, statx, statfs, pipe2, getxattr = 9, 74, 332, 137, 293, 191
     shared, private, anonymous, huge = 0x01, 0x02, 0x20, 0x40000
     for flags in (private, private | anonymous, shared, 0x03, private | anonymous | 0x20000):
-        assert allowed(program, mmap, 0, 4096, 3, flags) == seccomp._ALLOW
+        assert allowed(program, mmap, 0, 4096, 3, flags) == bpf.ALLOW
     for flags in (shared | anonymous, 0x03 | anonymous):
         assert allowed(program, mmap, 0, 4096, 3, flags) & 0xFFFF == 1
     assert allowed(program, mmap, 0, 1 << 21, 3, private | anonymous | huge) & 0xFFFF == 12
     assert allowed(program, statx) & 0xFFFF == allowed(program, statfs) & 0xFFFF == 38
     assert allowed(program, pipe2) & 0xFFFF == 11
     assert allowed(program, getxattr) & 0xFFFF == 95
-    assert allowed(program, fsync) == seccomp._ERRNO  # said to be done
+    assert allowed(program, fsync) == bpf.ERRNO  # said to be done
 
 
 def test_where_the_machines_files_are_seen_none_is_changed_or_cut(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,14 +297,14 @@ def test_where_the_machines_files_are_seen_none_is_changed_or_cut(monkeypatch: p
     own, seen = seccomp.policy_filter(), seccomp.policy_filter(sees_the_machines_files=True)
     truncate, chmod, utimensat, open_, openat, openat2 = 76, 90, 280, 2, 257, 437
     for number in (truncate, chmod, utimensat, openat2):
-        assert allowed(own, number) == seccomp._ALLOW
+        assert allowed(own, number) == bpf.ALLOW
     assert allowed(seen, truncate) & 0xFFFF == 1
-    assert allowed(seen, chmod) == allowed(seen, utimensat) == seccomp._ERRNO
+    assert allowed(seen, chmod) == allowed(seen, utimensat) == bpf.ERRNO
     assert allowed(seen, openat2) & 0xFFFF == 38
     reading, writing, cutting = 0, 1, 0o1000
     for arguments in ((open_, 0), (openat, 0, 0)):
-        assert allowed(seen, *arguments, reading) == seccomp._ALLOW
-        assert allowed(seen, *arguments, writing | cutting) == seccomp._ALLOW  # where it may write at all
+        assert allowed(seen, *arguments, reading) == bpf.ALLOW
+        assert allowed(seen, *arguments, writing | cutting) == bpf.ALLOW  # where it may write at all
         assert allowed(seen, *arguments, reading | cutting) & 0xFFFF == 1
 
 
