@@ -19,9 +19,15 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
     bearer: bool = False
     """Every request needs the bearer token in `EVOPOLICYGYM_TOKEN`."""
 
+    @property
+    def api(self) -> str:
+        """What the other three are below."""
+        return self.info.rpartition("/")[0]
+
     def environment(self) -> dict[str, str]:
         """As the variables that an agent's process is started with."""
         return {
+            "EVOPOLICYGYM_API": self.api,
             "EVOPOLICYGYM_INFO_URL": self.info,
             "EVOPOLICYGYM_TASK_URL": self.task,
             "EVOPOLICYGYM_SUBMIT_URL": self.submit,
@@ -42,7 +48,7 @@ def urls_below(base: str, token: str, *, bearer: bool = False) -> Urls:
 _ASK = 'SUBMIT_URL + "/" + str(answer["submit_id"])'
 _WITHOUT_BEARER = {
     "auth": "",
-    "addresses": "service's addresses are also in `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.",
+    "addresses": "service's addresses are also in `EVOPOLICYGYM_API` (base), `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.",
     "os": "",
     "headers": "",
     "more_headers": "",

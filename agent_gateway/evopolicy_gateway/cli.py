@@ -234,6 +234,7 @@ def _plans(
             runs=given.runs,
             started_in=started_in,
             wall_limit_s=given.agent_wall_s,
+            silence_s=given.agent_silence_s,
             overwrite=given.overwrite,
             resume=given.resume,
             jail=jail,

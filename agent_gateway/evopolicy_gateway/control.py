@@ -25,9 +25,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
 class Ready(Event, frozen=True, kw_only=True, tag="ready"):
     """The gateway serves."""
 
-    info_url: str
-    task_url: str
-    submit_url: str
+    variables: dict[str, str]
+    """The `EVOPOLICYGYM_*` variables that hold URLs."""
     notes: tuple[str, ...] = ()
     """What the operator should know of the run that was opened."""
     held_s: float = 0.0
@@ -107,7 +106,7 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """The agent and all its children are gone."""
 
     reason: str
-    """`agent_stopped`, `agent_failed`, `wall_limit`, or `told` when the parent ended it."""
+    """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, or `told` when the parent ended it."""
     detail: str = ""
     turns: int = 0
     retries: int = 0
@@ -140,13 +139,17 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     workspace: str
     agent_log: str
     urls: dict[str, str]
-    """The `EVOPOLICYGYM_*` variables."""
+    """The `EVOPOLICYGYM_*` variables that hold URLs: what its jail lets through."""
+    variables: dict[str, str] = {}
+    """The others."""
     started_in: str
     """Where the operator's command was given: file names in the agent's command are meant from there."""
     wall_limit_s: float
     config: dict[str, Any] | None = None
     """A coding agent's settings: `AgentConfig`."""
     session_file: str | None = None
+    silence_s: float | None = None
+    """A program that does nothing for so long is ended; None: never for that."""
     jail: JailOrder | None = None
     """None: not jailed."""
     lock: str | None = None
@@ -159,6 +162,14 @@ class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):
     seconds: float
 
 
+class SubmitsSeen(Order, frozen=True, kw_only=True, tag="submits_seen"):
+    """To a keeper: the submits that the agent has asked for so far, refused ones too."""
+
+    asked: int
+    running: bool
+    """One of them has no answer yet."""
+
+
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
     """To a keeper: end the agent and all that it has started."""
 
@@ -166,7 +177,7 @@ class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
 AnyEvent = (
     Ready | Waits | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentSurvives | AgentEnded
 )
-AnyOrder = CloseRun | StartAgent | HeldTime | StopAgent
+AnyOrder = CloseRun | StartAgent | HeldTime | SubmitsSeen | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 

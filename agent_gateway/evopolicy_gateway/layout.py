@@ -30,6 +30,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root / "workspace"
 
     @property
+    def agents_md(self) -> Path:
+        """The rules."""
+        return self.workspace / "AGENTS.md"
+
+    @property
     def system(self) -> Path:
         """The policy that the agent edits."""
         return self.workspace / "system"

@@ -29,7 +29,7 @@ from evopolicy_common.notices import Waiting
 from evopolicy_common.preflight import check_loopback, check_text, check_writable
 from evopolicy_common.run_record import RunRecord, decode_run_record
 from evopolicy_common.scratch import remove_tree
-from evopolicy_gateway import children, control, harnesses, record
+from evopolicy_gateway import children, control, harnesses, record, workspace
 from evopolicy_gateway.agents_md import LAST_WORDS_S
 from evopolicy_gateway.alone import alone, check_free
 from evopolicy_gateway.children import Child
@@ -49,6 +49,7 @@ from evopolicy_gateway.control import (
 )
 from evopolicy_gateway.door import TOKEN_VARIABLE, Door, check_agent, said_of_place
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.clock import SILENCE_S
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import IntendedRun, OpenedRun, RunFolder, run_folder, save
@@ -76,6 +77,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     started_in: Path
     wall_limit_s: float
     """The agent's time, seconds."""
+    silence_s: float = SILENCE_S
+    """A program that does nothing for so long is ended, seconds."""
     overwrite: bool = False
     resume: bool = False
     """What the folder holds of this run is gone on with."""
@@ -178,6 +181,8 @@ class RunPlay:
         self._on_agent_gone = on_agent_gone
         self._survivors: list[int] = []
         """Processes of the agent that could not be ended."""
+        self._submits = control.SubmitsSeen(asked=0, running=False)
+        """As the gateway told it last."""
         self._held_before = 0.0
         """`held_s` of the run when the keeper was started."""
         self._order: CloseRun | None = None
@@ -389,6 +394,7 @@ class RunPlay:
             self._stopwatch.gateway_told(event.in_flight_s, event.feedback_s)
             self._watch.progress(self._name, event)
             await self._give_back(event.held_s)
+            await self._tell_submits(event)
             self._cancelled = self._cancelled or event.cancelled
             if event.spent:
                 self._spent.set()
@@ -401,6 +407,12 @@ class RunPlay:
         if held > before and self._keeper is not None:
             await self._keeper.tell(HeldTime(seconds=held - self._held_before))
 
+    async def _tell_submits(self, progress: Progress) -> None:
+        asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
+        self._submits = control.SubmitsSeen(asked=asked, running=running)
+        if self._keeper is not None:
+            await self._keeper.tell(self._submits)
+
     def _tell_where(self, ready: Ready) -> None:
         """What the operator hands to a remote agent."""
         if self._plan.door is None:
@@ -410,7 +422,7 @@ class RunPlay:
             return
         for text in (
             said_of_place(self._plan.settings.agent_host, self._folder.root),
-            f"the agent is served at {ready.submit_url}",
+            f"the agent is served at {ready.variables['EVOPOLICYGYM_SUBMIT_URL']}",
             f"its bearer token is in {self._folder.bearer}; it finds it in {TOKEN_VARIABLE}",
             f"its workspace is {self._folder.workspace}; the rules are in AGENTS.md there",
             f"when it is done before its budget is spent: evopolicy finish {self._folder.root}",
@@ -455,19 +467,18 @@ class RunPlay:
                 agent=self._plan.agent,
                 workspace=str(self._folder.workspace),
                 agent_log=str(self._folder.agent_log),
-                urls={
-                    "EVOPOLICYGYM_INFO_URL": ready.info_url,
-                    "EVOPOLICYGYM_TASK_URL": ready.task_url,
-                    "EVOPOLICYGYM_SUBMIT_URL": ready.submit_url,
-                },
+                urls=ready.variables,
+                variables=workspace.variables(self._folder),
                 started_in=str(self._plan.started_in),
                 wall_limit_s=left_s,
+                silence_s=self._plan.silence_s,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
                 lock=str(self._folder.keeper_lock),
                 jail=self._jail(),
             )
         )
+        await self._keeper.tell(self._submits)
         ended: AgentEnded | None = None
         async for event in self._keeper.events():
             if isinstance(event, AgentTurn):

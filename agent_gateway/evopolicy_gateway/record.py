@@ -159,6 +159,7 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
         settings={
             "agent": plan.agent,
             "wall_limit_s": plan.wall_limit_s,
+            "silence_limit_s": plan.silence_s,
             **({"jail": plan.jail.chosen()} if plan.jail.chosen() else {}),
             **told.get("settings", {}),
         },

@@ -14,6 +14,7 @@ from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.door import Door, agent_host_of, door_of
+from evopolicy_gateway.harnesses.clock import SILENCE_S
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
 from evopolicy_gateway.options import (
     HiddenCasesOption,
@@ -75,6 +76,13 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     limit: Limits = None
     agent_wall_s: Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")] = WALL_S
+    agent_silence_s: Annotated[
+        float,
+        typer.Option(
+            min=1.0,
+            help="A program that asks for no submit, changes no file and takes no processor time for so long is ended.",
+        ),
+    ] = SILENCE_S
     runs: Annotated[Path, typer.Option(help="Folder of run directories.")] = Path("runs")
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")] = False
     resume: Annotated[

@@ -24,6 +24,7 @@ from evopolicy_gateway.play import Plan, RunPlay
 from evopolicy_gateway.watch import Watch, watching
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
+_AGENT_FAILED = ("agent_failed", "silent")
 """Of a command that plays runs, the gravest first; 0 when every run completed."""
 
 
@@ -131,8 +132,8 @@ def exit_code(ends: Iterable[tuple[str, str]]) -> int:
 
 
 def _end(status: str, closed_reason: str) -> str:
-    if closed_reason == "agent_failed" and status != "cancelled":
-        return closed_reason
+    if closed_reason in _AGENT_FAILED and status != "cancelled":
+        return "agent_failed"
     return status if status in EXIT_CODES or status == "completed" else "error"
 
 

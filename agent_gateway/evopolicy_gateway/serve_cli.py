@@ -18,7 +18,7 @@ import typer
 from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.preflight import explained
-from evopolicy_gateway import control
+from evopolicy_gateway import control, workspace
 from evopolicy_gateway.agents_md import Urls
 from evopolicy_gateway.alone import alone
 from evopolicy_gateway.control import Orders, Progress, Ready, RunClosed, Waits
@@ -54,13 +54,13 @@ def serve(
             " this machine's.",
         ),
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the URLs as one JSON object.")] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print them as one JSON object.")] = False,
     controlled: Annotated[
         bool,
         typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
     ] = False,
 ) -> None:
-    """Serves the workspace of one run on a loopback port, and prints its three URLs.
+    """Serves the workspace of one run on a loopback port, and prints the variables that its agent is started with.
 
     Example: evopolicy-gateway runs/evolve/gym_acrobot/first
 
@@ -109,24 +109,23 @@ async def _serve(
     controlled: bool,
 ) -> bool:
     def ready(urls: Urls, desk: Desk) -> None:
+        told = urls.environment() | workspace.variables(folder)
         if controlled:
             opened = desk.run
             undrawn = opened.video != "off" and not opened.env.renders
             notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
             control.emit(
                 Ready(
-                    info_url=urls.info,
-                    task_url=urls.task,
-                    submit_url=urls.submit,
+                    variables=urls.environment(),
                     notes=notes if undrawn else (),
                     held_s=round(desk.held_s, 3),
                     permit_s=round(gateway.permit_s, 3),
                 )
             )
         elif json_output:
-            print(orjson.dumps(urls.environment()).decode(), flush=True)
+            print(orjson.dumps(told).decode(), flush=True)
         else:
-            print("".join(f"{name}={url}\n" for name, url in urls.environment().items()), end="", flush=True)
+            print("".join(f"{name}={value}\n" for name, value in told.items()), end="", flush=True)
 
     def changed(desk: Desk) -> None:
         if controlled:

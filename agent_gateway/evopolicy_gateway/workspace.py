@@ -6,9 +6,21 @@ import msgspec
 
 from evopolicy_common.blobs import digest_of, write_atomically
 from evopolicy_common.messages.gateway import RunOpened
+from evopolicy_common.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.agents_md import NO_URLS, Urls, agents_md
 from evopolicy_gateway.initial_policy import initial_policy
 from evopolicy_gateway.layout import RunFolder, Staged, save
+
+
+def variables(folder: RunFolder) -> dict[str, str]:
+    """What an agent's process is told beside the URLs, as the published variables."""
+    return {
+        "EVOPOLICYGYM_WORKSPACE": str(folder.workspace),
+        "EVOPOLICYGYM_SYSTEM": str(folder.system),
+        "EVOPOLICYGYM_FEEDBACK": str(folder.feedback),
+        "EVOPOLICYGYM_AGENTS": str(folder.agents_md),
+        "EVOPOLICYGYM_PROTOCOL": PROTOCOL_VERSION,
+    }
 
 
 def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
@@ -22,7 +34,7 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
     folder.feedback.mkdir(exist_ok=True)
     policy = initial_policy(run.env.action_space).encode()
     write_atomically(folder.system / "policy.py", policy)
-    write_atomically(folder.workspace / "AGENTS.md", agents_md(run, urls).encode(), mode=0o444)
+    write_atomically(folder.agents_md, agents_md(run, urls).encode(), mode=0o444)
     staged = Staged(
         agents_md_hash=digest_of(agents_md(run, NO_URLS).encode()),
         initial_policy_hash=digest_of(policy),

@@ -151,7 +151,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """`ok` checkpoints that brought their slot down in hidden evaluation: not eligible."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
-    """Why no more submits were taken: `budget_spent`, `agent_stopped`, `agent_failed`, `wall_limit`, `cancelled`."""
+    """Why no more submits were taken: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}

@@ -21,7 +21,7 @@ import msgspec
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import AgentProcess
-from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.harnesses.clock import Activity, AgentClock
 from evopolicy_gateway.jail.jail import Jail
 
 _INFO_TIMEOUT_S = 30.0
@@ -34,7 +34,7 @@ class AgentError(EvopolicyError):
 class Ending(msgspec.Struct, frozen=True, kw_only=True):
     """How an agent ended by itself."""
 
-    reason: Literal["agent_stopped", "agent_failed"]
+    reason: Literal["agent_stopped", "agent_failed", "silent"]
     detail: str = ""
     turns: int = 0
     """Prompts that it answered."""
@@ -66,9 +66,9 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     workspace: Path
     """Its working directory."""
     urls: Mapping[str, str]
-    """The `EVOPOLICYGYM_*` variables."""
+    """The `EVOPOLICYGYM_*` variables that hold URLs."""
     environment: Mapping[str, str]
-    """All its variables, those of `urls` too."""
+    """All its variables, the `EVOPOLICYGYM_*` ones too."""
     log: AgentLog
     on_turn: Callable[[int, str], None]
     """Told what the agent says, for people who watch."""
@@ -78,6 +78,8 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """Where a session is kept, so that it goes on after its keeper was killed."""
     on_doing: Callable[[Doing], None] = _nobody_watches
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
+    activity: Activity | None = None
+    """None: nobody asks whether it is silent."""
     over: asyncio.Event = msgspec.field(default_factory=asyncio.Event)
     """Set when the agent's time is over: a program that ends from now on has been ended, and is not started again."""
     jail: Jail | None = None

@@ -1,14 +1,14 @@
-"""Any program as an agent: started in the workspace with the three URLs.
+"""Any program as an agent: started in the workspace with the published variables.
 
 It may also speak the published turn protocol, JSON lines: it is sent `{"type": "prompt", "turn": N, "message": …}` on stdin
 and answers each with one object on stdout, until it says stop or exits. `turn`, `text` and `stop` are optional in an answer; an
-answer to an earlier turn is passed over. A program that never reads its stdin plays until it exits, whatever it prints.
+answer that names an earlier turn is passed over. A program that never reads its stdin plays until it exits, whatever it prints.
+A program that does nothing for long is ended (`clock.Activity`).
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from typing import Any
 
 import orjson
@@ -20,6 +20,10 @@ from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
 _PIPE_PATIENCE_S = 1.0
 _STOP_PATIENCE_S = 10.0
 """How long a program that has said stop may take to exit by itself."""
+IDLE_TURNS = 10
+"""After so many answers in a row without a submit in between, prompts come slowly."""
+_IDLE_PAUSE_S = 10.0
+"""Between them: one that answers and does nothing else takes no processor time then, and is found to be silent."""
 
 
 class CommandHarness(Harness):
@@ -33,20 +37,25 @@ class CommandHarness(Harness):
 
     async def play(self, stage: Stage) -> Ending:
         process = await stage.start(self._program, talks=True)
-        talk = asyncio.create_task(_talk(process, stage))
+        talk = _Talk(process, stage)
+        talking = asyncio.create_task(talk.go_on())
+        ended = asyncio.create_task(process.ended())
+        silent = asyncio.create_task(_silence(stage))
+        tasks: list[asyncio.Task[Any]] = [talking, ended, silent]
         try:
-            ended = asyncio.create_task(process.ended())
-            await asyncio.wait([talk, ended], return_when=asyncio.FIRST_COMPLETED)
-            if ended.done():
-                # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
-                await asyncio.wait([talk], timeout=_PIPE_PATIENCE_S)
-            turns, stopped = talk.result() if talk.done() else (0, False)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(asyncio.shield(ended), _STOP_PATIENCE_S if stopped else None)
-            return self._ending(ended.result() if ended.done() else 0, turns)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            if talking.done() and not talk.stopped:
+                await asyncio.wait([ended, silent], return_when=asyncio.FIRST_COMPLETED)
+            if silent.done() and not (ended.done() or talk.stopped):
+                return Ending(reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known())
+            # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+            await asyncio.wait([talking], timeout=_PIPE_PATIENCE_S)
+            await asyncio.wait([ended], timeout=_STOP_PATIENCE_S if talk.stopped else None)
+            return self._ending(ended.result() if ended.done() else 0, talk.turn)
         finally:
-            talk.cancel()
-            await asyncio.gather(talk, return_exceptions=True)
+            for task in (talking, silent):
+                task.cancel()
+            await asyncio.gather(talking, silent, return_exceptions=True)
             await process.close()
 
     def known(self) -> dict[str, Any]:
@@ -62,35 +71,61 @@ class CommandHarness(Harness):
         )
 
 
-async def _talk(process: AgentProcess, stage: Stage) -> tuple[int, bool]:
-    """Turns answered, and whether the program said stop. Ends with the program's stdout."""
-    turn = 0
-    answered = asyncio.Event()
-    answered.set()
+async def _silence(stage: Stage) -> str:
+    """As `Activity.silence`; never returns where nobody asks."""
+    while stage.activity is None:
+        await asyncio.Event().wait()
+    return await stage.activity.silence()
 
-    async def prompt() -> None:
+
+class _Talk:
+    """The turns of one program."""
+
+    def __init__(self, process: AgentProcess, stage: Stage) -> None:
+        self.turn = 0
+        """Turns answered."""
+        self.stopped = False
+        """It has said stop."""
+        self._process = process
+        self._stage = stage
+        self._answered = asyncio.Event()
+        self._idle = 0
+        """Answers in a row without a submit in between."""
+
+    async def go_on(self) -> None:
+        """Until the program says stop, or its stdout ends."""
         # Apart from reading: a program that prints objects and never reads fills its stdin, and must still be read.
-        while True:
-            await answered.wait()
-            answered.clear()
-            await _prompt(process, stage, turn)
+        prompting = asyncio.create_task(self._prompt())
+        activity = self._stage.activity
+        submits = 0
+        try:
+            async for line in self._process.lines():
+                answer = _answer(line)
+                if answer is None:
+                    continue
+                self.stopped = answer.get("stop") is True
+                if _names_earlier(answer, self.turn) and not self.stopped:
+                    continue
+                self.turn += 1
+                if activity is not None:
+                    self._idle = self._idle + 1 if activity.submits == submits else 0
+                    submits = activity.submits
+                self._stage.on_turn(self.turn, str(answer.get("text", "")))
+                if self.stopped:
+                    self._process.hang_up()
+                    return
+                self._answered.set()
+        finally:
+            prompting.cancel()
+            await asyncio.gather(prompting, return_exceptions=True)
 
-    prompting = asyncio.create_task(prompt())
-    try:
-        async for line in process.lines():
-            answer = _answer(line)
-            if answer is None or answer.get("turn", turn) != turn:
-                continue
-            turn += 1
-            stage.on_turn(turn, str(answer.get("text", "")))
-            if answer.get("stop") is True:
-                process.hang_up()
-                return turn, True
-            answered.set()
-    finally:
-        prompting.cancel()
-        await asyncio.gather(prompting, return_exceptions=True)
-    return turn, False
+    async def _prompt(self) -> None:
+        while True:
+            self._answered.clear()
+            await _prompt(self._process, self._stage, self.turn)
+            await self._answered.wait()
+            if self._idle > IDLE_TURNS:
+                await self._stage.sleep(_IDLE_PAUSE_S)
 
 
 async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> None:
@@ -108,6 +143,12 @@ async def _message(stage: Stage, turn: int) -> str:
     except (OSError, ValueError, KeyError):
         return "Go on. Ask /info for the budget that is left."
     return f"Go on: {left} episodes of the budget are left. Answer with stop set to true if you are done."
+
+
+def _names_earlier(answer: dict[str, Any], turn: int) -> bool:
+    """Whether it says of itself that it is not the answer to this turn. A program that counts from one is taken at this turn."""
+    named = answer.get("turn")
+    return isinstance(named, int) and named < turn
 
 
 def _answer(line: bytes) -> dict[str, Any] | None:

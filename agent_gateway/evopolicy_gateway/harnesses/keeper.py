@@ -34,7 +34,7 @@ from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import environment_of
 from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
-from evopolicy_gateway.harnesses.clock import AgentClock
+from evopolicy_gateway.harnesses.clock import Activity, AgentClock
 from evopolicy_gateway.harnesses.redaction import Redaction
 from evopolicy_gateway.jail.jail import Jail
 
@@ -50,10 +50,11 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     """Plays the agent to its end, or until told; everything that it started is gone afterwards."""
-    environment = environment_of(order.urls)
+    environment = environment_of({**order.urls, **order.variables})
     config = None if order.config is None else msgspec.convert(order.config, AgentConfig)
     agent_log = AgentLog(Path(order.agent_log), Redaction.of(secrets_in(environment, config), order.urls))
     clock = AgentClock(order.wall_limit_s)
+    activity = None if order.silence_s is None else Activity(order.silence_s, Path(order.workspace))
     stage = Stage(
         workspace=Path(order.workspace),
         urls=order.urls,
@@ -63,9 +64,10 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         session_file=None if order.session_file is None else Path(order.session_file),
         on_doing=_tell,
         clock=clock,
+        activity=activity,
     )
     play = asyncio.create_task(_play(order, stage, config))
-    told = asyncio.create_task(_stopped(orders, clock))
+    told = asyncio.create_task(_stopped(orders, clock, activity))
     late = asyncio.create_task(clock.run_out())
     telling = asyncio.create_task(_tell_time(clock))
     log.info("agent started", agent=order.agent)
@@ -108,7 +110,7 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
             urls=order.urls,
             started_in=Path(order.started_in),
         )
-        inside = jail.environment(stage.environment, order.urls)
+        inside = jail.environment(stage.environment, {**order.urls, **order.variables})
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
     return await harness.play(stage)
 
@@ -142,11 +144,13 @@ async def _tell_time(clock: AgentClock) -> None:
         control.emit(AgentTime(used_s=clock.used_s()))
 
 
-async def _stopped(orders: Orders, clock: AgentClock) -> None:
-    """Returns when the parent says stop, or is gone; gives back to the clock what it is told meanwhile."""
+async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None) -> None:
+    """Returns when the parent says stop, or is gone; passes on to the clocks what it is told meanwhile."""
     while (order := await orders.next()) is not None:
         if isinstance(order, control.HeldTime):
             clock.held(order.seconds)
+        if isinstance(order, control.SubmitsSeen) and activity is not None:
+            activity.told(order.asked, order.running)
         if isinstance(order, control.StopAgent):
             return
 

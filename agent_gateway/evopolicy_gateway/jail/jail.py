@@ -167,14 +167,14 @@ class Jail:
         self._view.prepare()
         self._proxy_port = self._doors().proxy_port
 
-    def environment(self, surroundings: Mapping[str, str], urls: Mapping[str, str]) -> dict[str, str]:
-        """Of the keeper's variables those that the agent gets, with the URLs and the way to the allowed hosts."""
+    def environment(self, surroundings: Mapping[str, str], ours: Mapping[str, str]) -> dict[str, str]:
+        """Of the keeper's variables those that the agent gets, with `ours` and the way to the allowed hosts."""
         kept = {
             name: value
             for name, value in surroundings.items()
             if name in self._variables or name.startswith("LC_")
         }
-        kept |= {"HOME": self._home, "TMPDIR": "/tmp", **urls}
+        kept |= {"HOME": self._home, "TMPDIR": "/tmp", **ours}
         if self._open_network:
             return kept
         proxy = f"http://127.0.0.1:{self._proxy_port}"

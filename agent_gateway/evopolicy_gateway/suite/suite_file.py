@@ -24,6 +24,7 @@ from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.clock import SILENCE_S
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.layout import RunFolder, run_folder
 from evopolicy_gateway.options import hidden_cases_of
@@ -53,6 +54,7 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     replays: VideoOption | None = None
     limits: dict[str, float] | None = None
     agent_wall_s: Annotated[float, Meta(gt=0)] | None = None
+    agent_silence_s: Annotated[float, Meta(gt=0)] | None = None
     repeats: Positive | None = None
 
 
@@ -129,6 +131,7 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
     config: AgentConfig | None
     settings: RunSettings
     wall_s: float
+    silence_s: float = SILENCE_S
     parallel: int | None
     """Runs of its agent at once."""
     jail: JailSettings = JailSettings()
@@ -147,6 +150,8 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
         settings = _unusual(msgspec.to_builtins(self.settings), msgspec.to_builtins(usual))
         settings.pop("replays", None)  # recorded once all is over, it changes nothing of the run
         found = {"agent": self.harness, "config": config, "settings": settings, "agent_wall_s": self.wall_s}
+        if self.silence_s != SILENCE_S:
+            found["agent_silence_s"] = self.silence_s
         # What a jail shows (`read`) is where programs lie, which differs from host to host.
         reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
         if reached or self.jail.mode != JailSettings().mode:
@@ -303,6 +308,7 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         config=agent.config,
         settings=settings,
         wall_s=table.agent_wall_s or WALL_S,
+        silence_s=table.agent_silence_s or SILENCE_S,
         parallel=agent.parallel,
         jail=agent.jail,
     )

@@ -280,6 +280,7 @@ class Sweep:
             runs=self._root,
             started_in=self._started_in,
             wall_limit_s=run.wall_s,
+            silence_s=run.silence_s,
             config=run.config,
             jail=run.jail,
         )

@@ -223,7 +223,7 @@ class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
     run: Word
     token: Word
     reason: Text
-    """`budget_spent`, `agent_stopped`, `agent_failed`, `wall_limit`, `cancelled`."""
+    """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""
     agent: Plain = {}
     """What the gateway has to say of the agent for `run.json`: turns, retries, tokens, version."""
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,30 +14,41 @@ from typing import Any
 from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.agent_process import environment_of
 from evopolicy_gateway.harnesses.base import Ending, Stage
+from evopolicy_gateway.harnesses.clock import Activity
 from evopolicy_gateway.harnesses.command import CommandHarness
 
 PATIENCE_S = 30.0
 
 
-def play(tmp_path: Path, code: str) -> tuple[Ending, list[dict[str, Any]], list[tuple[int, str]]]:
+def play(
+    tmp_path: Path, code: str, silence_s: float | None = None
+) -> tuple[Ending, list[dict[str, Any]], list[tuple[int, str]]]:
     """How a Python program with that code ended, its log, and what it said."""
     turns: list[tuple[int, str]] = []
-    log = AgentLog(tmp_path / "logs" / "agent.jsonl")
+    log_file = tmp_path.with_name(f"{tmp_path.name}-log") / "agent.jsonl"
+    log = AgentLog(log_file)
     stage = Stage(
         workspace=tmp_path,
         urls={"EVOPOLICYGYM_INFO_URL": "http://127.0.0.1:9/nobody"},
         environment=environment_of({"EVOPOLICYGYM_INFO_URL": "u"}),
         log=log,
+        activity=None if silence_s is None else Activity(silence_s, tmp_path),
         on_turn=lambda turn, text: turns.append((turn, text)),
     )
 
     async def main() -> Ending:
         async with asyncio.timeout(PATIENCE_S):
-            return await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
+            ending = await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
+            for pid in stage.started if ending.reason == "silent" else ():  # a keeper would end it
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(pid, signal.SIGKILL)
+                while Path(f"/proc/{pid}").exists():  # asyncio takes its status
+                    await asyncio.sleep(0.02)
+            return ending
 
     ending = asyncio.run(main())
     log.close()
-    lines = (tmp_path / "logs" / "agent.jsonl").read_text().splitlines()
+    lines = log_file.read_text().splitlines()
     return ending, [json.loads(line) for line in lines], turns
 
 

@@ -15,6 +15,7 @@ from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_log import MAX_LINE_BYTES, AgentLog
 from evopolicy_gateway.harnesses.agent_process import environment_of
 from evopolicy_gateway.harnesses.base import AgentError, Stage
+from evopolicy_gateway.harnesses.clock import Activity
 from evopolicy_gateway.harnesses.command import CommandHarness
 
 
@@ -37,7 +38,7 @@ def test_turns_go_on_until_the_program_says_stop(tmp_path: Path) -> None:
 import json, sys
 for line in sys.stdin:
     turn = json.loads(line)["turn"]
-    print(json.dumps({"turn": 99, "text": "not this turn", "stop": True}))
+    print(json.dumps({"turn": turn - 1, "text": "not this turn"}))
     print(json.dumps({"turn": turn, "text": f"did {turn}", "stop": turn == 2}), flush=True)
 """
     ending, log, turns = play(tmp_path, code)
@@ -57,6 +58,56 @@ for number, line in enumerate(sys.stdin):
     ending, _, turns = play(tmp_path, code)
     assert (ending.reason, ending.turns) == ("agent_stopped", 5)
     assert turns == [(1, ""), (2, "two"), (3, ""), (4, ""), (5, "")]
+
+
+def test_a_program_that_counts_its_turns_from_one_is_heard(tmp_path: Path) -> None:
+    code = """
+import json, sys
+for number, line in enumerate(sys.stdin, 1):
+    print(json.dumps({"turn": number, "stop": number == 3}), flush=True)
+"""
+    ending, _, _ = play(tmp_path, code)
+    assert (ending.reason, ending.turns) == ("agent_stopped", 3)
+
+
+IDLE = ["import time; time.sleep(1000)", "import os, time; os.close(1); time.sleep(1000)", "input(); input()"]
+ANSWERS_ONLY = "import sys\nfor line in sys.stdin: print('{}', flush=True)"
+CHATTERS = "import time\nwhile True: print('working on it', flush=True); time.sleep(0.2)"
+
+
+@pytest.mark.parametrize("code", [*IDLE, ANSWERS_ONLY, CHATTERS])
+def test_a_program_that_does_nothing_is_found_silent(tmp_path: Path, code: str) -> None:
+    ending, _, _ = play(tmp_path, code, silence_s=1.5)
+    assert ending.reason == "silent"
+    assert "for 1.5 s it asked for no submit" in ending.detail
+
+
+WRITES = "open('notes', 'a').write('x'); time.sleep(0.5)"
+COMPUTES = "sum(range(5_000_000)); time.sleep(0.01)"
+
+
+@pytest.mark.parametrize("work", [WRITES, COMPUTES])
+def test_a_program_that_works_without_a_word_is_not_silent(tmp_path: Path, work: str) -> None:
+    code = f"import time\nends = time.monotonic() + 4.0\nwhile time.monotonic() < ends: {work}"
+    ending, _, _ = play(tmp_path, code, silence_s=1.5)
+    assert ending.reason == "agent_stopped"
+
+
+def test_an_agent_is_not_silent_while_its_submit_runs_or_when_it_asks_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        activity = Activity(0.5, tmp_path / "nothing", cpu_s=lambda: 0.0)
+        silence = asyncio.create_task(activity.silence())
+        activity.told(1, True)
+        await asyncio.sleep(1.0)
+        assert not silence.done()
+        activity.told(1, False)
+        for submits in range(2, 6):
+            await asyncio.sleep(0.2)
+            activity.told(submits, False)
+        assert not silence.done()
+        assert "0.5 s" in await asyncio.wait_for(silence, 30.0)
+
+    asyncio.run(main())
 
 
 def test_program_that_prints_objects_and_never_reads_plays_until_it_exits(tmp_path: Path) -> None:
