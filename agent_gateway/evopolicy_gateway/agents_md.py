@@ -138,12 +138,12 @@ def submit(env_instances):
     return answer
 
 answer = submit($example)
-print(answer["feedback"], answer["status"], answer["summary"]["mean_return"])
+print(answer["feedback"], answer["status"], answer["summary"]["mean_return"], answer["warning"] or "")
 ```
 
 | answer | meaning |
 |---|---|
-| 200, status `ok` | played; single episodes may have failed, see `errors` in the summary |
+| 200, status `ok` | played. `policy_failures` counts the episodes in which your policy failed, and `warning` says how: look at both before the returns |
 | 200, `missing_policy`, `denied_import`, `import_error`, `init_error` | `system/` gives no `Policy`: charged, see `errors.txt` |
 | 200, `rollout_timeout`, `quarantined` | it took too long, or it kept bringing its sandbox down: charged |
 | 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
@@ -163,9 +163,13 @@ class Policy:
     def act(self, obs): ...                  # once a step; returns an action
 ```
 
-$scope
-It runs in a sandbox: Python's standard library and $imports, no network, no other files, limits on time and memory (`/info`).
-If it raises or exceeds a limit, random actions play the rest of that episode.
+$scope Observations arrive as $observations.
+If it raises or exceeds a limit, random actions play the rest of that episode. An action that cannot be read counts as zeros (the
+lowest choice where there are choices).
+
+It runs in a sandbox. It may import Python's standard library, its own modules in `system/` and $imports, and nothing else; use up to
+$threads threads; read its own copy of `system/`, and write there and to `/tmp` until the episode is over. It may not start processes
+(`subprocess`, `os.fork`, `multiprocessing`), use the network, or see other files. Limits on time and memory are in `/info`.
 
 ## Feedback
 
@@ -196,6 +200,10 @@ Episodes are numbered through the run. While a submit runs, its finished episode
 """)
 
 
+_OBSERVATIONS = {
+    "arrays": "numpy arrays, ints, strings, dicts and tuples",
+    "lists": "nested lists, numbers, strings and dicts",
+}
 _EVIDENCE = {
     "forbidden": "What you know of it comes from submitted episodes\nand from nothing else.",
     "allowed": "This run lets you experiment with\nsimulations of your own as well; only submits count.",
@@ -249,7 +257,9 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         scope=scope,
         evidence=_EVIDENCE[run.simulation],
         rule=_RULE[run.simulation],
-        imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "nothing else",
+        observations=_OBSERVATIONS[run.observations],
+        imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "no package",
+        threads=run.limits.processes,
         first_submit=submit_id(0, run.episode_budget),
         first_episode=episode_name(0, run.episode_budget),
         task_url=urls.task,

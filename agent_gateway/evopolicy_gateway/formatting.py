@@ -15,12 +15,17 @@ import msgspec
 import numpy as np
 import orjson
 
+from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import NO_POLICY, TIME_LIMITS, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitDone
 from evopolicy_common.summary import SCHEMA_VERSION, Summary, utc_text
 
 MAX_TEXT_BYTES = 64 << 10
 """Of stdout.txt, stderr.txt, error.txt, errors.txt each."""
+
+
+_MAX_WARNED = 300
+"""Characters of a policy's own message in a warning."""
 
 
 class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,8 +36,8 @@ class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
     episode_return: float
     length: int
     """Steps."""
-    category: str | None
-    """Of the policy's failure; None when it did not fail."""
+    failure: PolicyFailure | None
+    """How the policy failed; None when it did not."""
     reward_components: dict[str, float] = {}
 
 
@@ -130,13 +135,25 @@ def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes
     )
 
 
-def summary_bytes(env: str, submit_index: int, done: SubmitDone, scores: Sequence[EpisodeScore]) -> bytes:
+def summary_bytes(
+    env: str,
+    submit_index: int,
+    done: SubmitDone,
+    scores: Sequence[EpisodeScore],
+    observations: ObservationForm = "arrays",
+) -> bytes:
     """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order."""
-    plain = _plain(msgspec.to_builtins(_summary(env, submit_index, done, scores)))
+    plain = _plain(msgspec.to_builtins(_summary(env, submit_index, done, scores, observations)))
     return msgspec.json.format(msgspec.json.encode(plain), indent=2) + b"\n"
 
 
-def _summary(env: str, submit_index: int, done: SubmitDone, scores: Sequence[EpisodeScore]) -> Summary:
+def _summary(
+    env: str,
+    submit_index: int,
+    done: SubmitDone,
+    scores: Sequence[EpisodeScore],
+    observations: ObservationForm,
+) -> Summary:
     ok = done.status == "ok"
     ordered = sorted(scores, key=lambda score: score.index)
     if ok and [score.index for score in ordered] != list(range(done.n_episodes)):
@@ -168,7 +185,27 @@ def _summary(env: str, submit_index: int, done: SubmitDone, scores: Sequence[Epi
         errors=_where(ordered, None) if ok else None,
         reward_components_mean=_component_means(components) if with_components else None,
         reward_components_per_episode=components if with_components else None,
+        policy_failures=len(_where(ordered, None)) if ok else None,
+        warning=_warning(ordered, observations) if ok else None,
     )
+
+
+def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm) -> str | None:
+    """What an agent must not overlook in the numbers of an ok submit; None where no episode failed."""
+    failures = [score.failure for score in scores if score.failure is not None]
+    if not failures:
+        return None
+    first, n = failures[0], len(scores)
+    where = "before the first step" if first.step_index is None else f"at step {first.step_index}"
+    which = f"ALL {n} episodes" if len(failures) == n else f"{len(failures)} of {n} episodes"
+    text = f"the policy failed in {which} (first {where}, {first.category}: {first.message[:_MAX_WARNED]})."
+    if len(failures) == n:
+        text += " Random actions played the rest, so these returns say nothing about your policy."
+    else:
+        text += " Random actions played the rest of these episodes, which `errors` lists."
+    if observations == "arrays" and len(failures) == n and first.category == "act_error":
+        text += " Observations arrive as numpy arrays in this run, not as nested lists."
+    return text + " Each error.txt has the traceback."
 
 
 def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) -> tuple[int, ...]:
@@ -176,7 +213,7 @@ def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) ->
     return tuple(
         score.index
         for score in scores
-        if score.category is not None and (categories is None or score.category in categories)
+        if score.failure is not None and (categories is None or score.failure.category in categories)
     )
 
 

@@ -48,7 +48,7 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
 
     async def info(request: Request) -> Response:
         state = await desk.refresh()
-        return _json(200, info_document(desk.run, state, desk.spent, desk.in_flight))
+        return _json(200, info_document(desk.run, state, desk.spent, desk.in_flight, desk.last_warning))
 
     async def task_text(request: Request) -> Response:
         return Response(task, media_type="text/markdown; charset=utf-8")
@@ -117,6 +117,8 @@ def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
             "status": ticket.status,
             "is_finalized": last,
             "feedback": f"feedback/{ticket.submit_id}",
+            "policy_failures": ticket.policy_failures,
+            "warning": ticket.warning,
         }
     )
     body = head[:-1] + b',"summary":' + summary + b"}"

@@ -8,11 +8,16 @@ import msgspec
 
 from evopolicy_common.messages.gateway import RunOpened, RunState
 from evopolicy_common.run_record import PROTOCOL_VERSION
+from evopolicy_gateway.agents_md import LAST_WORDS_S
 from evopolicy_gateway.tickets import Ticket
 
 
 def info_document(
-    run: RunOpened, state: RunState, finalized: bool, in_flight: Ticket | None
+    run: RunOpened,
+    state: RunState,
+    finalized: bool,
+    in_flight: Ticket | None,
+    last_warning: str | None = None,
 ) -> dict[str, Any]:
     """What an agent may know of the run, as plain values."""
     env = run.env
@@ -49,6 +54,8 @@ def info_document(
         "sandbox_tier": run.sandbox_tier,
         "video": run.video,
         "deterministic": env.deterministic,
+        "end_grace_s": LAST_WORDS_S,
+        "last_warning": last_warning,
         "submit_in_flight": None if in_flight is None else progress_document(in_flight, state),
     }
 

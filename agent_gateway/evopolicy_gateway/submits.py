@@ -118,6 +118,13 @@ class Desk:
         too_little = self.state.remaining_budget < max(1, self.run.min_episodes_per_submit)
         return self.in_flight is None and (too_little or self.closed)
 
+    @property
+    def last_warning(self) -> str | None:
+        """How the policy failed in the last submit that was answered; None when it did not."""
+        answered = (ticket for ticket in reversed(self.tickets) if ticket.status is not None)
+        last = next(answered, None)
+        return None if last is None else last.warning
+
     def bounds(self) -> Bounds:
         """What a submit may ask for now."""
         return Bounds(
@@ -429,7 +436,7 @@ class Desk:
                     index=episode.index,
                     episode_return=episode.episode_return,
                     length=episode.length,
-                    category=episode.failure.category if episode.failure else None,
+                    failure=episode.failure,
                     reward_components=episode.reward_components,
                 )
 
@@ -473,7 +480,9 @@ class Desk:
                 tree.drop_episode(
                     formatting.episode_name(done.first_global_episode + late, self.run.episode_budget)
                 )
-        summary = formatting.summary_bytes(self.run.env.env, index, done, list(scores.values()))
+        summary = formatting.summary_bytes(
+            self.run.env.env, index, done, list(scores.values()), self.run.observations
+        )
         tree.commit(summary, errors)
         return done.status, summary
 

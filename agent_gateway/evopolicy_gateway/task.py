@@ -109,7 +109,7 @@ def _limits(run: RunOpened) -> str:
         ("wall time of import and `__init__`", f"{limits.init_wall_s:g} s"),
         ("CPU time in one episode", f"{limits.cpu_s:g} s"),
         ("memory beside Python and the allowed packages", _size(limits.memory_bytes)),
-        ("threads (no processes may be started)", str(limits.processes)),
+        ("threads", str(limits.processes)),
         ("files written", f"{_size(limits.file_bytes)}, {limits.files:,} files"),
         ("open files", str(limits.open_files)),
         ("one action, beyond 16 bytes for each of its numbers", _size(limits.action_bytes)),
@@ -120,16 +120,20 @@ def _limits(run: RunOpened) -> str:
         rows.append(("wall time of a whole submit", f"{limits.submit_wall_s:g} s"))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
     allowed = ", ".join(f"`{name}`" for name in run.allowed_imports) or "none"
-    text = f"""## Limits
+    denied = ", ".join(f"`{name}`" for name in run.denied_imports) or "none"
+    return f"""## What a policy may do
+
+- Import Python's standard library, your own modules in `system/`, and these packages: {allowed}. No other package is installed.
+  A file that imports one of these gets the submit refused as `denied_import`: {denied}.
+- Start threads. It may not start processes: `subprocess`, `os.fork`, `os.exec*` and `multiprocessing` fail.
+- Read and write its own copy of `system/` and `/tmp`, both thrown away after the episode. It sees no other files.
+- It has no network: sockets fail.
+
+## Limits
 
 | limit | value |
 |---|---|
-{table}
-
-Imports: Python's standard library, your own modules in `system/`, and {allowed}."""
-    if run.denied_imports:
-        text += f" Denied: {', '.join(f'`{name}`' for name in run.denied_imports)}."
-    return text + " There is no network and no view of other files."
+{table}"""
 
 
 def _randomness(run: RunOpened) -> str:

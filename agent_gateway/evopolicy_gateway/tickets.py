@@ -23,8 +23,12 @@ class ConflictError(RequestError):
         """Of the submit that it contradicts."""
 
 
-class _Mean(msgspec.Struct):
+class _Told(msgspec.Struct):
+    """What is kept of a summary."""
+
     mean_return: float | str | None
+    policy_failures: int | None = None
+    warning: str | None = None
 
 
 class Ticket:
@@ -49,6 +53,10 @@ class Ticket:
         self.status: str | None = None
         self.mean: float | None = None
         """Of its returns, once it is settled and has some."""
+        self.policy_failures: int | None = None
+        """Episodes in which the policy failed; None unless it is ok."""
+        self.warning: str | None = None
+        """How it failed, for the agent."""
         self.error: RequestError | None = None
         """Why it was not taken after all."""
         self.n_episodes = len(request.env_instances)
@@ -72,7 +80,9 @@ class Ticket:
         What it has of its single episodes is let go of: a run has thousands.
         """
         self.status, self._load = status, load
-        mean = msgspec.json.decode(summary, type=_Mean).mean_return
+        told = msgspec.json.decode(summary, type=_Told)
+        self.policy_failures, self.warning = told.policy_failures, told.warning
+        mean = told.mean_return
         self.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
         self.request = msgspec.structs.replace(self.request, env_instances=())
         self.n_done = self.n_episodes

@@ -19,7 +19,7 @@ SCHEMA_VERSION = 1
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One submit's summary. Only the two reward-component fields have defaults, so only they may be left out."""
+    """One submit's summary. Fields with defaults may be left out."""
 
     schema_version: int
     submit_index: int
@@ -57,6 +57,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Mean over episodes of each component's sum; left out when the environment reports none."""
     reward_components_per_episode: tuple[dict[str, float], ...] | None = None
     """Each episode's sums, request order; left out likewise."""
+    policy_failures: int | None = None
+    """How many episodes the policy failed in; left out when not ok, and in files of earlier versions."""
+    warning: str | None = None
+    """How it failed, in words for the agent; left out when it did not."""
 
 
 _decoder = msgspec.json.Decoder(Summary)

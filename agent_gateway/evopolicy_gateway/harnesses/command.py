@@ -139,10 +139,12 @@ async def _message(stage: Stage, turn: int) -> str:
     if turn == 0:
         return prompts.FIRST
     try:
-        left = (await stage.info())["state"]["remaining_budget"]
+        info = await stage.info()
+        left = info["state"]["remaining_budget"]
     except (OSError, ValueError, KeyError):
         return "Go on. Ask /info for the budget that is left."
-    return f"Go on: {left} episodes of the budget are left. Answer with stop set to true if you are done."
+    text = f"Go on: {left} episodes of the budget are left. Answer with stop set to true if you are done."
+    return text + prompts.warned(info.get("last_warning"))
 
 
 def _names_earlier(answer: dict[str, Any], turn: int) -> bool:

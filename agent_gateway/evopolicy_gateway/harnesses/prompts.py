@@ -18,6 +18,11 @@ def go_on(left: int) -> str:
     )
 
 
+def warned(warning: str | None) -> str:
+    """What is added to a prompt where the policy failed in the last submit."""
+    return f" In your last submit {warning}" if warning else ""
+
+
 def interrupted(left: int | None) -> str:
     """To an agent whose session goes on after a failure that was not its own."""
     remaining = (

@@ -76,7 +76,7 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
     double.failures = {1: PolicyFailure(category="act_error", step_index=1, message="m", traceback="t")}
 
     def client(environment: dict[str, str], workspace: Path) -> None:
-        with urllib.request.urlopen(environment["EVOPOLICYGYM_INFO_URL"]) as answer:
+        with urllib.request.urlopen(environment["EVOPOLICYGYM_API"] + "/info") as answer:
             info = json.load(answer)
         assert info["protocol_version"] == "protocol/v2.0-draft"
         assert info["state"]["remaining_budget"] == info["episode_budget"] == 12
@@ -89,6 +89,10 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
             assert {"submit_id", "status", "summary"} <= set(document)
             assert document["is_finalized"] is False
             check_submit(workspace / document["feedback"], document)
+            assert document["policy_failures"] == len(document["summary"]["errors"]) == 1
+            assert "1 of 3 episodes" in document["warning"]
+            with urllib.request.urlopen(environment["EVOPOLICYGYM_INFO_URL"]) as answer:
+                assert json.load(answer)["last_warning"] == document["warning"]
         for body, wanted in (
             ({"env_instances": []}, "budget_invalid"),
             ({"env_instances": [99]}, "invalid_env_instance"),

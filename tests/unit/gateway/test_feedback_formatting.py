@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure
 from evopolicy_common.messages.gateway import EpisodeFeedback, SubmitDone
 from evopolicy_common.summary import decode_summary
@@ -46,7 +47,7 @@ def done(n: int, status: Any = "ok", **fields: Any) -> SubmitDone:
 
 def scores(returns: list[float]) -> list[EpisodeScore]:
     return [
-        EpisodeScore(index=i, episode_return=r, length=i + 1, category=None) for i, r in enumerate(returns)
+        EpisodeScore(index=i, episode_return=r, length=i + 1, failure=None) for i, r in enumerate(returns)
     ]
 
 
@@ -150,9 +151,25 @@ def test_a_summary_of_missing_episodes_is_a_bug_not_a_file() -> None:
         summary_bytes("e", 0, done(3), scores([1.0, 2.0]))
 
 
+@pytest.mark.parametrize("form", ["arrays", "lists"])
+def test_a_policy_that_failed_in_every_episode_is_told_loudly(form: ObservationForm) -> None:
+    failure = PolicyFailure(category="act_error", step_index=0, message="ValueError: ambiguous", traceback="")
+    failed = [EpisodeScore(index=i, episode_return=1.0, length=9, failure=failure) for i in range(3)]
+    document = json.loads(summary_bytes("e", 0, done(3), failed, form))
+    assert (document["status"], document["policy_failures"]) == ("ok", 3)
+    for word in ("ALL 3 episodes", "at step 0", "ValueError: ambiguous", "nothing about your policy"):
+        assert word in document["warning"]
+    assert ("arrive as numpy arrays" in document["warning"]) == (form == "arrays")
+    document = json.loads(summary_bytes("e", 0, done(4), [*failed, *scores([1.0] * 4)[3:]], form))
+    assert document["warning"].startswith("the policy failed in 3 of 4 episodes")
+    document = json.loads(summary_bytes("e", 0, done(3), scores([1.0] * 3), form))
+    assert document["policy_failures"] == 0
+    assert "warning" not in document
+
+
 def test_reward_components_are_meant_over_episodes() -> None:
     with_parts = [
-        EpisodeScore(index=i, episode_return=0.0, length=1, category=None, reward_components={"a": float(i)})
+        EpisodeScore(index=i, episode_return=0.0, length=1, failure=None, reward_components={"a": float(i)})
         for i in range(3)
     ]
     document = json.loads(summary_bytes("e", 0, done(3), with_parts))

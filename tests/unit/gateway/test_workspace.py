@@ -123,7 +123,7 @@ def test_the_task_says_what_differs_between_runs() -> None:
     ):
         assert needed in text
     assert "observations.npz" in text
-    assert "Denied: `socket`" in text
+    assert "`denied_import`: `socket`" in text
     assert "scope `episode`" in task_markdown(opened())
 
 
