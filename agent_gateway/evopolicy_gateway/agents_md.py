@@ -145,7 +145,7 @@ print(answer["feedback"], answer["status"], answer["summary"]["mean_return"], an
 |---|---|
 | 200, status `ok` | played. `policy_failures` counts the episodes in which your policy failed, and `warning` says how: look at both before the returns |
 | 200, `missing_policy`, `denied_import`, `import_error`, `init_error` | `system/` gives no `Policy`: charged, see `errors.txt` |
-| 200, `rollout_timeout`, `quarantined` | it took too long, or it kept bringing its sandbox down: charged |
+| 200, `rollout_timeout` | it took too long: charged |
 | 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
 | 200 or 409, `cancelled` | the operator has ended the run: nothing charged, nothing more is taken |
 | 409, `run_closed` | the budget is spent: no more submits are taken |

@@ -35,7 +35,6 @@ from evopolicy_coordinator.core.records import (
     RunRow,
     RunStateRow,
     Snapshot,
-    StrikeRow,
     SubmitRow,
     WorkerRow,
 )
@@ -183,18 +182,15 @@ class Store:
         groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
         groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
         outcomes: list[OutcomeHead] = []
-        strikes: list[StrikeRow] = []
         for group in groups:
             heads = db.execute("SELECT head FROM outcomes WHERE grp = ? ORDER BY seq", (group,))
             outcomes.extend(_heads.decode(head) for (head,) in heads)
-            strikes.extend(_rows(db, StrikeRow, "SELECT data FROM strikes WHERE grp = ?", (group,)))
         return Snapshot(
             incarnation=incarnation,
             runs=_rows(db, RunRow, "SELECT data FROM runs"),
             states=_rows(db, RunStateRow, "SELECT data FROM run_states"),
             submits=submits,
             outcomes=tuple(outcomes),
-            strikes=tuple(strikes),
             evaluations=evaluations,
             workers=_rows(db, WorkerRow, "SELECT data FROM workers"),
             audits=_rows(db, AuditRow, f"SELECT data FROM audits WHERE run IN ({live_runs})"),
@@ -334,7 +330,6 @@ _RUN = _upsert("runs", "run, key, data", "run")
 _RUN_STATE = _upsert("run_states", "run, phase, data", "run")
 _SUBMIT = _upsert("submits", "run, submit_index, key, data", "run, submit_index")
 _OUTCOME = _upsert("outcomes", "grp, idx, seq, head, data", "grp, idx")
-_STRIKE = _upsert("strikes", "grp, lease_id, data", "grp, lease_id")
 _EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
 _FINISHED = _upsert("finished", "run, data", "run")
 _WORKER = _upsert("workers", "worker, data", "worker")
@@ -362,10 +357,6 @@ def _write_outcome(db: sqlite3.Connection, row: OutcomeRow) -> None:
     if run is not None:
         for ref in stored_blobs(row.outcome):
             db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
-
-
-def _write_strike(db: sqlite3.Connection, row: StrikeRow) -> None:
-    db.execute(_STRIKE, (row.group, row.lease_id, _encode(row)))
 
 
 def _write_evaluation(db: sqlite3.Connection, row: EvaluationRow) -> None:
@@ -397,7 +388,6 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     RunStateRow: _write_run_state,
     SubmitRow: _write_submit,
     OutcomeRow: _write_outcome,
-    StrikeRow: _write_strike,
     EvaluationRow: _write_evaluation,
     FinishedRow: _write_finished,
     WorkerRow: _write_worker,

@@ -98,8 +98,6 @@ BUGS = (
     Bug("show episodes before the gate", runs, "_released", "if 0 in group.marks", "if True"),
     Bug("let ties go to the earlier submit", finalisation, "select", ">= best_mean", "> best_mean"),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
-    Bug("quarantine after two strikes", handin, "_strike", "core.settings.strikes", "2"),
-    Bug("keep strikes in memory only", handin, "_strike", "turn.persist(row)", "pass"),
     Bug(
         "forget idempotency keys at a restart",
         loading,

@@ -23,7 +23,6 @@ from evopolicy_coordinator.core.records import (
     OutcomeRow,
     Row,
     RunStateRow,
-    StrikeRow,
     SubmitRow,
     WorkerRow,
     train_group,
@@ -64,13 +63,10 @@ class Checkers:
         self._attempts: dict[str, int] = {}
         """Job to its highest attempt."""
         self._handed_in: set[str] = set()
-        self._strikes: dict[str, int] = {}
         self._steps = 0
         self._moved_at = 0.0
         self._core: Core | None = None
         self._early_since: dict[str, float] = {}
-        self.not_counted: set[str] = set()
-        """Leases whose slot died, by a report that came after they were given up or after a silence."""
         self.drained_at: dict[str, float] = {}
         self.retries = 0
         self.unreasoned = 0
@@ -96,10 +92,6 @@ class Checkers:
             elif isinstance(row, WorkerRow) and row.state == "quarantined":
                 want(row.worker == self._simulation.slanderer, "no honest worker is quarantined", row)
                 self.named.add(row.worker)
-            elif isinstance(row, StrikeRow):
-                self._strikes[row.group] = self._strikes.get(row.group, 0) + 1
-                known = self._disk.strikes.get((row.group, row.lease_id))
-                want(known is None, "a strike is counted once a lease", row)
             elif isinstance(row, RunStateRow):
                 old = self._disk.states.get(row.run)
                 order = ("open", "closed", "finished")
@@ -223,7 +215,7 @@ class Checkers:
 
     def _taken(self, result: wire.JobResult) -> None:
         """A result was acknowledged, so the worker forgets it."""
-        group, _, first = result.job_id.rpartition("/")
+        group = result.job_id.rpartition("/")[0]
         if "/audit-" in group:
             return
         parts = group.split("/")
@@ -232,20 +224,7 @@ class Checkers:
             return
         if parts[-1] == "train" and self._disk.submits[parts[0], int(parts[1][1:])].status is not None:
             return
-        if (
-            parts[-1] in ("validation", "heldout")
-            and self._disk.submits[parts[0], int(parts[1][1:])].ineligible
-        ):
-            return
-        if result.kind == "slot_died":
-            struck = (group, result.lease_id) in self._disk.strikes
-            stored = self._disk.outcome(group, int(first)) is not None
-            want(
-                struck or stored or result.lease_id in self.not_counted,
-                "an acknowledged strike is durable",
-                result,
-            )
-        elif result.kind == "done":
+        if result.kind == "done":
             late = any(
                 each.failure is not None and each.failure.category == "act_timeout"
                 for each in result.episodes
@@ -338,12 +317,6 @@ class Checkers:
                 told,
                 each,
             )
-            want(
-                (index in result.validation_ineligible) >= each.ineligible,
-                "ineligible ones are told",
-                plan.name,
-                index,
-            )
         self._audited(plan, result)
         got = (result.status, result.best_submit_index, result.heldout_returns, result.random_heldout_returns)
         wanted = (expected.status, expected.best, expected.heldout, expected.random)
@@ -416,8 +389,6 @@ class Checkers:
         if log.event == "job_retried":
             self.retries += 1
             self.unreasoned += 1
-        elif log.event == "strike_not_counted":
-            self.not_counted.add(log.fields["lease"])
 
     def playing(self, worker: str, lease: wire.Lease) -> None:
         """A worker begins to play what it was leased."""

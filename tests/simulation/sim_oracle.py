@@ -6,10 +6,6 @@ seed and what the policy is told:
   raises-N     fails in every episode at `act`, which is a result
   none-N       yields no Policy, in any episode
   late-N       yields no Policy in the episodes after request index 0, which is those episodes' failure
-  kills-N      brings its slot down every time
-  twice-N      brings its slot down on its first two attempts, then plays
-  hides-N      brings its slot down on hidden validation cases
-  holds-N      brings its slot down on held-out cases
 """
 
 from __future__ import annotations
@@ -94,7 +90,6 @@ class ExpectedSubmit:
     episodes: tuple[Expected, ...]
     mean: float | None
     val_mean: float | None
-    ineligible: bool
 
 
 @dataclass(frozen=True)
@@ -112,16 +107,6 @@ def failure_of(bundle: str | None, index: int) -> FailureCategory | None:
     if kind == "none" or (kind == "late" and index > 0):
         return "init_error"
     return "act_error" if kind == "raises" else None
-
-
-def kills(bundle: str | None, case_seed: int) -> bool:
-    """Whether the policy brings its slot down in this episode, each time it is played."""
-    kind = "" if bundle is None else bundle.split("-")[0]
-    return (
-        kind == "kills"
-        or (kind == "hides" and case_seed in VALIDATION_SEEDS)
-        or (kind == "holds" and case_seed in HELDOUT_SEEDS)
-    )
 
 
 def return_of(
@@ -174,7 +159,7 @@ def _mean(episodes: tuple[Expected, ...]) -> float:
 def expect(run: PlannedRun) -> ExpectedRun:
     """What a run must come to when it is not cancelled."""
     submits: list[ExpectedSubmit] = []
-    heldout_of: dict[int, tuple[float, ...] | None] = {}
+    heldout_of: dict[int, tuple[float, ...]] = {}
     left = run.budget
     for index, submit in enumerate(run.admitted()):
         n = len(submit.ids)
@@ -186,37 +171,20 @@ def expect(run: PlannedRun) -> ExpectedRun:
             "remaining_budget_after": left,
         }
         episodes = _played(run, "train", list(submit.ids), submit.bundle, index, n, told)
-        seeds = run.cases("train")
-        status = "ok"
-        if any(kills(submit.bundle, seeds[case_id]) for case_id in submit.ids):
-            status = "quarantined"
-        elif failure_of(submit.bundle, 0) == "init_error":
-            status = "init_error"
-        if status != "ok":
-            submits.append(ExpectedSubmit(status, episodes, None, None, ineligible=False))
+        if failure_of(submit.bundle, 0) == "init_error":
+            submits.append(ExpectedSubmit("init_error", episodes, None, None))
             continue
         hidden = _played(run, "validation", list(range(run.n_validation)), submit.bundle, index, n, told)
-        ineligible = any(kills(submit.bundle, seed) for seed in run.cases("validation"))
         heldout = _played(run, "heldout", list(range(run.n_heldout)), submit.bundle, index, n, told)
-        killed = any(kills(submit.bundle, seed) for seed in run.cases("heldout"))
-        heldout_of[index] = None if killed else tuple(each.episode_return for each in heldout)
-        submits.append(
-            ExpectedSubmit("ok", episodes, _mean(episodes), None if ineligible else _mean(hidden), ineligible)
-        )
-    best = None
-    eligible = {index: each.val_mean for index, each in enumerate(submits) if each.val_mean is not None}
-    while eligible:
-        best = max(eligible, key=lambda index: (eligible[index], index))
-        if heldout_of[best] is not None:
-            break
-        del eligible[best]
-        best = None
+        heldout_of[index] = tuple(each.episode_return for each in heldout)
+        submits.append(ExpectedSubmit("ok", episodes, _mean(episodes), _mean(hidden)))
+    ok = {index: each.val_mean for index, each in enumerate(submits) if each.val_mean is not None}
+    best = max(ok, key=lambda index: (ok[index], index), default=None)
     random = _played(run, "random", list(range(run.n_heldout)), None, -1, run.n_heldout, {"env": run.env})
-    ok = any(each.status == "ok" for each in submits)
     return ExpectedRun(
         submits=tuple(submits),
-        status="completed" if best is not None else ("error" if ok else "no_ok_submit"),
+        status="no_ok_submit" if best is None else "completed",
         best=best,
-        heldout=() if best is None else heldout_of[best] or (),
+        heldout=() if best is None else heldout_of[best],
         random=tuple(each.episode_return for each in random),
     )

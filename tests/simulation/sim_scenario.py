@@ -10,7 +10,7 @@ from sim_checkers import Checkers, ViolationError
 from sim_clients import SimGateway, SimOperator
 from sim_coordinator import SimCoordinator
 from sim_faults import HARMLESS, Faults, draw
-from sim_oracle import PlannedRun, PlannedSubmit, kills
+from sim_oracle import PlannedRun, PlannedSubmit
 from sim_store import Disk
 from sim_truth import Machine, Truth
 from sim_worker import SimWorker
@@ -29,7 +29,7 @@ HIDDEN_WAIT_S = 20.0
 PERMIT_S = 400.0
 """Without faults no agent waits longer for its permit."""
 ENVS = ("toy/line", "toy/maze")
-KINDS = ("good", "good", "good", "good", "raises", "none", "late", "kills", "twice", "hides", "holds")
+KINDS = ("good",) * 7 + ("raises", "raises", "none", "late")
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,9 @@ class Simulation:
         self._older = {
             plan.name for plan in self.plans if self.near and not self.crowd and self.places.random() < 0.12
         }
-        if any("twice" in submit.bundle or kills_any(plan) for plan in self.plans for submit in plan.submits):
-            self.harmless = False
-        self._horizon_s = HORIZON_S * max(1.0, size.episodes / Size.episodes)
+        # One slot plays six runs in a crowd.
+        self._horizon_s = HORIZON_S * max(2.0 if self.crowd else 1.0, size.episodes / Size.episodes)
         self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
-        self._attempts: dict[str, int] = {}
         self.checkers = Checkers(self)
         self.workers: dict[str, SimWorker] = {}
         self.gateways: list[SimGateway] = []
@@ -166,14 +164,6 @@ class Simulation:
         part = zlib.crc32(f"{spec.case.seed} {job.bundle}".encode()) % 100 / 100.0
         hidden = 4.0 if "validation" in job.job_id else 1.0
         return self.lengths * (0.5 + part) * hidden
-
-    def dies(self, job: Job) -> bool:
-        """Whether the policy brings its slot down in this attempt."""
-        bundle = job.bundle or ""
-        if bundle.startswith("twice"):
-            count = self._attempts[bundle] = self._attempts.get(bundle, 0) + 1
-            return count <= 2
-        return any(kills(bundle, spec.case.seed) for spec in job.episodes)
 
     # ---- faults that come by themselves ----
 
@@ -266,11 +256,6 @@ class Simulation:
         return len(self.checkers.finished_runs) == len(self.plans) and all(
             each.closed for each in self.gateways
         )
-
-
-def kills_any(plan: PlannedRun) -> bool:
-    """Whether any policy of the plan brings a slot down, which is retried without a fault of ours."""
-    return any(submit.bundle.split("-")[0] in ("kills", "hides", "holds") for submit in plan.submits)
 
 
 def _plan(name: str, size: Size, chance: random.Random) -> PlannedRun:

@@ -16,7 +16,6 @@ from evopolicy_coordinator.core.records import (
     RunRow,
     RunStateRow,
     Snapshot,
-    StrikeRow,
     SubmitRow,
     WorkerRow,
     evaluation_group,
@@ -33,7 +32,6 @@ class Disk:
         self.states: dict[str, RunStateRow] = {}
         self.submits: dict[tuple[str, int], SubmitRow] = {}
         self.outcomes: dict[str, dict[int, OutcomeRow]] = {}
-        self.strikes: dict[tuple[str, str], StrikeRow] = {}
         self.evaluations: dict[str, EvaluationRow] = {}
         self.finished: dict[str, FinishedRow] = {}
         self.workers: dict[str, WorkerRow] = {}
@@ -52,8 +50,6 @@ class Disk:
                     self.states[row.run] = row
                 case RunRow():
                     self.runs[row.run] = row
-                case StrikeRow():
-                    self.strikes[row.group, row.lease_id] = row
                 case EvaluationRow():
                     self.evaluations[row.evaluation] = row
                 case FinishedRow():
@@ -93,7 +89,6 @@ class Disk:
             states=tuple(self.states.values()),
             submits=tuple(row for row in self.submits.values() if row.run in live),
             outcomes=tuple(heads),
-            strikes=tuple(row for row in self.strikes.values() if wanted(row.group)),
             evaluations=tuple(self.evaluations.values()),
             workers=tuple(self.workers.values()),
             audits=tuple(row for row in self.audits.values() if row.run in live),

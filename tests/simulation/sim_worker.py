@@ -336,8 +336,6 @@ class SimWorker(Asker):
         )
         if stormy and chance.random() < self.world.faults.worker_trouble:
             self._put(lease, "failed")
-        elif self.simulation.dies(job):
-            self._put(lease, "slot_died")
         else:
             lies = self.name == self.simulation.slanderer
             episodes = tuple(_outcome(job, spec, frozen_s, lies=lies) for spec in job.episodes)

@@ -29,7 +29,8 @@ SubmitStatus = Literal[
     "quarantined",
     "cancelled",
 ]
-"""`cancelled`: the operator ended the run meanwhile, and nothing was charged. All others were charged."""
+"""`cancelled`: the operator ended the run meanwhile, and nothing was charged. All others were charged. `quarantined`: only of
+submits that a coordinator of an earlier version ended."""
 
 CANCELLED = "cancelled"
 """Why an operator's cancelled run takes no more submits: `close_reason`."""

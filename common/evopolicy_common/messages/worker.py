@@ -141,8 +141,8 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
 """done: played; returned: given back unplayed (drained, preempted, cancelled); failed: infrastructure (ended
-from outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions, which do not
-tell a slot that its policy brought down from one that was ended from outside; now the first is an outcome (done)."""
+from outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions; the same as
+failed."""
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):

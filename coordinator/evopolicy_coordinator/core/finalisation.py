@@ -5,7 +5,7 @@ Rules that this module owns:
   never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle, env_meta, case, scope and
   policy seed, in a run that is pinned to one fingerprint class.
 - Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later submit.
-- A checkpoint whose bundle brings its slots down while hidden is ineligible, and only the finished run says so.
+- A checkpoint that an earlier version found ineligible stays so, and only the finished run says it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
   split and case (`seeds.reference_seed`), except in a run that was created when they followed from its secret.
 - Each stage is found again from the store: `advance` may be called any number of times.
@@ -119,15 +119,6 @@ def progressed(core: Core, group: JobGroup, turn: Turn) -> None:
     else:
         run.hidden_returns[group.id] = group.returns()
     core.close_group(group, turn, "all done")
-    advance(core, run, turn)
-
-
-def quarantine(core: Core, group: JobGroup, turn: Turn) -> None:
-    """A bundle brought its slots down while hidden: not a word of it before the run is finished."""
-    run = core.runs[group.run]
-    text = f"brought its slot down on {len(group.strikes)} attempts during {group.kind}"
-    run.change_submit(group.submit_index, turn, ineligible=text)
-    core.close_group(group, turn, text)
     advance(core, run, turn)
 
 

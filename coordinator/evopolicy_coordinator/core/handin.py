@@ -8,9 +8,8 @@ Rules that this module owns:
 - An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
   name proves its grant. So is one of a worker that the job's group bars.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
-- What a policy can do to its slot is an outcome, and what it cannot is played again without a limit (`failed`). Only workers of
-  earlier versions hand in strikes (`slot_died`), which may be either. A strike is counted once per lease, under the same condition as a limit verdict: after a silence a slot may have died of
-  that.
+- What a policy can do to its slot is an outcome, and what it cannot is played again without a limit: `failed`, or `slot_died` in
+  the words of workers of earlier versions.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from evopolicy_common.messages.worker import JobResult
 from . import audit
 from .jobs import JobState, mark_of
 from .leases import Lease
-from .records import OutcomeRow, StrikeRow
+from .records import OutcomeRow
 from .retry import Mishap
 from .turn import Turn
 from .workers import Worker
@@ -50,8 +49,6 @@ def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
         core.book.release(worker, lease, turn, f"handed in: {result.kind}", sure=True)
     if result.kind == "done":
         _done(core, worker, job, result, turn, live=live, silent=silent)
-    elif result.kind == "slot_died" and job.group.template.bundle is not None:
-        _strike(core, worker, job, result, turn, live=live, silent=silent)
     elif live:
         if result.kind != "returned":
             core.fleet.failed(worker, turn)
@@ -177,25 +174,3 @@ def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: T
     core.count_done(len(result.episodes), turn.now)
     audit.sample(core, worker, group, result.episodes, turn)
     core.concluded(group, result.episodes, turn)
-
-
-def _strike(
-    core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool, silent: bool
-) -> None:
-    """A living supervisor says that the bundle brought its slot down."""
-    group = job.group
-    if live and not silent:
-        group.strikes[result.lease_id] = None
-        error = result.error[:4096]
-        row = StrikeRow(
-            group=group.id, lease_id=result.lease_id, worker=worker.name, error=error, at=turn.now
-        )
-        turn.persist(row)
-        turn.log("warning", "strike", group=group.id, lease=result.lease_id, worker=worker.name, error=error)
-        if len(group.strikes) >= core.settings.strikes:
-            core.quarantined(group, turn)
-            return
-    else:
-        turn.log("info", "strike_not_counted", lease=result.lease_id, worker=worker.name)
-    if live:
-        core.book.give_back(job, "slot_died", worker, turn, ran=True, error=result.error)

@@ -157,8 +157,6 @@ class JobGroup:
     marks: dict[int, Mark] = field(default_factory=dict)
     jobs: dict[int, JobState] = field(default_factory=dict)
     """Open jobs, by their first index."""
-    strikes: dict[str, None] = field(default_factory=dict)
-    """Leases under which the bundle brought its slot down."""
     first_leased_at: float | None = None
     n_leased: int = 0
     held_since: float | None = None

@@ -30,8 +30,6 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
         if "/audit-" not in head.group:
             of_run = played.setdefault(head.group.partition("/")[0], {})
             of_run[head.worker] = of_run.get(head.worker, 0) + 1
-    for strike in snapshot.strikes:
-        core.struck.setdefault(strike.group, []).append(strike.lease_id)
     for worker in snapshot.workers:
         core.fleet.set_state(worker.worker, worker.state, worker.reason, worker.machine)
     states = {state.run: state for state in snapshot.states}
@@ -71,7 +69,6 @@ def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
             _conclude(core, group, turn)
     core.loading = False
     core.heads.clear()
-    core.struck.clear()
     if core.adopting:
         core.timers.arm(("adopt", ""), turn.now + core.settings.adoption_s)
     turn.log("info", "core_loaded", incarnation=core.incarnation, runs=len(core.runs), jobs=len(core.jobs))
@@ -113,7 +110,5 @@ def _spent(run: Run, row: SubmitRow) -> None:
 
 
 def _conclude(core: Core, group: JobGroup, turn: Turn) -> None:
-    if len(group.strikes) >= core.settings.strikes:
-        core.quarantined(group, turn)
-    elif group.done:
+    if group.done:
         core.concluded(group, (), turn)

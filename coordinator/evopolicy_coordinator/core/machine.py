@@ -91,8 +91,6 @@ class Core:
         """What workers disagree on, in words, the latest last; since the core was loaded."""
         self.heads: dict[str, list[OutcomeHead]] = {}
         """While loading: what is stored of each group."""
-        self.struck: dict[str, list[str]] = {}
-        """While loading: the strikes of each group."""
         self.loading = False
         self.reloaded: list[JobGroup] = []
         """While loading: groups that may be complete already."""
@@ -306,7 +304,6 @@ class Core:
     def open_group(self, group: JobGroup, turn: Turn) -> None:
         """Queue what is not done of a group. While loading, jobs wait to be adopted first."""
         self.groups[group.id] = group
-        group.strikes.update(dict.fromkeys(self.struck.pop(group.id, ())))
         heads = self.heads.pop(group.id, [])
         for job in open_jobs(group, heads, self.first_attempt, turn.now):
             self.jobs[job.job_id] = job
@@ -373,17 +370,6 @@ class Core:
             evaluations.progressed(self, group, turn)
         else:
             finalisation.progressed(self, group, turn)
-
-    def quarantined(self, group: JobGroup, turn: Turn) -> None:
-        """A group's bundle brought its slot down too often."""
-        turn.log("warning", "quarantined", group=group.id, bundle=group.template.bundle)
-        if group.kind == "train":
-            runs.quarantine(self, group, turn)
-        elif group.kind == "evaluation":
-            text = f"the policy brought its slot down on {len(group.strikes)} attempts"
-            evaluations.end(self, group, text, turn)
-        else:
-            finalisation.quarantine(self, group, turn)
 
     def submit_ended(self, run: Run, row: SubmitRow, turn: Turn) -> None:
         """A submit has its verdict: its hidden validation may begin, and a closed run may go on."""

@@ -113,7 +113,7 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     val_mean: float | None = None
     """Hidden validation mean; None until every validation case is done."""
     ineligible: str | None = None
-    """Why the checkpoint cannot be selected, when it brought its slots down while hidden."""
+    """Why the checkpoint cannot be selected, by the word of an earlier version; None otherwise."""
     held_s: float = 0.0
     """Seconds for which none of its episodes ran because hidden ones had the machines."""
     refunded: bool = False
@@ -134,16 +134,6 @@ class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
     attempt: int
     worker: str
     fingerprint_class: str
-    at: float
-
-
-class StrikeRow(msgspec.Struct, frozen=True, kw_only=True, tag="strike"):
-    """A bundle brought its slot down, by the word of a living supervisor. Key: `group`, `lease_id`."""
-
-    group: str
-    lease_id: str
-    worker: str
-    error: str
     at: float
 
 
@@ -248,7 +238,6 @@ Row = (
     | RunStateRow
     | SubmitRow
     | OutcomeRow
-    | StrikeRow
     | EvaluationRow
     | FinishedRow
     | WorkerRow
@@ -291,9 +280,9 @@ def head_of(row: OutcomeRow) -> OutcomeHead:
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """All that a core starts from, read in one transaction.
 
-    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits`,
-    `outcomes` and `strikes` are wanted only for runs whose phase is not `finished`, and `outcomes` and `strikes` also for
-    evaluations that are not finished; more does no harm. Order does not matter.
+    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits` and
+    `outcomes` are wanted only for runs whose phase is not `finished`, and `outcomes` also for evaluations that are not
+    finished; more does no harm. Order does not matter.
     """
 
     incarnation: int
@@ -302,7 +291,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     states: tuple[RunStateRow, ...] = ()
     submits: tuple[SubmitRow, ...] = ()
     outcomes: tuple[OutcomeHead, ...] = ()
-    strikes: tuple[StrikeRow, ...] = ()
     evaluations: tuple[EvaluationRow, ...] = ()
     workers: tuple[WorkerRow, ...] = ()
     audits: tuple[AuditRow, ...] = ()

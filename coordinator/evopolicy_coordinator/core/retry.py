@@ -4,7 +4,6 @@ Rules that this module owns:
 - Only what is our own fault is retried, without limit. A policy's failure is a result, and never comes here.
 - Being given back (drained, preempted, cancelled) is nobody's fault: no delay, no blame.
 - A lost worker makes suspects of the jobs that ran on it: they rerun alone. Those that waited behind them just go back.
-- A slot brought down is a strike against the bundle; who counts strikes decides about quarantine.
 """
 
 from __future__ import annotations
@@ -13,10 +12,9 @@ from typing import Literal, NamedTuple
 
 from .settings import CoreSettings
 
-Mishap = Literal["returned", "unlisted", "failed", "slot_died", "worker_lost", "overdue"]
+Mishap = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
 """returned: given back unplayed. unlisted: its worker lives but does not know of it, the lease never arrived. failed: the
-worker's own trouble. slot_died: the slot went down under it. worker_lost: its worker went silent. overdue: it was played for
-longer than any episode may take."""
+worker's own trouble. worker_lost: its worker went silent. overdue: it was played for longer than any episode may take."""
 
 
 class Retry(NamedTuple):

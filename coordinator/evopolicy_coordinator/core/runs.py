@@ -421,13 +421,6 @@ def progressed(core: Core, group: JobGroup, outcomes: tuple[EpisodeOutcome, ...]
         answer_polls(core, group, turn)
 
 
-def quarantine(core: Core, group: JobGroup, turn: Turn) -> None:
-    """The submit's bundle brought its slot down too often."""
-    text = f"the policy brought its whole slot down on {len(group.strikes)} attempts; the submit was ended"
-    failure = PolicyFailure(category="killed", step_index=None, message=text)
-    end(core, core.runs[group.run], group, "quarantined", failure, turn)
-
-
 def timed_out(core: Core, group: JobGroup, turn: Turn) -> None:
     """The operator's limit on a whole submit's wall time has passed."""
     run = core.runs[group.run]

@@ -32,8 +32,6 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     retry_max_s: float = 60.0
     avoid_s: float = 5.0
     """How long a retried job is kept from the worker it failed on, so that another may take it."""
-    strikes: int = 3
-    """Slots of workers of earlier versions that died under a bundle before it is quarantined."""
     batch_s: float = 0.1
     """Leases are handed out in batches of about so much play time per slot."""
     batch_max: int = 32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator import store as store_module
 from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.records import EvaluationRow, StrikeRow, WorkerRow, head_of
+from evopolicy_coordinator.core.records import EvaluationRow, WorkerRow, head_of
 from evopolicy_coordinator.store import SCHEMA_VERSION, Reader, Store, train_run
 
 TRAIN = records.train_group("r-1", 0)
@@ -52,13 +53,11 @@ def evaluation_row(finished: bool) -> EvaluationRow:
 
 def test_everything_written_is_loaded_again_after_reopening(path: Path) -> None:
     outcome = outcome_row(TRAIN, 1, 0)
-    strike = StrikeRow(group=TRAIN, lease_id="l", worker="w", error="died", at=1.0)
     rows = [
         run_row(),
         state_row(),
         submit_row(),
         outcome,
-        strike,
         evaluation_row(False),
         WorkerRow(worker="w", state="draining"),
     ]
@@ -72,9 +71,19 @@ def test_everything_written_is_loaded_again_after_reopening(path: Path) -> None:
     assert snapshot.states == (rows[1],)
     assert snapshot.submits == (rows[2],)
     assert snapshot.outcomes == (head_of(outcome),)
-    assert snapshot.strikes == (strike,)
-    assert snapshot.evaluations == (rows[5],)
-    assert snapshot.workers == (rows[6],)
+    assert snapshot.evaluations == (rows[4],)
+    assert snapshot.workers == (rows[5],)
+
+
+def test_strikes_that_an_earlier_version_wrote_are_read_past(path: Path) -> None:
+    store = Store(path)
+    store.write([run_row(), state_row(), submit_row()])
+    store.close()
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("INSERT INTO strikes VALUES (?, 'l', x'81')", (TRAIN,))
+    store = Store(path)
+    assert store.load().submits == (submit_row(),)
+    store.close()
 
 
 def test_incarnation_counts_every_load(path: Path) -> None:

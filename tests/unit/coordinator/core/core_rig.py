@@ -42,7 +42,6 @@ from evopolicy_coordinator.core.records import (
     RunRow,
     RunStateRow,
     Snapshot,
-    StrikeRow,
     SubmitRow,
     WorkerRow,
     head_of,
@@ -85,8 +84,6 @@ def key_of(row: Row) -> tuple[Any, ...]:
             return (SubmitRow, row.run, row.submit_index)
         case OutcomeRow():
             return (OutcomeRow, row.group, row.index)
-        case StrikeRow():
-            return (StrikeRow, row.group, row.lease_id)
         case EvaluationRow():
             return (EvaluationRow, row.evaluation)
         case WorkerRow():
@@ -133,7 +130,6 @@ class Rig:
             states=of(RunStateRow),
             submits=of(SubmitRow),
             outcomes=tuple(head_of(row) for row in of(OutcomeRow)),
-            strikes=of(StrikeRow),
             evaluations=of(EvaluationRow),
             workers=of(WorkerRow),
             audits=of(AuditRow),

@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import msgspec
 import pytest
 from asking import asked
-from core_rig import BUNDLE, Rig, done, result, split_of
+from core_rig import BUNDLE, Rig, done, key_of, split_of
 from hypothesis import given, settings
 
 from evopolicy_common.messages import gateway, operator
@@ -140,37 +140,36 @@ def test_random_actions_outside_a_run_are_the_reference_of_their_split() -> None
     assert sorted(each.job.episodes[0].policy_seed for each in leases) == sorted(reference)
 
 
-def test_a_checkpoint_quarantined_while_hidden_is_ineligible_and_only_the_end_tells() -> None:
+def found_ineligible(rig: Rig, index: int) -> None:
+    """As a coordinator of an earlier version stored it, which goes on with this one."""
+    row = rig.row(SubmitRow, "r1", index)
+    rig.rows[key_of(row)] = msgspec.structs.replace(row, ineligible="brought its slot down")
+    rig.load()
+
+
+def test_a_checkpoint_found_ineligible_earlier_stays_so_and_only_the_end_tells() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     rig.create(n_valid=1)
     rig.submit(0)
     rig.play(session, *rig.poll(session, 8))
     before = rig.tell(asked(gateway.StateRequest, request="s1", run="r1"))
-    for _ in range(3):
-        rig.pass_time(10.0)
-        rig.beat(session)
-        rig.hand_in(session, *(result(each, "slot_died") for each in rig.poll(session, 8)))
-    assert rig.row(SubmitRow, "r1", 0).status == "ok"
+    found_ineligible(rig, 0)
     assert rig.tell(asked(gateway.StateRequest, request="s2", run="r1")) == before
     rig.close()
-    rig.work_off(session)
+    rig.work_off(rig.register(slots=8))
     finished = rig.finished()
     assert (finished.status, list(finished.validation_ineligible)) == ("error", [0])
 
 
-def test_a_checkpoint_quarantined_on_held_out_gives_way_to_the_next() -> None:
+def test_a_checkpoint_found_ineligible_on_held_out_gives_way_to_the_next() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     two_submits(rig, session)
     rig.work_off(session, value_of)
+    found_ineligible(rig, 1)
     rig.close()
-    for _ in range(12):
-        rig.pass_time(3.0)
-        rig.beat(session)
-        for lease in rig.poll(session, 8):
-            dies = split_of(lease.job) == "heldout" and lease.job.bundle == "b" * 64
-            rig.hand_in(session, result(lease, "slot_died") if dies else done(lease, value_of(lease.job)))
+    rig.work_off(rig.register(slots=8), value_of)
     finished = rig.finished()
     assert (finished.status, finished.best_submit_index) == ("completed", 2)
     assert list(finished.validation_ineligible) == [1]

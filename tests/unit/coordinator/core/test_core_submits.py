@@ -117,28 +117,20 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
     assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
 
 
-def test_three_strikes_quarantine_a_bundle_and_a_lost_worker_is_none() -> None:
+def test_a_slot_that_died_under_a_worker_of_an_earlier_version_is_played_again() -> None:
     rig, session = started()
     rig.submit(0)
-    for strike in range(3):
-        assert rig.row(SubmitRow, "r1", 0).status is None, strike
+    for attempt in range(4):
         rig.pass_time(60.0)
         session = rig.register(slots=8)
         (lease,) = rig.poll(session, 1, wait_s=1.0)
+        assert lease.attempt == attempt + 1
         rig.hand_in(session, result(lease, "slot_died", error="oops"))
-    row = rig.row(SubmitRow, "r1", 0)
-    assert row.status == "quarantined"
-    assert row.failure is not None
-    assert "3 attempts" in row.failure.message
-
-
-def test_a_strike_survives_a_restart() -> None:
-    rig, session = started()
-    rig.submit(0)
-    (lease,) = rig.poll(session, 1)
-    rig.hand_in(session, result(lease, "slot_died"))
-    rig.load()
-    assert len(rig.core.groups["r1/s0/train"].strikes) == 1
+        assert rig.row(SubmitRow, "r1", 0).status is None
+    rig.pass_time(60.0)
+    session = rig.register(slots=8)
+    rig.play(session, *rig.poll(session, 1, wait_s=1.0))
+    assert rig.row(SubmitRow, "r1", 0).status == "ok"
 
 
 def test_a_limit_on_the_whole_submit_keeps_the_episodes_before_the_first_unfinished() -> None:
