@@ -71,3 +71,7 @@ class PartFailedError(EvopolicyError):
 
 class StorageError(EvopolicyError):
     """The store could not persist or read back; what was not persisted did not happen."""
+
+
+class DamagedStoreError(StorageError):
+    """What is stored cannot be read, or contradicts itself: trying again does not help."""

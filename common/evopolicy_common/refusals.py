@@ -26,6 +26,7 @@ class Refusal(StrEnum):
     TOO_LARGE = "too_large"
 
     # What it names is not there.
+    DAMAGED = "damaged"
     MISSING_BLOB = "missing_blob"
     MISSING_BUNDLE = "missing_bundle"
     UNKNOWN_BLOB = "unknown_blob"

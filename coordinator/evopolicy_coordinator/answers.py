@@ -20,7 +20,7 @@ import structlog
 
 from evopolicy_common import codec
 from evopolicy_common.blobs import BlobStore, digest_of, is_digest
-from evopolicy_common.errors import ProtocolError, StorageError
+from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
@@ -84,8 +84,14 @@ class Answers:
         self._pages.submit(self._answer, lambda: self._recorded(message), answer)
 
     def finished_secret(self, run: str) -> bytes | None:
-        """What a finished run's policy seeds are derived from; None for any other run. Reads the database."""
-        row = self._reader.run(run) if self._reader.finished(run) is not None else None
+        """What a finished run's policy seeds are derived from; None for any other run. Reads the database.
+
+        RefusedError when the row cannot be read.
+        """
+        try:
+            row = self._reader.run(run) if self._reader.finished(run) is not None else None
+        except DamagedStoreError as error:
+            raise damaged(error) from error
         return None if row is None else row.secret
 
     def close(self) -> None:
@@ -98,6 +104,9 @@ class Answers:
     def _answer(self, work: Callable[[], Message], answer: Answer) -> None:
         try:
             answer(work())
+        except DamagedStoreError as error:
+            refused = damaged(error)
+            answer(Refused(status=refused.status, message=refused.message))
         except StorageError as error:
             # Ours to mend: whoever asked asks again.
             log.error("cannot answer from the store", error=str(error))
@@ -222,6 +231,13 @@ def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
         stdout=outcome.stdout,
         stderr=outcome.stderr,
     )
+
+
+def damaged(error: DamagedStoreError) -> RefusedError:
+    """What whoever asks for a row that cannot be read is told: asking again does not help. The log names the row."""
+    log.error("what is stored cannot be read", error=str(error))
+    text = "what the coordinator has stored of this cannot be read; its log names the row and the remedy"
+    return RefusedError(Refusal.DAMAGED, text)
 
 
 def lane_of(asker: str) -> int:

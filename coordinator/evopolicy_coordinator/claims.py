@@ -15,10 +15,10 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import RefusedError
+from evopolicy_common.errors import DECODE_ERRORS, DamagedStoreError, RefusedError
 from evopolicy_common.messages.operator import Claim, ClaimState
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.store import Store, unreadable
 from evopolicy_coordinator.writer import Writer
 
 MAX_TTL_S = 3600.0
@@ -85,9 +85,18 @@ class Claims:
     async def _loaded(self, now: float) -> dict[tuple[str, str], ClaimRow]:
         if self._rows is None:
             found = await self._writer.call(Store.claims)
-            self._rows = {(suite, name): _rows.decode(data) for suite, name, data in found}
+            self._rows = {(suite, name): _decoded(suite, name, data) for suite, name, data in found}
             self._until = {key: now + row.ttl_s for key, row in self._rows.items()}
         return self._rows
+
+
+def _decoded(suite: str, name: str, data: bytes) -> ClaimRow:
+    try:
+        return _rows.decode(data)
+    except DECODE_ERRORS as error:
+        raise DamagedStoreError(
+            f"table claims, row (suite, name) = {suite, name}: {unreadable(error)}"
+        ) from error
 
 
 def _check(message: Claim) -> None:

@@ -7,9 +7,10 @@ Rules that this module owns:
   serves them all.
 - When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
   the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
-  are asked again.
-- What the service does not know how to go on from (a store that cannot be loaded for another reason, a failure in its own
-  machinery) ends the process with the reason: whoever keeps it up starts it again, on what is on disk. See `failure`.
+  are asked again. The same follows a bug of the core, or a row that the store does not take, but only a few times in a row.
+- What the service does not know how to go on from (a store that cannot be loaded for another reason, a failure that comes back
+  after each load, a failure in its own machinery) ends the process with the reason: whoever keeps it up starts it again, on what
+  is on disk. See `failure`.
 - `now` is Unix time at the start, and not before what is on disk, advanced by the monotonic clock: a wall clock that is
   set changes nothing.
 """
@@ -27,12 +28,18 @@ import msgspec
 import structlog
 
 from evopolicy_common import bundles, codec
-from evopolicy_common.errors import PartFailedError, ProtocolError, RefusedError, StorageError
+from evopolicy_common.errors import (
+    DamagedStoreError,
+    PartFailedError,
+    ProtocolError,
+    RefusedError,
+    StorageError,
+)
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, LeaseRequest, Message, Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.transport import IncomingQuery
-from evopolicy_coordinator.answers import Answers, answer_bytes, answer_to, lane_of
+from evopolicy_coordinator.answers import Answers, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.claims import Claims
 from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
 from evopolicy_coordinator.core.events import (
@@ -57,6 +64,9 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
+_LOADS_MAX = 5
+"""How often a core is loaded anew after a failure that is not the disk's, each soon after the one before."""
+_SOON_S = 60.0
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _STALLS_TOLD = 5
@@ -90,6 +100,9 @@ class Service:
         self._timer_at = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
         self._reload_pause_s = _FIRST_PAUSE_S
+        self._n_failures = 0
+        """Of the core, each within `_SOON_S` of the one before."""
+        self._failed_at = 0.0
         self._storage_error = ""
         self._stopping = False
         self._failed: asyncio.Future[None] = self._loop.create_future()
@@ -289,6 +302,9 @@ class Service:
         except RefusedError as error:
             self._refuse(query, error)
             return
+        except DamagedStoreError as error:
+            self._refuse(query, damaged(error))
+            return
         except StorageError as error:
             answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
         except Exception:
@@ -368,12 +384,22 @@ class Service:
             return
         try:
             effects = step(core)
-        except Exception:
+        except Exception as error:
             # A bug. What the core holds may be half changed, what is on disk is not.
-            log.exception("the core failed; loading it anew from the store")
-            self._drop_core()
+            self._core_failed(error)
             return
         outbox.put(effects)
+
+    def _core_failed(self, error: Exception) -> None:
+        """Loads the core anew, unless that has not helped the last times."""
+        now = self._loop.time()
+        self._n_failures = self._n_failures + 1 if now - self._failed_at < _SOON_S else 1
+        self._failed_at = now
+        if self._n_failures > _LOADS_MAX:
+            self._fail(f"the core, {self._n_failures} times in a row,", error)
+            return
+        log.error("the core failed; loading it anew from the store", n=self._n_failures, exc_info=error)
+        self._drop_core()
 
     def _flush(self) -> None:
         try:
@@ -421,6 +447,9 @@ class Service:
         self._flush()
 
     def _on_write_failure(self, error: BaseException) -> None:
+        if isinstance(error, DamagedStoreError):
+            self._core_failed(error)
+            return
         if not isinstance(error, StorageError):
             self._fail("writing the store", error)
             return
@@ -450,6 +479,9 @@ class Service:
             self._reload_pause_s = min(_LONGEST_PAUSE_S, 2 * self._reload_pause_s)
             try:
                 await self._load()
+            except DamagedStoreError as error:
+                self._fail("loading the state", error)
+                return
             except StorageError as error:
                 log.error("the store still refuses", error=str(error))
                 self._storage_error = str(error)

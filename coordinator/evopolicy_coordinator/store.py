@@ -5,6 +5,7 @@ Rules that this module owns:
 - One connection writes (`Store`, from one thread); any number read (`Reader`, a connection a thread).
 - A row is its msgpack bytes plus the columns it is found by. The schema's version is in `user_version`; an older file
   is migrated when opened, a newer one is refused.
+- A disk that refuses may take it later (StorageError); a row that cannot be read stays so (DamagedStoreError).
 - What a gateway may fetch by digest is written down with the outcome that names it (`train_blobs`), in the same
   transaction.
 """
@@ -19,7 +20,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core import records
@@ -87,11 +88,24 @@ _MIGRATIONS: tuple[str, ...] = (
 SCHEMA_VERSION = len(_MIGRATIONS)
 
 _encode = msgspec.msgpack.Encoder().encode
-_outcomes = msgspec.msgpack.Decoder(OutcomeRow)
-_heads = msgspec.msgpack.Decoder(OutcomeHead)
-_runs = msgspec.msgpack.Decoder(RunRow)
-_submits = msgspec.msgpack.Decoder(SubmitRow)
-_finished = msgspec.msgpack.Decoder(FinishedRow)
+
+_PLACES: dict[type[Any], tuple[str, str, str]] = {
+    RunRow: ("runs", "run", "data"),
+    RunStateRow: ("run_states", "run", "data"),
+    SubmitRow: ("submits", "run, submit_index", "data"),
+    OutcomeRow: ("outcomes", "grp, idx", "data"),
+    OutcomeHead: ("outcomes", "grp, idx", "head"),
+    EvaluationRow: ("evaluations", "evaluation", "data"),
+    FinishedRow: ("finished", "run", "data"),
+    WorkerRow: ("workers", "worker", "data"),
+    AuditRow: ("audits", "audit", "data"),
+    PermitRow: ("permits", "run, boot_id", "data"),
+    KernelRow: ("kernels", "worker", "data"),
+}
+"""Where the rows of a kind are: their table, its key, and the column of their bytes."""
+_DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
+    kind: msgspec.msgpack.Decoder(kind) for kind in _PLACES
+}
 
 
 class Store:
@@ -122,13 +136,13 @@ class Store:
             script = f"BEGIN IMMEDIATE; {_MIGRATIONS[number]} PRAGMA user_version={number + 1}; COMMIT;"
             self._db.executescript(script)
 
-    def write(self, rows: Iterable[Row]) -> None:
+    def write(self, changed: Iterable[Row]) -> None:
         """Writes all rows in one durable transaction; StorageError when it could not, and then none of them."""
-        _guard(self._path, lambda: self._write(rows))
+        _guard(self._path, lambda: self._write(changed))
 
-    def _write(self, rows: Iterable[Row]) -> None:
+    def _write(self, changed: Iterable[Row]) -> None:
         with self._transaction():
-            for row in rows:
+            for row in changed:
                 _WRITERS[type(row)](self._db, row)
 
     @contextlib.contextmanager
@@ -168,8 +182,8 @@ class Store:
         db = self._db
         incarnation = db.execute("SELECT value FROM meta WHERE name = 'incarnation'").fetchone()[0]
         live_runs = "SELECT run FROM run_states WHERE phase != 'finished'"
-        submits = _rows(db, SubmitRow, f"SELECT data FROM submits WHERE run IN ({live_runs})")
-        evaluations = _rows(db, EvaluationRow, "SELECT data FROM evaluations")
+        submits = tuple(rows(db, SubmitRow, f"WHERE run IN ({live_runs})"))
+        evaluations = tuple(rows(db, EvaluationRow))
         groups = [
             group
             for submit in submits
@@ -181,21 +195,21 @@ class Store:
         ]
         groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
         groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
-        outcomes: list[OutcomeHead] = []
-        for group in groups:
-            heads = db.execute("SELECT head FROM outcomes WHERE grp = ? ORDER BY seq", (group,))
-            outcomes.extend(_heads.decode(head) for (head,) in heads)
         return Snapshot(
             incarnation=incarnation,
-            runs=_rows(db, RunRow, "SELECT data FROM runs"),
-            states=_rows(db, RunStateRow, "SELECT data FROM run_states"),
+            runs=tuple(rows(db, RunRow)),
+            states=tuple(rows(db, RunStateRow)),
             submits=submits,
-            outcomes=tuple(outcomes),
+            outcomes=tuple(
+                head
+                for group in groups
+                for head in rows(db, OutcomeHead, "WHERE grp = ? ORDER BY seq", (group,))
+            ),
             evaluations=evaluations,
-            workers=_rows(db, WorkerRow, "SELECT data FROM workers"),
-            audits=_rows(db, AuditRow, f"SELECT data FROM audits WHERE run IN ({live_runs})"),
-            permits=_rows(db, PermitRow, "SELECT data FROM permits WHERE NOT ended"),
-            kernels=_rows(db, KernelRow, "SELECT data FROM kernels"),
+            workers=tuple(rows(db, WorkerRow)),
+            audits=tuple(rows(db, AuditRow, f"WHERE run IN ({live_runs})")),
+            permits=tuple(rows(db, PermitRow, "WHERE NOT ended")),
+            kernels=tuple(rows(db, KernelRow)),
         )
 
     def close(self) -> None:
@@ -227,39 +241,34 @@ class Reader:
         """Outcomes with cursor ≤ seq < upto, from the first on, up to `max_bytes` of rows but at least one."""
 
         def read() -> OutcomePage:
-            rows: list[OutcomeRow] = []
+            page: list[OutcomeRow] = []
             total = 0
-            found = self._db.execute(
-                "SELECT data FROM outcomes WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq",
-                (group, cursor, upto),
-            )
-            for (data,) in found:
-                total += len(data)
-                if rows and total > max_bytes:
+            where = "WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq"
+            for row, n_bytes in _sized_rows(self._db, OutcomeRow, where, (group, cursor, upto)):
+                total += n_bytes
+                if page and total > max_bytes:
                     break
-                rows.append(_outcomes.decode(data))
-            return OutcomePage(tuple(rows), rows[-1].seq + 1 if rows else cursor)
+                page.append(row)
+            return OutcomePage(tuple(page), page[-1].seq + 1 if page else cursor)
 
         return _guard(self._path, read)
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         """The outcome at that place of its group; None when there is none."""
-        return self._one(_outcomes, "SELECT data FROM outcomes WHERE grp = ? AND idx = ?", (group, index))
+        return self._one(OutcomeRow, "WHERE grp = ? AND idx = ?", (group, index))
 
     def submit(self, run: str, submit_index: int) -> SubmitRow | None:
         """The submit's row as it is now; None when there is none."""
-        return self._one(
-            _submits, "SELECT data FROM submits WHERE run = ? AND submit_index = ?", (run, submit_index)
-        )
+        return self._one(SubmitRow, "WHERE run = ? AND submit_index = ?", (run, submit_index))
 
     def finished(self, run: str) -> RunFinished | None:
         """What came of a run; None while it is not finished."""
-        row = self._one(_finished, "SELECT data FROM finished WHERE run = ?", (run,))
+        row = self._one(FinishedRow, "WHERE run = ?", (run,))
         return None if row is None else row.result
 
     def run(self, run: str) -> RunRow | None:
         """The run as it was created; None for an unknown one."""
-        return self._one(_runs, "SELECT data FROM runs WHERE run = ?", (run,))
+        return self._one(RunRow, "WHERE run = ?", (run,))
 
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""
@@ -270,12 +279,8 @@ class Reader:
 
         return _guard(self._path, read)
 
-    def _one(self, decoder: msgspec.msgpack.Decoder[T], query: str, args: tuple[Any, ...]) -> T | None:
-        def read() -> T | None:
-            found = self._db.execute(query, args).fetchone()
-            return None if found is None else decoder.decode(found[0])
-
-        return _guard(self._path, read)
+    def _one(self, kind: type[T], where: str, args: tuple[Any, ...]) -> T | None:
+        return _guard(self._path, lambda: next(rows(self._db, kind, where, args), None))
 
     def close(self) -> None:
         """Close the connection."""
@@ -299,23 +304,58 @@ def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
     return db
 
 
-def _guard(path: Path, work: Callable[[], T]) -> T:
-    """`work()`, with SQLite's errors told as ours."""
+@contextlib.contextmanager
+def told(path: Path) -> Iterator[None]:
+    """SQLite's errors, and rows that cannot be read, as ours with the database's path."""
     try:
-        return work()
-    except sqlite3.OperationalError as error:
-        raise StorageError(f"{path}: {error}") from error
-    except sqlite3.IntegrityError as error:
-        raise StorageError(f"{path} refuses a row that contradicts another: {error}") from error
+        yield
     except sqlite3.DatabaseError as error:
-        raise StorageError(f"{path} cannot be used: {error}; restore it from a backup") from error
-    except DECODE_ERRORS as error:
-        raise StorageError(f"{path} holds a row that cannot be read: {error}") from error
+        if isinstance(error, sqlite3.IntegrityError):
+            raise DamagedStoreError(f"{path} refuses a row that contradicts another: {error}") from error
+        # An operational error is the machine's (full, locked, I/O), but for statements that do not fit the tables.
+        if (
+            isinstance(error, sqlite3.OperationalError)
+            and error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_ERROR
+        ):
+            raise StorageError(f"{path}: {error}") from error
+        raise DamagedStoreError(f"{path} cannot be used: {error}; restore it from a backup") from error
+    except DamagedStoreError as error:
+        raise DamagedStoreError(f"{path}: {error}") from error
 
 
-def _rows(db: sqlite3.Connection, kind: type[T], query: str, args: tuple[Any, ...] = ()) -> tuple[T, ...]:
-    decoder = msgspec.msgpack.Decoder(kind)
-    return tuple(decoder.decode(data) for (data,) in db.execute(query, args))
+def _guard(path: Path, work: Callable[[], T]) -> T:
+    with told(path):
+        return work()
+
+
+def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
+    """The rows of a kind. DamagedStoreError names the one that cannot be read; `told` adds the database's path."""
+    for row, _ in _sized_rows(db, kind, where, args):
+        yield row
+
+
+def _sized_rows(
+    db: sqlite3.Connection, kind: type[T], where: str, args: tuple[Any, ...]
+) -> Iterator[tuple[T, int]]:
+    """Rows, each with its number of bytes."""
+    table, key, column = _PLACES[kind]
+    decode = _DECODERS[kind].decode
+    for *place, data in db.execute(f"SELECT {key}, {column} FROM {table} {where}", args):
+        try:
+            row = decode(data)
+        except DECODE_ERRORS as error:
+            raise DamagedStoreError(
+                f"table {table}, row ({key}) = {tuple(place)}: {unreadable(error)}"
+            ) from error
+        yield row, len(data)
+
+
+def unreadable(error: Exception) -> str:
+    """What is wrong with a row's bytes, and the remedy."""
+    return (
+        f"this row cannot be read: {error}. Restore a backup of the state folder; if a newer version wrote the row,"
+        " use that version"
+    )
 
 
 def _upsert(table: str, columns: str, key: str) -> str:

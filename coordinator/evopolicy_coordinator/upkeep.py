@@ -18,12 +18,11 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 
 from evopolicy_common.blobs import BlobStore
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator.core.records import (
     AuditRow,
     EvaluationRow,
@@ -33,9 +32,8 @@ from evopolicy_coordinator.core.records import (
     SubmitRow,
     evaluation_group,
 )
-from evopolicy_coordinator.store import stored_blobs
+from evopolicy_coordinator.store import rows, stored_blobs, told
 
-T = TypeVar("T")
 Bounds = tuple[str, str]
 """Group ids from the first on, before the second."""
 
@@ -44,13 +42,6 @@ UNNAMED_S = 24 * 3600.0
 BUSY_TIMEOUT_S = 30.0
 GUESS_BYTES = 1 << 20
 """Taken for an episode of an environment of which nothing is stored, when nothing at all is."""
-
-_runs = msgspec.msgpack.Decoder(RunRow)
-_submits = msgspec.msgpack.Decoder(SubmitRow)
-_outcomes = msgspec.msgpack.Decoder(OutcomeRow)
-_finished = msgspec.msgpack.Decoder(FinishedRow)
-_evaluations = msgspec.msgpack.Decoder(EvaluationRow)
-_audits = msgspec.msgpack.Decoder(AuditRow)
 
 
 class Collected(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,20 +97,16 @@ def collect(
     now = time.time() if now is None else now
     blobs = BlobStore(state / "blobs")
     with _database(state) as db:
-        old_runs = [
-            row.run
-            for row in _decoded(db, _finished, "SELECT data FROM finished")
-            if row.result.finished_at < now - older_than_s
-        ]
+        old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
         old_evaluations = [
             row.evaluation
-            for row in _decoded(db, _evaluations, "SELECT data FROM evaluations WHERE finished")
+            for row in rows(db, EvaluationRow, "WHERE finished")
             if row.created_at < now - older_than_s
         ]
         gone = [_of_run(run) for run in old_runs]
         gone += [_of_evaluation(evaluation) for evaluation in old_evaluations]
         named = _named(db, frozenset(old_runs), frozenset(old_evaluations))
-        sizes = [_rows(db, bounds) for bounds in gone]
+        sizes = [_size(db, bounds) for bounds in gone]
         unnamed = [
             digest
             for digest in blobs.digests()
@@ -152,14 +139,14 @@ def use(state: Path) -> list[EnvironmentUse]:
     blobs = BlobStore(state / "blobs")
     found: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
-        for run in _decoded(db, _runs, "SELECT data FROM runs"):
+        for run in rows(db, RunRow):
             train = db.execute(
                 "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE '%/train'",
                 _of_run(run.run),
             ).fetchone()[0]
             if not train:
                 continue
-            _, size = _rows(db, _of_run(run.run))
+            _, size = _size(db, _of_run(run.run))
             digests = db.execute("SELECT digest FROM train_blobs WHERE run = ?", (run.run,)).fetchall()
             size += sum(blobs.size(digest) for (digest,) in digests if blobs.has(digest))
             env = run.settings.env
@@ -189,19 +176,14 @@ def _database(state: Path) -> Iterator[sqlite3.Connection]:
     path = state / DATABASE
     if not path.is_file():
         raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
-    try:
-        uri = f"{path.absolute().as_uri()}?mode=rw"
-        with contextlib.closing(
+    uri = f"{path.absolute().as_uri()}?mode=rw"
+    with (
+        told(path),
+        contextlib.closing(
             sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
-        ) as db:
-            yield db
-    except sqlite3.Error as error:
-        raise StorageError(f"{path}: {error}") from error
-
-
-def _decoded(db: sqlite3.Connection, decoder: msgspec.msgpack.Decoder[T], query: str) -> Iterator[T]:
-    for (data,) in db.execute(query):
-        yield decoder.decode(data)
+        ) as db,
+    ):
+        yield db
 
 
 def _of_run(run: str) -> Bounds:
@@ -213,7 +195,7 @@ def _of_evaluation(evaluation: str) -> Bounds:
     return group, f"{group}\0"
 
 
-def _rows(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
+def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
     """Number and bytes of the outcomes of these groups."""
     query = "SELECT COUNT(*), IFNULL(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
     n, size = db.execute(query, bounds).fetchone()
@@ -230,32 +212,24 @@ def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
 
 def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
     """Digests of all blobs that rows name which stay."""
-    named = {
-        row.bundle
-        for row in _decoded(db, _submits, "SELECT data FROM submits")
-        if row.bundle is not None and row.run not in old_runs
-    }
+    named = {row.bundle for row in rows(db, SubmitRow) if row.bundle is not None and row.run not in old_runs}
     named |= {
         row.bundle
-        for row in _decoded(db, _evaluations, "SELECT data FROM evaluations")
+        for row in rows(db, EvaluationRow)
         if row.bundle is not None and row.evaluation not in old_evaluations
     }
     named |= {
         ref.digest
-        for row in _decoded(db, _evaluations, "SELECT data FROM evaluations")
+        for row in rows(db, EvaluationRow)
         if row.evaluation not in old_evaluations
         for ref in row.replays
     }
     named |= {
         digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
     }
-    named |= {
-        row.actions.digest
-        for row in _decoded(db, _audits, "SELECT data FROM audits")
-        if row.actions is not None
-    }
-    hidden = "SELECT data FROM outcomes WHERE grp NOT LIKE '%/train'"
-    for row in _decoded(db, _outcomes, hidden):
+    named |= {row.actions.digest for row in rows(db, AuditRow) if row.actions is not None}
+    hidden = "WHERE grp NOT LIKE '%/train'"
+    for row in rows(db, OutcomeRow, hidden):
         head, _, tail = row.group.partition("/")
         if head not in old_runs and not (head == "evaluation" and tail in old_evaluations):
             named |= {ref.digest for ref in stored_blobs(row.outcome)}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
+import sqlite3
 import threading
 import time
 from pathlib import Path
@@ -15,7 +17,7 @@ from service_world import Asked, World, play, register
 from structlog.testing import capture_logs
 
 from evopolicy_common import keys
-from evopolicy_common.errors import PartFailedError
+from evopolicy_common.errors import DamagedStoreError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_coordinator import process, service
@@ -266,6 +268,121 @@ def test_a_state_that_cannot_be_loaded_at_the_start_is_told(
     monkeypatch.setattr(Core, "load", broken)
     with pytest.raises(PartFailedError, match="loading the state failed: KeyError"):
         play(tmp_path, scenario)
+
+
+def test_a_core_that_fails_after_each_load_ends_the_service_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads: list[float] = []
+    load = Core.load
+
+    def counted(*args: Any) -> Any:
+        loads.append(time.monotonic())
+        return load(*args)
+
+    def broken(*_: Any) -> Any:
+        raise ZeroDivisionError("planted")
+
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        monkeypatch.setattr(Core, "handle", broken)
+        failing = asyncio.create_task(failed(world))
+        while not failing.done():
+            world.ask(world.state(created))
+            await asyncio.sleep(0.01)
+        assert await failing == "the core, 6 times in a row, failed: ZeroDivisionError: planted"
+        assert len(loads) == 1 + 5
+
+    monkeypatch.setattr(service, "_LONGEST_PAUSE_S", 0.2)
+    monkeypatch.setattr(Core, "load", counted)
+    play(tmp_path, scenario)
+
+
+def test_a_core_that_fails_now_and_then_is_loaded_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        handle = Core.handle
+
+        def stumble(*_: Any) -> Any:
+            monkeypatch.setattr(Core, "handle", handle)
+            raise ZeroDivisionError("planted")
+
+        for _ in range(8):
+            monkeypatch.setattr(Core, "handle", stumble)
+            answer = None
+            while answer is None:
+                asked = world.state(created)
+                world.ask(asked)
+                answer = await asked.message()
+                await asyncio.sleep(0.01)
+            assert isinstance(answer, gateway.StateReply)
+
+    monkeypatch.setattr(service, "_SOON_S", 0.0)
+    play(tmp_path, scenario)
+
+
+def test_a_row_that_the_store_never_takes_ends_the_service_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+
+        def contradicts(rows: Any) -> None:
+            raise DamagedStoreError("refuses a row that contradicts another")
+
+        world.store.write = contradicts  # type: ignore[method-assign]
+        failing = asyncio.create_task(failed(world))
+        while not failing.done():
+            world.ask(world.submit(created, "key"))
+            await asyncio.sleep(0.01)
+        assert "refuses a row that contradicts another" in await failing
+
+    monkeypatch.setattr(service, "_LONGEST_PAUSE_S", 0.2)
+    play(tmp_path, scenario)
+
+
+def test_a_row_that_cannot_be_read_ends_the_service_and_names_row_and_remedy(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        with contextlib.closing(sqlite3.connect(tmp_path / "db")) as db, db:
+            db.execute("UPDATE runs SET data = x'00'")
+        world.full = True
+        world.ask(world.submit(created, "key"))
+        why = await failed(world)
+        for named in ("table runs", created.run, "Restore a backup"):
+            assert named in why
+
+    play(tmp_path, scenario)
+
+
+def test_who_asks_for_what_cannot_be_read_is_refused_and_others_are_served(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        claim = operator.Claim(token="operate", suite="s", name="n", holder="h", ttl_s=9.0)
+        await world.service._writer.call(lambda store: store.write_claim("s", "n", b"\0"))
+        asked = Asked(keys.operator_key("c", "claim"), claim)
+        submitted = world.submit(created, "key")
+        world.ask(asked, submitted)
+        refused = await asked.message()
+        assert refused.status == "damaged"
+        assert isinstance(await submitted.message(), gateway.SubmitAccepted)
+        with contextlib.closing(sqlite3.connect(tmp_path / "db")) as db, db:
+            db.execute("UPDATE submits SET data = x'00'")
+        message = gateway.ResultsRequest(
+            run=created.run, token=created.capability, submit_index=0, cursor=0, wait_s=1.0
+        )
+        results = Asked(keys.gateway_key("c", created.run, "results"), message)
+        world.ask(results)
+        refused = await results.message()
+        assert refused.status == "damaged"
+        assert str(tmp_path) not in refused.message
+        state = world.state(created)
+        world.ask(state)
+        assert isinstance(await state.message(), gateway.StateReply)
+
+    play(tmp_path, scenario)
 
 
 def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:

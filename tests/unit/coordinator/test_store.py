@@ -11,9 +11,10 @@ import msgspec
 import pytest
 from store_rows import blob, outcome_row, run_row, state_row, submit_row
 
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator import store as store_module
+from evopolicy_coordinator import upkeep
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import EvaluationRow, WorkerRow, head_of
 from evopolicy_coordinator.store import SCHEMA_VERSION, Reader, Store, train_run
@@ -244,7 +245,40 @@ def test_file_that_is_no_database_is_told(path: Path) -> None:
 def test_row_that_cannot_be_read_is_told(store: Store, path: Path) -> None:
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
-    with pytest.raises(StorageError, match="cannot be read"):
+    with pytest.raises(DamagedStoreError) as told:
+        store.load()
+    for named in (str(path), "table submits", "('r-1', 0)", "Restore a backup", "newer version"):
+        assert named in str(told.value)
+
+
+def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> None:
+    store.write([run_row(), state_row(), submit_row(), outcome_row(TRAIN, 3, 0)])
+    store._db.execute("UPDATE outcomes SET data = x'00'")
+    reader = Reader(path)
+    for read in (lambda: reader.outcomes(TRAIN, 0, 9, 1 << 20), lambda: reader.outcome(TRAIN, 3)):
+        with pytest.raises(DamagedStoreError, match=r"table outcomes, row .*'r-1/s0/train', 3"):
+            read()
+    reader.close()
+
+
+def test_upkeep_names_the_row_that_it_cannot_read(store: Store, path: Path) -> None:
+    store.write([run_row(), state_row(), submit_row()])
+    store._db.execute("UPDATE submits SET data = x'00'")
+    with pytest.raises(DamagedStoreError, match=f"{path}: table submits, row"):
+        upkeep.collect(path.parent, 0.0)
+
+
+def test_what_the_disk_may_take_later_is_told_from_what_it_never_will(store: Store) -> None:
+    store.write([run_row(), state_row(), submit_row(), outcome_row(TRAIN, 0, 0)])
+    with pytest.raises(DamagedStoreError, match="contradicts another"):
+        store.write([outcome_row(TRAIN, 1, 0)])
+    store._db.execute("PRAGMA query_only=1")
+    with pytest.raises(StorageError) as refused:
+        store.write([submit_row()])
+    assert not isinstance(refused.value, DamagedStoreError)
+    store._db.execute("PRAGMA query_only=0")
+    store._db.execute("DROP TABLE workers")
+    with pytest.raises(DamagedStoreError, match="no such table"):
         store.load()
 
 
