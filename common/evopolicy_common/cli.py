@@ -15,7 +15,7 @@ import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.preflight import explained
+from evopolicy_common.processes.preflight import explained
 from evopolicy_common.terminal import harmless, one_line, say
 
 Connect = Annotated[

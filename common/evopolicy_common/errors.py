@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 """What msgspec raises for bytes that are not what was expected: malformed or of another shape, text that is not UTF-8

@@ -15,7 +15,8 @@ from pathlib import Path
 import typer
 from rich.console import Console, Group
 
-from evopolicy_gateway.suite import suite_cli, suite_view
+from evopolicy_gateway.cli import suite as suite_cli
+from evopolicy_gateway.suite import suite_view
 
 EVERY_S = 5.0
 WIDTH = 140

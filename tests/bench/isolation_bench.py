@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
 SUITE = """
 name = "isolation"

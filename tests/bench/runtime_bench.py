@@ -28,7 +28,7 @@ from rich.table import Table
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeSpec, Job
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 HERE = Path(__file__).parent
 ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"

@@ -28,10 +28,10 @@ from runtime_bench import ACCELERATIONS, jobs, pipe_round_trip_s
 
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.trajectory import Recorder
+from evopolicy_common.records.trajectory import Recorder
 from evopolicy_worker import environments
 from evopolicy_worker.environments import settings
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 (SEED,) = seeds(1)
 ENVIRONMENTS = ("gym/acrobot", "gym/halfcheetah5", "gym/ant5", "gymnasium/MiniGrid-FourRooms-v0")

@@ -40,7 +40,7 @@ from coordinator_harness import (
 )
 
 from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job
-from evopolicy_common.transport import connect
+from evopolicy_common.wire.transport import connect
 
 PER_SUBMIT = 128
 POLICY = """

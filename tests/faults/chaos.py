@@ -26,9 +26,9 @@ from unittest.mock import patch
 
 from fault_cluster import EPISODES, HIDDEN, SUBMITS, FaultCluster, command_line, fault_cluster, record
 
-from evopolicy_common import scratch
-from evopolicy_common.run_difference import differences
-from evopolicy_gateway import processes
+from evopolicy_common.processes import scratch
+from evopolicy_common.records.run_difference import differences
+from evopolicy_gateway.run import processes
 
 EVERY_S = 2.5
 """Mean time between two strikes."""

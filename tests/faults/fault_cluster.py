@@ -24,11 +24,11 @@ from host_faults import Cable, Clock
 from own_processes import only_what_starts_inside
 from weak_link import WeakLink
 
-from evopolicy_common import codec, credentials, keys
 from evopolicy_common.messages import operator
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import connect
-from evopolicy_gateway import processes
+from evopolicy_common.wire import codec, credentials, keys
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import connect
+from evopolicy_gateway.run import processes
 
 SUBMITS = 3
 EPISODES = 6
@@ -39,8 +39,8 @@ PATIENCE_S = 100.0
 DISK_BYTES = 48 << 20
 """Of each file system: the coordinator's state is on one, the run directories on another."""
 KINDS = {
-    "slot": ("python", "evopolicy_worker.env_process"),
-    "slot's jail": ("bwrap", "evopolicy_worker.env_process"),
+    "slot": ("python", "evopolicy_worker.episodes.env_process"),
+    "slot's jail": ("bwrap", "evopolicy_worker.episodes.env_process"),
     "policy's jail": ("bwrap", "zygote.py"),
     "zygote": ("python", "zygote.py"),
     "policy": ("python", "zygote.py"),

@@ -2,7 +2,7 @@
 
 A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when its
 command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the
-published list (`evopolicy_common.run_difference`), its budget spent to the episode, and no process be left over. A worker
+published list (`evopolicy_common.records.run_difference`), its budget spent to the episode, and no process be left over. A worker
 that was frozen past its leases must say so. Exit code 1 when anything is not as it must be. With `--chaos SECONDS` instead:
 several faults at once, at random (`chaos.py`); another seed by `--first-seed`.
 """
@@ -31,13 +31,13 @@ import chaos
 from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system
 
-from evopolicy_common import codec, keys
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator
-from evopolicy_common.requests import Requester
-from evopolicy_common.run_difference import differences
-from evopolicy_common.transport import connect
-from evopolicy_gateway import processes
+from evopolicy_common.records.run_difference import differences
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import connect
+from evopolicy_gateway.run import processes
 
 FREEZE_S = 0.7
 LONG_FREEZE_S = 4.0

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.blobs import write_atomically
 from evopolicy_common.cli import setup_logging
-from evopolicy_coordinator import intake, process
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.server import intake, process
 
 SETTINGS = CoreSettings(
     lease_ttl_s=3.0,

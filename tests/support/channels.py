@@ -25,7 +25,7 @@ from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.jail import Way
 from evopolicy_gateway.jail.view import View
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 PERIOD_S = 0.05
 LIMITS = ResourceLimits(

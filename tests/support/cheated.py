@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
 PATIENCE_S = 120.0
 SECRET = "the operator's own"

@@ -15,13 +15,13 @@ from typing import Any
 
 from own_processes import only_what_starts_inside
 
+from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
+from evopolicy_gateway.agent_supervisor.clock import AgentClock
+from evopolicy_gateway.agent_supervisor.keeper import secrets_in
+from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.agent_log import AgentLog
 from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
-from evopolicy_gateway.harnesses.clock import AgentClock
-from evopolicy_gateway.harnesses.keeper import secrets_in
-from evopolicy_gateway.harnesses.redaction import Redaction
 
 FAKES = Path(__file__).parent / "fake_clis"
 PATIENCE_S = 60.0

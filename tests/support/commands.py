@@ -14,7 +14,7 @@ from pathlib import Path
 from coordinator_harness import Coordinator
 from waiting import PATIENCE_S, wait_until
 
-from evopolicy_common.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
 MARK = "EVOTEST_MARK"
 SMALL = ["--budget", "6", "--validation", "2", "--heldout", "2"]

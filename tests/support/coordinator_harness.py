@@ -18,16 +18,17 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common import bundles, codec, credentials, keys
-from evopolicy_common.bundles import Bundle, BundleFile
-from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
 from evopolicy_common.messages.operator import RunFinished, RunSettings
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import Link, connect
+from evopolicy_common.records import bundles
+from evopolicy_common.records.bundles import Bundle, BundleFile
+from evopolicy_common.wire import codec, credentials, keys
+from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import Link, connect
 
 LINE = EnvironmentDescription(
     env="toy/line",

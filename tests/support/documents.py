@@ -11,9 +11,9 @@ from typing import Any
 
 import typer
 
-from evopolicy_coordinator import cli as coordinator_cli
-from evopolicy_gateway import cli as gateway_cli
-from evopolicy_gateway import serve_cli
+from evopolicy_coordinator.cli import main as coordinator_cli
+from evopolicy_gateway.cli import main as gateway_cli
+from evopolicy_gateway.cli import serve as serve_cli
 from evopolicy_worker import cli as worker_cli
 
 APPS = {

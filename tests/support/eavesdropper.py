@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator
 
 import zenoh
 
-from evopolicy_common import transport
-from evopolicy_common.credentials import Credentials
+from evopolicy_common.wire import transport
+from evopolicy_common.wire.credentials import Credentials
 
 
 @contextlib.asynccontextmanager

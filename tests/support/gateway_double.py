@@ -12,9 +12,6 @@ import httpx
 import msgspec
 import numpy as np
 
-from evopolicy_common import codec, credentials, keys, transport
-from evopolicy_common.blobs import digest_of
-from evopolicy_common.credentials import Credentials
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits
 from evopolicy_common.messages.gateway import (
@@ -36,12 +33,15 @@ from evopolicy_common.messages.gateway import (
     SubmitInFlight,
 )
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
-from evopolicy_common.refusals import Refusal
-from evopolicy_common.trajectory import Recorder
-from evopolicy_gateway.agents_md import Urls
-from evopolicy_gateway.gateway import Close, Gateway
-from evopolicy_gateway.layout import OpenedRun, RunFolder, save
-from evopolicy_gateway.submits import Desk
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.trajectory import Recorder
+from evopolicy_common.wire import codec, credentials, keys, transport
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.submits.desk import Desk
+from evopolicy_gateway.workspace.agents_md import Urls
 
 CLUSTER = "test"
 RUN = "run-1"

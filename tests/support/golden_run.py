@@ -20,12 +20,12 @@ from coordinator_harness import PATIENCE_S, OperatorClient
 from leak_search import memory_of
 from wiretap import Wiretap
 
-from evopolicy_common import codec, credentials
 from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, Job
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunFinished
-from evopolicy_common.transport import connect
+from evopolicy_common.wire import codec, credentials
+from evopolicy_common.wire.transport import connect
 
 N_CASES: dict[str, int] = {"train": 4, "valid": 2, "heldout": 2}
 N_SUBMITS = 2
@@ -220,8 +220,8 @@ class GoldenRun:
             n_played = (number + 1) * N_CASES["valid"]
             cluster.wait_for(lambda n=n_played: cluster.validations_of(self._bundles()) == n)  # type: ignore[misc]
             if number == N_SUBMITS - 1:
-                self.gateway = self._process_of(process.pid, b"evopolicy_gateway.serve_cli")
-                keeper = self._process_of(process.pid, b"evopolicy_gateway.harnesses.keeper")
+                self.gateway = self._process_of(process.pid, b"evopolicy_gateway.cli.serve")
+                keeper = self._process_of(process.pid, b"evopolicy_gateway.agent_supervisor.keeper")
                 for who, pid in (("gateway", self.gateway), ("keeper", keeper)):
                     self.memory[f"{who}, after the validation"] = list(memory_of(pid))
             (self.workspace / f"go-{number}").touch()

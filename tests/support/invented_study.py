@@ -10,7 +10,7 @@ from invented_policies import Version, png, policy
 from run_dirs import write_run
 
 from evopolicy_common import catalogue
-from evopolicy_common.run_record import Tokens
+from evopolicy_common.records.run_record import Tokens
 
 AGENTS: Mapping[str, tuple[str, str, float]] = {
     "Northwind": ("codex", "codex", 0.9),

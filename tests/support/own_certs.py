@@ -8,9 +8,9 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common import credentials
-from evopolicy_common.credentials import Credentials, MachineRole, Role
-from evopolicy_coordinator import machines
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials, MachineRole, Role
+from evopolicy_coordinator.pki import machines
 
 CLUSTER = "local"
 DAYS = 30

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import patch
 
-from evopolicy_gateway import processes
+from evopolicy_gateway.run import processes
 
 
 def alive(pid: int) -> bool:

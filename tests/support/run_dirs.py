@@ -13,7 +13,7 @@ import msgspec
 from agent_logs import LOGS
 from invented_policies import Version
 
-from evopolicy_common.run_record import (
+from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
     CheckpointMetrics,
@@ -29,7 +29,7 @@ from evopolicy_common.run_record import (
     encode_checkpoint_metrics,
     encode_run_record,
 )
-from evopolicy_common.summary import Summary, utc_text
+from evopolicy_common.records.summary import Summary, utc_text
 
 START = 1_760_000_000.0
 

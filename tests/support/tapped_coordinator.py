@@ -16,11 +16,11 @@ import msgspec
 import zenoh
 import zstandard
 
-from evopolicy_common import codec
 from evopolicy_common.messages.gateway import ResultsPage, RunOpened
 from evopolicy_common.messages.worker import HandIn
-from evopolicy_common.transport import IncomingQuery, Server
-from evopolicy_coordinator import cli
+from evopolicy_common.wire import codec
+from evopolicy_common.wire.transport import IncomingQuery, Server
+from evopolicy_coordinator.cli import main as cli
 
 
 def tap(file: Path, leak: Path) -> None:

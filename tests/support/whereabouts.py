@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 from golden_run import GoldenCluster
 
-from evopolicy_common import codec
 from evopolicy_common.messages import gateway, worker
+from evopolicy_common.wire import codec
 
 
 class Moment(msgspec.Struct, frozen=True):

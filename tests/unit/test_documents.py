@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from documents import blocks_of_commands, commands, parse
 
-from evopolicy_coordinator.intake import _VERBS
+from evopolicy_coordinator.server.intake import _VERBS
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [

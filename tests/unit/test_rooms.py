@@ -58,10 +58,10 @@ def test_the_coordinators_core_does_no_io() -> None:
 OWN_STDOUT = {
     "evopolicy_gateway/agents": "programs of their own, whose stdout is an agent's log",
     "evopolicy_gateway/jail/doorway.py": "inside the jail, with the standard library alone",
-    "evopolicy_gateway/serve_cli.py": "URLs of its own, for a shell to read",
-    "evopolicy_common/leash.py": "becomes another program, with the standard library alone",
-    "evopolicy_worker/episodes.py": "speaks with the process that started it",
-    "evopolicy_worker/recording.py": "speaks with the process that started it",
+    "evopolicy_gateway/cli/serve.py": "URLs of its own, for a shell to read",
+    "evopolicy_common/processes/leash.py": "becomes another program, with the standard library alone",
+    "evopolicy_worker/episodes/loop.py": "speaks with the process that started it",
+    "evopolicy_worker/slots/recording.py": "speaks with the process that started it",
     "evopolicy_worker/sandbox/inside": "inside the sandbox, with the standard library alone",
     "evopolicy_common/terminal.py": "is the one place",
 }

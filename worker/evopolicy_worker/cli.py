@@ -16,20 +16,22 @@ import structlog
 import typer
 from rich.table import Table
 
-from evopolicy_common import catalogue, credentials, host, keys, transport
+from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.preflight import check_scratch
-from evopolicy_common.scratch import scratch_folder
+from evopolicy_common.processes import host
+from evopolicy_common.processes.preflight import check_scratch
+from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_worker import environments
-from evopolicy_worker.cores import Cores
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.cores import Cores
+from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
 
 app = typer.Typer(add_completion=False, no_args_is_help=False)

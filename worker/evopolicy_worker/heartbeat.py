@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import structlog
 
-from evopolicy_common import codec, keys
 from evopolicy_common.errors import ProtocolError, TransportError
 from evopolicy_common.messages.worker import Heartbeat, HeartbeatReply, HeldLease, Refused
-from evopolicy_common.transport import Link
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.transport import Link
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -18,13 +18,13 @@ from collections.abc import Awaitable, Callable
 import msgspec
 import structlog
 
-from evopolicy_common import codec
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import HandIn, HandInReply, JobResult, WorkerReply
-from evopolicy_common.refusals import NOT_NOW, Refusal
-from evopolicy_common.requests import Requester
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire import codec
+from evopolicy_common.wire.refusals import NOT_NOW, Refusal
+from evopolicy_common.wire.requests import Requester
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -24,7 +24,6 @@ from typing import Protocol
 import msgspec
 import structlog
 
-from evopolicy_common import codec, keys
 from evopolicy_common.errors import (
     EvopolicyError,
     PartFailedError,
@@ -47,9 +46,10 @@ from evopolicy_common.messages.worker import (
     ResultKind,
     WorkerReply,
 )
-from evopolicy_common.refusals import Refusal
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import Link
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
 from evopolicy_worker.outbox import Outbox

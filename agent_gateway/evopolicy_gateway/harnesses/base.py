@@ -19,9 +19,9 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_gateway.harnesses.agent_log import AgentLog
-from evopolicy_gateway.harnesses.agent_process import AgentProcess
-from evopolicy_gateway.harnesses.clock import Activity, AgentClock
+from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
+from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
+from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
 from evopolicy_gateway.jail.jail import Jail
 
 _INFO_TIMEOUT_S = 30.0

@@ -13,8 +13,8 @@ from typing import Any
 
 import orjson
 
+from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses import prompts
-from evopolicy_gateway.harnesses.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
 
 _PIPE_PATIENCE_S = 1.0

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.blobs import write_atomically
 from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_gateway.harnesses.usage import Usage
 
 

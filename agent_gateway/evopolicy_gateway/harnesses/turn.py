@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import orjson
 
-from evopolicy_gateway import processes
-from evopolicy_gateway.harnesses.agent_process import AgentProcess
+from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import Doing, Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader
 from evopolicy_gateway.harnesses.trouble import Trouble, trouble_of
+from evopolicy_gateway.run import processes
 
 DONE_PATIENCE_S = 30.0
 """What a program gets to exit after it has said that its turn is done."""

@@ -16,18 +16,19 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from evopolicy_common import catalogue, keys
+from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.wire import keys
 from evopolicy_gateway import harnesses
+from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
+from evopolicy_gateway.cli.options import hidden_cases_of
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.clock import SILENCE_S
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.layout import RunFolder, run_folder
-from evopolicy_gateway.options import hidden_cases_of
+from evopolicy_gateway.run.layout import RunFolder, run_folder
 
 Positive = Annotated[int, Meta(ge=1)]
 WALL_S = 12 * 3600.0

@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.blobs import write_atomically
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.run_record import RunRecord
-from evopolicy_common.summary import utc_text
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.suite.suite_file import SuiteRun
 
 SCHEMA_VERSION = 1

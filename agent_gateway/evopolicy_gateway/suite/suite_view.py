@@ -18,9 +18,9 @@ from rich.text import Text
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import Terminal, say_json
-from evopolicy_gateway.control import AgentDoing, Progress
+from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.watch import PHASES, first_line
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
-from evopolicy_gateway.watch import PHASES, first_line
 
 _SHOWN_ROWS = 24
 _WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30}

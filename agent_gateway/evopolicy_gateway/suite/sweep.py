@@ -24,19 +24,19 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
-from evopolicy_common.preflight import explained
-from evopolicy_common.run_record import RunRecord, decode_run_record
-from evopolicy_common.scratch import remove_tree
+from evopolicy_common.processes.preflight import explained
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.alone import alone
-from evopolicy_gateway.control import AgentDoing
 from evopolicy_gateway.harnesses import session
-from evopolicy_gateway.layout import OpenedRun, RunFolder
-from evopolicy_gateway.operations import Operations
-from evopolicy_gateway.play import Plan, RunPlay
+from evopolicy_gateway.operator.alone import alone
+from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run.play import Plan, RunPlay
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Decision, Found, side_by_side
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun

@@ -9,7 +9,7 @@ import msgspec
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Text, Word
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):

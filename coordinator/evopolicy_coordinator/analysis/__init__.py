@@ -20,16 +20,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from evopolicy_coordinator.analysis.comparability import MixedRunsError, mixtures
-from evopolicy_coordinator.analysis.edits import classify, edit_rates
-from evopolicy_coordinator.analysis.paper import heldout_returns
-from evopolicy_coordinator.analysis.ranking import leaderboard
-from evopolicy_coordinator.analysis.reader import load_runs
-from evopolicy_coordinator.analysis.records import Run, Submit, rows
-from evopolicy_coordinator.analysis.report_tables import tables_of
-from evopolicy_coordinator.analysis.scores import score_table
+from evopolicy_coordinator.analysis.behaviour.edits import classify, edit_rates
+from evopolicy_coordinator.analysis.behaviour.trace import trace
+from evopolicy_coordinator.analysis.reading.comparability import MixedRunsError, mixtures
+from evopolicy_coordinator.analysis.reading.reader import load_runs
+from evopolicy_coordinator.analysis.reading.records import Run, Submit, rows
+from evopolicy_coordinator.analysis.scoring.paper import heldout_returns
+from evopolicy_coordinator.analysis.scoring.ranking import leaderboard
+from evopolicy_coordinator.analysis.scoring.scores import score_table
 from evopolicy_coordinator.analysis.study import Study, study, study_of
-from evopolicy_coordinator.analysis.trace import trace
+from evopolicy_coordinator.analysis.tables.report_tables import tables_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,20 +7,30 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_coordinator.analysis.audit import AuditSignals, TokenUse, audit_signals, token_use
-from evopolicy_coordinator.analysis.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
-from evopolicy_coordinator.analysis.edits import EditRates, Transition, classify, edit_rates
-from evopolicy_coordinator.analysis.evolution import Evolution, evolutions
-from evopolicy_coordinator.analysis.normalised import Normalised, normalised
-from evopolicy_coordinator.analysis.ranking import RESAMPLES, Leaderboard, leaderboard
-from evopolicy_coordinator.analysis.reader import load_runs
-from evopolicy_coordinator.analysis.records import LeftOut, Run
-from evopolicy_coordinator.analysis.scores import ScoreTable, ordered_environments, score_table, suites_of
-from evopolicy_coordinator.analysis.structure import (
+from evopolicy_coordinator.analysis.behaviour.audit import AuditSignals, TokenUse, audit_signals, token_use
+from evopolicy_coordinator.analysis.behaviour.edits import EditRates, Transition, classify, edit_rates
+from evopolicy_coordinator.analysis.behaviour.structure import (
     EditSizeBin,
     StructureMean,
     edit_size_bins,
     structure_means,
+)
+from evopolicy_coordinator.analysis.reading.comparability import (
+    UNKNOWN_ISOLATION,
+    MixedRunsError,
+    Mixture,
+    mixtures,
+)
+from evopolicy_coordinator.analysis.reading.reader import load_runs
+from evopolicy_coordinator.analysis.reading.records import LeftOut, Run
+from evopolicy_coordinator.analysis.scoring.evolution import Evolution, evolutions
+from evopolicy_coordinator.analysis.scoring.normalised import Normalised, normalised
+from evopolicy_coordinator.analysis.scoring.ranking import RESAMPLES, Leaderboard, leaderboard
+from evopolicy_coordinator.analysis.scoring.scores import (
+    ScoreTable,
+    ordered_environments,
+    score_table,
+    suites_of,
 )
 
 

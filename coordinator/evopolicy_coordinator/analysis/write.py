@@ -21,6 +21,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator.analysis.behaviour.trace import Trace, trace
 from evopolicy_coordinator.analysis.html.pages import (
     FORMS,
     FigureView,
@@ -31,15 +32,14 @@ from evopolicy_coordinator.analysis.html.pages import (
     replays_page,
     trace_page,
 )
-from evopolicy_coordinator.analysis.latex import to_latex
 from evopolicy_coordinator.analysis.palette import Look, looks
-from evopolicy_coordinator.analysis.records import Run, path_text
-from evopolicy_coordinator.analysis.report_tables import tables_of
-from evopolicy_coordinator.analysis.run_tables import feedback_use, submits_of
-from evopolicy_coordinator.analysis.scores import ordered_environments
+from evopolicy_coordinator.analysis.reading.records import Run, path_text
+from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
-from evopolicy_coordinator.analysis.tables import Table, to_csv, to_markdown
-from evopolicy_coordinator.analysis.trace import Trace, trace
+from evopolicy_coordinator.analysis.tables.latex import to_latex
+from evopolicy_coordinator.analysis.tables.report_tables import tables_of
+from evopolicy_coordinator.analysis.tables.run_tables import feedback_use, submits_of
+from evopolicy_coordinator.analysis.tables.table import Table, to_csv, to_markdown
 
 REPORT_SCHEMA_VERSION = 1
 _OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})

@@ -13,7 +13,7 @@ import msgspec
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.environment import PolicyScope
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import events
 from .effects import ReadEvaluation

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import PolicyScope
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import audit, events
 from .jobs import EARLY_VALIDATION, HELDOUT, REFERENCE, JobGroup, Template

@@ -30,7 +30,7 @@ from evopolicy_common.messages import gateway
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import ELSEWHERE, HiddenIsolation
 from evopolicy_common.messages.worker import HeldLease
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from .jobs import EARLY_VALIDATION, HIDDEN, TRAIN, JobGroup, JobState
 from .records import KernelRow, PermitRow, RunRow, RunStateRow

@@ -14,7 +14,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import RunState
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import (
     audit,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import events, handin, status
 from .isolation import NO_BOOT_ID

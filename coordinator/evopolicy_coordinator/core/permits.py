@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from evopolicy_common.messages import gateway, operator
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import events
 from .isolation import ASK_AGAIN_S, EVERYWHERE, poll_target

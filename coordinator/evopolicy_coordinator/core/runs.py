@@ -18,7 +18,7 @@ import msgspec
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import NO_POLICY, EpisodeOutcome, PolicyFailure
 from evopolicy_common.messages.gateway import CANCELLED, SubmitStatus
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from . import events
 from .effects import ReadFinished, ReadResults

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal
 
 from evopolicy_common.messages.worker import Message, Refused
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 
 from .effects import Effect, Log, Persist, Reply
 from .events import RequestId

@@ -78,7 +78,7 @@ def _():
     for path in glob.glob("/proc/[0-9]*/cmdline"):
         folder = os.path.dirname(path)
         try:
-            if "evopolicy_gateway.serve_cli" not in text(path):
+            if "evopolicy_gateway.cli.serve" not in text(path):
                 continue
             start = int(text(f"{folder}/maps").partition("-")[0], 16)
             with open(f"{folder}/mem", "rb") as memory:

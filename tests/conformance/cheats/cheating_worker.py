@@ -14,13 +14,13 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common import codec
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
-from evopolicy_common.trajectory import Recorder, decode
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.trajectory import Recorder, decode
+from evopolicy_common.wire import codec
 from evopolicy_worker import cli
 from evopolicy_worker.fingerprint import fingerprint
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 BONUS = 3.0
 """What a forger adds to a reward."""

@@ -9,10 +9,10 @@ import urllib.request
 import msgspec
 import zenoh
 
-from evopolicy_common import codec, keys, transport
-from evopolicy_common.credentials import Credentials
 from evopolicy_common.messages.gateway import StateRequest
 from evopolicy_common.messages.operator import StatusRequest
+from evopolicy_common.wire import codec, keys, transport
+from evopolicy_common.wire.credentials import Credentials
 
 
 def fail(*what):

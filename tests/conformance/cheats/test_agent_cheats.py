@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from cheated import Cheated, CheatingRun
 
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 
 STOPPED = (
     *("forge feedback", "add feedback", "move feedback away", "rewrite the rules", "replace the rules"),

@@ -11,11 +11,11 @@ from typing import Any, get_args
 import pytest
 from msgspec import inspect
 
-from evopolicy_common import codec
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, GatewayReply, ResultsPage
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.wire import codec
 
 ALLOWED: dict[str, dict[str, str]] = {
     "RunOpened": {

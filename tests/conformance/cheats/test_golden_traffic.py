@@ -10,8 +10,8 @@ import pytest
 from golden_run import EPISODES, N_CASES, N_SUBMITS, GoldenCluster, GoldenRun
 from leak_search import Needles
 
-from evopolicy_common import codec
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.wire import codec
 
 pytestmark = pytest.mark.slow
 

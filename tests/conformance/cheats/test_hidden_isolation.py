@@ -25,8 +25,8 @@ from signalling_policy import LEVELS
 from waiting import PATIENCE_S
 from whereabouts import heard_by, met, moments
 
-from evopolicy_common.run_record import RunRecord, decode_run_record
-from evopolicy_gateway.layout import RunFolder
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_gateway.run.layout import RunFolder
 
 pytestmark = pytest.mark.slow
 

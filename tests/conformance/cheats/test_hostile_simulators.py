@@ -22,7 +22,7 @@ import evopolicy_worker
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_worker.sandbox import env_jail
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 SIMULATORS = Path(__file__).with_name("simulators")
 ENV = "gymnasium/MiniGrid-FourRooms-v0"

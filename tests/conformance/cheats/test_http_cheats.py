@@ -19,10 +19,10 @@ from urllib.parse import urlsplit
 import pytest
 from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, opened, prepare
 
-from evopolicy_gateway import submits
-from evopolicy_gateway.door import Door
-from evopolicy_gateway.feedback import SubmitTree
-from evopolicy_gateway.layout import save
+from evopolicy_gateway.http.door import Door
+from evopolicy_gateway.run.layout import save
+from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.submits.feedback import SubmitTree
 
 PATIENCE_S = 60.0
 BODY = b'{"env_instances": [0]}'

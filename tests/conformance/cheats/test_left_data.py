@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from cheated import Cheated
 
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 
 HERE = Path(__file__).parent
 N_TRAIN = 3

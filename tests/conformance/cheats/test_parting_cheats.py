@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from cheated import PATIENCE_S, Cheated
 
-from evopolicy_common.run_difference import differences
-from evopolicy_common.run_record import decode_run_record
-from evopolicy_common.scratch import remove_tree
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.run_difference import differences
+from evopolicy_common.records.run_record import decode_run_record
 
 AGENT = Path(__file__).parent / "parting_agent.py"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from cheated import SECRET, Cheated
 
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 
 AGENT = Path(__file__).parent / "swapping_agent.py"
 N_RACES = 8

@@ -16,12 +16,13 @@ import pytest
 from cheated import Cheated
 from coordinator_harness import OperatorClient
 
-from evopolicy_common import credentials, trajectory
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest
-from evopolicy_common.run_record import RunRecord, decode_run_record
-from evopolicy_common.transport import connect
+from evopolicy_common.records import trajectory
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.transport import connect
 
 POLICY = Path(__file__).parent / "probing_policy.py"
 N_CASES = 4

@@ -23,11 +23,11 @@ from coordinator_harness import (
 )
 from waiting import wait_until
 
-from evopolicy_common import codec, keys
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.worker import Refused
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.wire import codec, keys
 
 EAVESDROPPER = Path(__file__).parent / "eavesdropping_agent.py"
 

@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 from waiting import eventually
 
 from evopolicy_common.messages import operator
-from evopolicy_common.run_record import decode_run_record
-from evopolicy_coordinator.status_cli import status_app
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_coordinator.cli.status import status_app
 
 PATIENCE_S = 150.0
 EPISODES = 6

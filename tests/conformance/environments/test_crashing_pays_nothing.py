@@ -11,7 +11,7 @@ import pytest
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 STEPS_COST = [
     "toy/maze",

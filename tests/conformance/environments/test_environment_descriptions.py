@@ -12,8 +12,8 @@ import pytest
 
 from evopolicy_common.catalogue import entries, entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
-from evopolicy_common.trajectory import Recorder
-from evopolicy_gateway.episode_files import trajectory_files
+from evopolicy_common.records.trajectory import Recorder
+from evopolicy_gateway.submits.episode_files import trajectory_files
 from evopolicy_worker.environments import Environment, offered
 from evopolicy_worker.environments.spaces import bounds
 

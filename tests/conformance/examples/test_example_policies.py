@@ -10,7 +10,7 @@ from pathlib import Path
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeSpec, Job
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 POLICIES = Path(__file__).parents[3] / "examples" / "policies"
 CORE16 = catalogue.suites()["core16"].environments

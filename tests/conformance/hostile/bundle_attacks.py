@@ -11,8 +11,8 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common import bundles
-from evopolicy_common.bundles import BundleFile
+from evopolicy_common.records import bundles
+from evopolicy_common.records.bundles import BundleFile
 
 SECRET = b"the hidden seeds"
 

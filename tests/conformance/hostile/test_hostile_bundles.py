@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from bundle_attacks import BUNDLES, PATHS, SECRET, BundleAttack, packed
 
-from evopolicy_common import bundles
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import BundleError
-from evopolicy_gateway.snapshots import take
+from evopolicy_common.records import bundles
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_gateway.submits.snapshots import take
 
 
 def folders(tmp_path: Path) -> tuple[Path, Path]:

@@ -12,8 +12,8 @@ from gateway_double import Served, opened, served
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_gateway.agents_md import NO_URLS, agents_md
-from evopolicy_gateway.submit_request import Bounds, parse
+from evopolicy_gateway.http.submit_request import Bounds, parse
+from evopolicy_gateway.workspace.agents_md import NO_URLS, agents_md
 
 PATIENCE_S = 30.0
 

@@ -19,8 +19,8 @@ import msgspec
 import pytest
 from coordinator_harness import PATIENCE_S, Coordinator, bundle_of, gateway_of, operator_of, working
 
-from evopolicy_common import credentials
 from evopolicy_common.errors import RefusedError
+from evopolicy_common.wire import credentials
 from evopolicy_coordinator.core.records import RunRow
 
 

@@ -18,7 +18,7 @@ from coordinator_harness import (
 )
 
 from evopolicy_common.messages.operator import RunFinished
-from evopolicy_common.transport import connect
+from evopolicy_common.wire.transport import connect
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
 

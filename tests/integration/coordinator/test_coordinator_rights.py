@@ -19,13 +19,13 @@ from coordinator_harness import (
     working,
 )
 
-from evopolicy_common import codec, keys
-from evopolicy_common.credentials import Credentials
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
 from evopolicy_common.messages.worker import Refused
-from evopolicy_common.transport import Link, connect
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_common.wire.transport import Link, connect
 
 
 @pytest.fixture(scope="module")

@@ -26,11 +26,12 @@ from coordinator_harness import (
 )
 from typer.testing import CliRunner
 
-from evopolicy_common.blobs import BlobStore, digest_of
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
-from evopolicy_common.transport import connect
-from evopolicy_coordinator import backup, upkeep, upkeep_cli
+from evopolicy_common.records.blobs import BlobStore, digest_of
+from evopolicy_common.wire.transport import connect
+from evopolicy_coordinator.cli import upkeep as upkeep_cli
+from evopolicy_coordinator.storage import backup, upkeep
 
 WEEK_S = 7 * 24 * 3600.0
 

@@ -26,7 +26,7 @@ from coordinator_harness import (
 from typer.testing import CliRunner, Result
 
 from evopolicy_common.messages.operator import WorkerStatus
-from evopolicy_coordinator.status_cli import runs_app, status_app, workers_app
+from evopolicy_coordinator.cli.status import runs_app, status_app, workers_app
 
 APPS = {"status": status_app, "workers": workers_app, "runs": runs_app}
 
@@ -162,7 +162,7 @@ def test_wrong_usage_exits_2(coordinator: Coordinator, tmp_path: Path) -> None:
 
 
 def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> None:
-    code = "from evopolicy_coordinator.status_cli import status_app; status_app()"
+    code = "from evopolicy_coordinator.cli.status import status_app; status_app()"
     file = coordinator.ready["credentials"]["operator"]
     controller, terminal = pty.openpty()
     watching = subprocess.Popen(
@@ -186,7 +186,7 @@ def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> 
 
 
 def test_watch_as_json_prints_an_object_a_line(coordinator: Coordinator) -> None:
-    code = "from evopolicy_coordinator.status_cli import status_app; status_app()"
+    code = "from evopolicy_coordinator.cli.status import status_app; status_app()"
     file = coordinator.ready["credentials"]["operator"]
     watching = subprocess.Popen(
         [sys.executable, "-c", code, "--watch", "--json", "--credentials", file], stdout=subprocess.PIPE

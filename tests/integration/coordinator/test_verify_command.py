@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 VERIFY = (
-    "from evopolicy_common.cli import run_app; from evopolicy_coordinator.verify_cli import app; run_app(app)"
+    "from evopolicy_common.cli import run_app; from evopolicy_coordinator.cli.verify import app; run_app(app)"
 )
 AGENT = """
 import json, os, urllib.request

@@ -10,8 +10,8 @@ import yaml
 from documents import blocks_of_commands
 from typer.testing import CliRunner
 
-from evopolicy_common import credentials
-from evopolicy_coordinator.cli import app
+from evopolicy_common.wire import credentials
+from evopolicy_coordinator.cli.main import app
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

@@ -16,13 +16,13 @@ from own_certs import CLUSTER, OwnCerts, free_port
 from typer.testing import CliRunner
 from waiting import eventually
 
-from evopolicy_common import credentials, keys, transport
-from evopolicy_common.credentials import Role
 from evopolicy_common.errors import ConfigError, TransportError
-from evopolicy_common.transport import IncomingQuery, Link
-from evopolicy_coordinator.cli import app
-from evopolicy_coordinator.machines import Machines
-from evopolicy_coordinator.router_config import write_router_config
+from evopolicy_common.wire import credentials, keys, transport
+from evopolicy_common.wire.credentials import Role
+from evopolicy_common.wire.transport import IncomingQuery, Link
+from evopolicy_coordinator.cli.main import app
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.router_config import write_router_config
 
 OWN_KEY = {
     "worker": keys.worker_key(CLUSTER, "lease"),

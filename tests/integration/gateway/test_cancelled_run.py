@@ -109,7 +109,7 @@ def test_a_gateway_that_starts_again_after_the_cancelling_ends_its_run(
     with command(tmp_path, *run_arguments(operator_file, agent(tmp_path, SLOW))) as running:
         partial = "runs/*/toy_line/t/workspace/feedback/submit_000.partial"
         wait_until(lambda: [*tmp_path.glob(partial)], lambda: running.text)
-        gateway = running.running("evopolicy_gateway.serve_cli")
+        gateway = running.running("evopolicy_gateway.cli.serve")
         os.kill(gateway, signal.SIGSTOP)
         cancel(operator_file, tmp_path)
         os.kill(gateway, signal.SIGKILL)

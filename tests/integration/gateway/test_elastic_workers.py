@@ -13,7 +13,7 @@ from commands import agent, command, record_in
 from coordinator_harness import Coordinator
 from waiting import PATIENCE_S, wait_until
 
-from evopolicy_common.summary import decode_summary
+from evopolicy_common.records.summary import decode_summary
 
 CODE = '''
 open("system/policy.py", "w").write("""

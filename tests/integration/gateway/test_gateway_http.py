@@ -14,8 +14,8 @@ import pytest
 from gateway_double import CAPABILITY, Double, Served, opened, served
 
 from evopolicy_common.messages.episode import PolicyFailure
-from evopolicy_common.summary import decode_summary
-from evopolicy_gateway.submit_request import MAX_BODY_BYTES
+from evopolicy_common.records.summary import decode_summary
+from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES
 
 
 def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], double: Double | None = None) -> Double:

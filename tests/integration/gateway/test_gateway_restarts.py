@@ -17,9 +17,10 @@ from gateway_double import Double, answering, gateway_on, opened, prepare, serve
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, RunState, Submit
 from evopolicy_common.messages.worker import Refused
-from evopolicy_common.refusals import Refusal
-from evopolicy_gateway import server, submits
-from evopolicy_gateway.feedback import SubmitTree
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_gateway.http import server
+from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.submits.feedback import SubmitTree
 
 BODY = {"env_instances": [1, 2, 3]}
 

@@ -82,7 +82,7 @@ def test_a_read_only_home_is_told_before_anything_is_begun(home: Path, name: str
             sys.executable,
             "-c",
             "import sys; from pathlib import Path\n"
-            "from evopolicy_coordinator.state import StateFolder\nStateFolder.open(Path(sys.argv[1])).close()",
+            "from evopolicy_coordinator.storage.state_folder import StateFolder\nStateFolder.open(Path(sys.argv[1])).close()",
             home / "old",
         ]
     )

@@ -11,9 +11,9 @@ import pytest
 from commands import SMALL, agent, command, record_in, run_dir
 from waiting import wait_until
 
-from evopolicy_common import scratch
-from evopolicy_common.run_record import decode_checkpoint_metrics
-from evopolicy_common.summary import decode_summary
+from evopolicy_common.processes import scratch
+from evopolicy_common.records.run_record import decode_checkpoint_metrics
+from evopolicy_common.records.summary import decode_summary
 
 
 def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> None:

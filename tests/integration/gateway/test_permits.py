@@ -10,16 +10,16 @@ import msgspec
 import pytest
 from gateway_double import RUN, Double, answering, gateway_on, opened, prepare, served
 
-from evopolicy_common import host
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, Permit, RequestPermit
 from evopolicy_common.messages.operator import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
-from evopolicy_common.refusals import Refusal
-from evopolicy_gateway import door
-from evopolicy_gateway.door import AgentPlace, Door
-from evopolicy_gateway.gateway import Close, Gateway
-from evopolicy_gateway.layout import IntendedRun, RunFolder, save
+from evopolicy_common.processes import host
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_gateway.http import door
+from evopolicy_gateway.http.door import AgentPlace, Door
+from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
 
 KERNEL = "0f2e9a7c-11d0-4b35-8d2f-5a3c9e7b1d60"
 WAITING = Permit(granted=False, waits_for="hidden episodes to end on this machine")

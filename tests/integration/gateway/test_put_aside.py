@@ -12,11 +12,11 @@ import gateway_double
 import pytest
 from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
 
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.messages.worker import BlobGet, Message, Refused
-from evopolicy_gateway import episode_files, formatting
-from evopolicy_gateway.journal import Died, Journal, SetAside
-from evopolicy_gateway.layout import RunFolder
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.submits import episode_files, formatting
+from evopolicy_gateway.submits.journal import Died, Journal, SetAside
 
 BODY = {"env_instances": [1, 2, 3]}
 WHOLE = {"trajectory.jsonl", "stdout.txt", "stderr.txt"}
@@ -82,9 +82,9 @@ def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None
 KILLED = """
 import asyncio, os, signal, sys
 from pathlib import Path
-from evopolicy_gateway import submits
-from evopolicy_gateway.gateway import Gateway
-from evopolicy_gateway.layout import RunFolder
+from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.run.gateway import Gateway
+from evopolicy_gateway.run.layout import RunFolder
 
 real = submits.episode_files
 

@@ -22,10 +22,10 @@ from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, op
 from waiting import wait_until
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.run_record import decode_run_record
-from evopolicy_gateway.cli import app as evopolicy
-from evopolicy_gateway.door import Door, door_of, finish
-from evopolicy_gateway.layout import RunFolder, save
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_gateway.cli.main import app as evopolicy
+from evopolicy_gateway.http.door import Door, door_of, finish
+from evopolicy_gateway.run.layout import RunFolder, save
 
 HOST = "127.0.0.2"
 """Of this machine, and not what a gateway listens on by itself."""

@@ -9,7 +9,7 @@ import pytest
 from commands import agent, command, record_in, run_arguments, run_dir, run_on
 from waiting import wait_until
 
-from evopolicy_common.summary import decode_summary
+from evopolicy_common.records.summary import decode_summary
 
 
 def test_a_spoken_agent_gets_turns_until_it_stops_and_the_run_is_finalised(

@@ -15,8 +15,8 @@ from pathlib import Path
 from commands import agent, command, record_in, run_arguments, run_dir, run_on
 from waiting import PATIENCE_S, wait_until
 
-from evopolicy_gateway import door
-from evopolicy_gateway.layout import RunFolder
+from evopolicy_gateway.http import door
+from evopolicy_gateway.run.layout import RunFolder
 
 
 def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ open("again", "w").write(json.dumps(again))
     with command(tmp_path, *run_arguments(operator_file, agent(tmp_path, code))) as running:
         workspace = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace")])[0]
         wait_until((workspace / "first").exists)
-        os.kill(running.running("evopolicy_gateway.serve_cli"), signal.SIGKILL)
+        os.kill(running.running("evopolicy_gateway.cli.serve"), signal.SIGKILL)
         (workspace / "killed").touch()
         exit_code, out, err = running.finish()
         assert exit_code == 0, err
@@ -61,7 +61,7 @@ time.sleep(1000)
     with command(tmp_path, *arguments, "--jail", "none") as running:
         found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
         wait_until(found.read_text)
-        os.kill(running.running("evopolicy_gateway.harnesses.keeper"), signal.SIGKILL)
+        os.kill(running.running("evopolicy_gateway.agent_supervisor.keeper"), signal.SIGKILL)
         exit_code, out, err = running.finish()
         assert exit_code == 0, err
         assert running.alive() == []
@@ -149,7 +149,7 @@ def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: P
     folder = run_dir(tmp_path)
     known = re.findall(r"http://\S+/submit", (folder / "workspace" / "AGENTS.md").read_text())
     by_hand = subprocess.Popen(
-        [sys.executable, "-m", "evopolicy_gateway.serve_cli", str(folder), "--json"],
+        [sys.executable, "-m", "evopolicy_gateway.cli.serve", str(folder), "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

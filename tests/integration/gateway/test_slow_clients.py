@@ -12,7 +12,8 @@ from urllib.parse import SplitResult, urlsplit
 import pytest
 from gateway_double import Served, served
 
-from evopolicy_gateway import http, patience
+from evopolicy_gateway.http import patience
+from evopolicy_gateway.http import service as http
 
 SHORT_S = 0.5
 PATIENCE_S = 60.0

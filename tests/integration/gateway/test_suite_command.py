@@ -21,7 +21,7 @@ import pytest
 from commands import Command, command, toy_cluster
 from waiting import wait_until
 
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 
 FAKES = Path(__file__).parents[2] / "support" / "fake_clis"
 

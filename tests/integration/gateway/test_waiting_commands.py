@@ -12,8 +12,8 @@ import pytest
 from commands import SMALL, agent, command, record_in, run_arguments, run_dir
 from waiting import wait_until
 
-from evopolicy_common import credentials
-from evopolicy_common.credentials import Credentials
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials
 
 POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
 WORKER_IS_PAUSED = (

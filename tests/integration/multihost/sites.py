@@ -26,11 +26,11 @@ from pathlib import Path
 
 from hosts import Host, Network
 
-from evopolicy_common import codec, credentials, keys
 from evopolicy_common.errors import TransportError
 from evopolicy_common.messages import operator
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import connect
+from evopolicy_common.wire import codec, credentials, keys
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import connect
 
 PATIENCE_S = 240.0
 SUBMITS = 3

@@ -20,7 +20,7 @@ import pytest
 from sites import EPISODES, PATIENCE_S, REAL, SUBMITS, TOTAL, TOY, Sites, sites
 
 from evopolicy_common.messages.operator import StatusReply
-from evopolicy_common.run_difference import differences
+from evopolicy_common.records.run_difference import differences
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

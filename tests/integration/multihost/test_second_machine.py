@@ -17,7 +17,7 @@ import hosts
 import pytest
 from hosts import Host
 
-from evopolicy_common.run_record import decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -17,11 +17,11 @@ import pytest
 from browser import Page
 from typer.testing import CliRunner
 
-from evopolicy_common.run_difference import differences
-from evopolicy_common.run_record import RunRecord, decode_run_record
-from evopolicy_coordinator.analysis.reader import load_runs
-from evopolicy_coordinator.analysis.trace import trace
-from evopolicy_coordinator.report_cli import app
+from evopolicy_common.records.run_difference import differences
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_coordinator.analysis.behaviour.trace import trace
+from evopolicy_coordinator.analysis.reading.reader import load_runs
+from evopolicy_coordinator.cli.report import app
 
 PATIENCE_S = 600.0
 ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")

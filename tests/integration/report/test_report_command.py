@@ -17,8 +17,9 @@ from invented_study import AGENTS, write_suite
 from run_dirs import write_run
 from typer.testing import CliRunner
 
-from evopolicy_coordinator.analysis import figures_of, paper, rows, study, write_report
-from evopolicy_coordinator.report_cli import app
+from evopolicy_coordinator.analysis import figures_of, rows, study, write_report
+from evopolicy_coordinator.analysis.scoring import paper
+from evopolicy_coordinator.cli.report import app
 
 ENVIRONMENTS = ("gym/acrobot", "gym/racing", "toy/line")
 MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d703431")
@@ -160,7 +161,7 @@ def test_index_is_self_contained(report: Path) -> None:
 
 def test_front_door_has_report_as_a_plain_command(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
-    command = [sys.executable, "-c", "from evopolicy_gateway.cli import main; main()", "report"]
+    command = [sys.executable, "-c", "from evopolicy_gateway.cli.main import main; main()", "report"]
     arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report"), "--no-pages"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr

@@ -12,10 +12,10 @@ import zenoh
 from eavesdropper import eavesdropping
 from waiting import eventually
 
-from evopolicy_common import keys, transport
-from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import TransportError
-from evopolicy_common.transport import IncomingQuery, Link
+from evopolicy_common.wire import keys, transport
+from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.transport import IncomingQuery, Link
 
 CLUSTER = "test"
 PASSWORDS: dict[Role, str] = {"worker": "w-secret", "gateway": "g-secret", "operator": "o-secret"}

@@ -14,16 +14,17 @@ import pytest
 import structlog
 from structlog.testing import capture_logs
 
-from evopolicy_common import codec, keys, requests, transport
-from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import TransportError
 from evopolicy_common.messages.operator import Done, WaitRun
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import IncomingQuery, Link
-from evopolicy_coordinator import verify_run
-from evopolicy_gateway import operations, session
-from evopolicy_gateway.operations import Operations
-from evopolicy_gateway.session import Session
+from evopolicy_common.wire import codec, keys, requests, transport
+from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import IncomingQuery, Link
+from evopolicy_coordinator.verify import run as verify_run
+from evopolicy_gateway.operator import operations
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run import session
+from evopolicy_gateway.run.session import Session
 
 SOON_S = 0.2
 QUESTION = WaitRun(token="", run="r", wait_s=0.0)

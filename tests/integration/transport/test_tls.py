@@ -16,12 +16,12 @@ import zenoh
 from own_certs import CLUSTER, DAYS, OwnCerts, now, of
 from waiting import eventually
 
-from evopolicy_common import keys, transport
-from evopolicy_common.credentials import Credentials, Role
 from evopolicy_common.errors import ConfigError, TransportError
-from evopolicy_common.transport import IncomingQuery, Link
-from evopolicy_coordinator.machines import Machines
-from evopolicy_coordinator.remote_door import remote_door
+from evopolicy_common.wire import keys, transport
+from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.transport import IncomingQuery, Link
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.remote_door import remote_door
 
 KEYS: dict[Role, str] = {
     "worker": keys.worker_key(CLUSTER, "lease"),

@@ -24,10 +24,10 @@ from coordinator_harness import (
 )
 from own_certs import OwnCerts, of
 
-from evopolicy_common import credentials
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages.operator import RunFinished
-from evopolicy_common.transport import connect
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.transport import connect
 
 IDS = tuple(range(8))
 

@@ -27,11 +27,11 @@ from coordinator_harness import (
     play,
 )
 
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
-from evopolicy_common.requests import Requester
-from evopolicy_common.transport import connect
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import connect
 from evopolicy_worker import outbox, supervisor
 from evopolicy_worker.supervisor import Options, Supervisor
 
@@ -455,7 +455,7 @@ def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
 @pytest.mark.parametrize(
     ("broken", "part"),
     [
-        ("evopolicy_common.transport.Link.ask_blocking", "the heartbeat"),
+        ("evopolicy_common.wire.transport.Link.ask_blocking", "the heartbeat"),
         ("evopolicy_worker.outbox.Outbox._batch", "handing in"),
     ],
 )

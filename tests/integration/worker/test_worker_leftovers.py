@@ -14,14 +14,14 @@ import pytest
 from own_processes import alive
 
 from evopolicy_common.errors import WorkerError
-from evopolicy_gateway import processes
+from evopolicy_gateway.run import processes
 from evopolicy_worker import cli
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 WORKER = """
 import asyncio, sys
 from pathlib import Path
-from evopolicy_common.scratch import scratch_folder
+from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_worker import cli
 from evopolicy_worker.sandbox import available_tiers
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common.blobs import MAX_UNFINISHED, BlobStore, digest_of, is_digest, write_atomically
 from evopolicy_common.errors import StorageError
+from evopolicy_common.records.blobs import MAX_UNFINISHED, BlobStore, digest_of, is_digest, write_atomically
 
 
 def test_what_is_put_is_read_back(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common import bundles
-from evopolicy_common.blobs import digest_of
-from evopolicy_common.bundles import BundleFile
 from evopolicy_common.errors import BundleError
+from evopolicy_common.records import bundles
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.bundles import BundleFile
 
 
 def make(folder: Path, files: dict[str, bytes]) -> Path:

@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from evopolicy_common import credentials
-from evopolicy_common.credentials import Credentials, TlsFiles, stays_on_machine
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials, TlsFiles, stays_on_machine
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common import host
+from evopolicy_common.processes import host
 
 
 def test_boot_id_is_the_kernels_own() -> None:

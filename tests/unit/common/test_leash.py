@@ -9,13 +9,13 @@ import time
 
 from own_processes import alive
 
-from evopolicy_common import leash
+from evopolicy_common.processes import leash
 
 
 def test_a_leashed_program_ends_with_its_parent() -> None:
     parent = """
 import subprocess, sys, time
-from evopolicy_common.leash import leashed
+from evopolicy_common.processes.leash import leashed
 child = subprocess.Popen(leashed([sys.executable, "-c", "print('up', flush=True); import time; time.sleep(1000)"]))
 print(child.pid, flush=True)
 time.sleep(1000)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from evopolicy_common.left_files import MAX_DEPTH, left_files
-from evopolicy_common.scratch import give_back_rights, remove_tree
+from evopolicy_common.processes.left_files import MAX_DEPTH, left_files
+from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 
 
 def names(root: Path) -> list[str]:

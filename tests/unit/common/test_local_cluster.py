@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from evopolicy_common import local_cluster
-from evopolicy_common.child_process import ChildProcess
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes import local_cluster
+from evopolicy_common.processes.child_process import ChildProcess
 
 SOON_S = 0.2
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"

@@ -10,13 +10,13 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from evopolicy_common import codec
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages import bounds
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import CloseRun, GatewayReply, GatewayRequest
 from evopolicy_common.messages.operator import OperatorReply, OperatorRequest
 from evopolicy_common.messages.worker import Message, WorkerReply, WorkerRequest
+from evopolicy_common.wire import codec
 
 DECODERS = {
     "worker requests": (WorkerRequest, codec.worker_requests),

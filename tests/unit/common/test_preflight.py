@@ -12,7 +12,7 @@ import pytest
 
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.preflight import check_text, check_writable, explained
+from evopolicy_common.processes.preflight import check_text, check_writable, explained
 
 
 def test_a_full_disk_is_told_unless_who_asks_waits_for_room(

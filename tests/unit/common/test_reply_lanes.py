@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from evopolicy_common.transport import _send_replies
+from evopolicy_common.wire.transport import _send_replies
 
 
 class Query:

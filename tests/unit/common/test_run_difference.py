@@ -8,8 +8,8 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from evopolicy_common.run_difference import differences
-from evopolicy_gateway.cli import app
+from evopolicy_common.records.run_difference import differences
+from evopolicy_gateway.cli.main import app
 
 
 def make_run(root: Path, name: str, **changes: Any) -> Path:

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from evopolicy_common.errors import ProtocolError
-from evopolicy_common.run_record import (
+from evopolicy_common.records.run_record import (
     Agent,
     ExperimentDimensions,
     Outcome,
@@ -19,7 +19,7 @@ from evopolicy_common.run_record import (
     decode_run_record,
     encode_run_record,
 )
-from evopolicy_common.summary import Summary, decode_summary, utc_text
+from evopolicy_common.records.summary import Summary, decode_summary, utc_text
 
 FIELDS = [
     "schema_version",

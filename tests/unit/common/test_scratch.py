@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.scratch import clear_stale, remove_tree, scratch_folder
+from evopolicy_common.processes.scratch import clear_stale, remove_tree, scratch_folder
 
 OWNER = """
 import sys, tempfile, time
-from evopolicy_common.scratch import scratch_folder
+from evopolicy_common.processes.scratch import scratch_folder
 tempfile.tempdir = sys.argv[1]
 with scratch_folder("local") as root:
     (root / "state").mkdir()

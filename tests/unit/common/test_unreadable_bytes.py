@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common import codec
-from evopolicy_common.bundles import BundleFile, digest_of, load, pack
 from evopolicy_common.errors import BundleError, ProtocolError
-from evopolicy_common.run_record import decode_checkpoint_metrics, decode_run_record
-from evopolicy_common.summary import decode_summary
+from evopolicy_common.records.bundles import BundleFile, digest_of, load, pack
+from evopolicy_common.records.run_record import decode_checkpoint_metrics, decode_run_record
+from evopolicy_common.records.summary import decode_summary
+from evopolicy_common.wire import codec
 
 NO_TEXT = b"\xd6 "
 

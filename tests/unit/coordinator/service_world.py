@@ -8,22 +8,22 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from evopolicy_common import codec, keys
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.messages.worker import Message
-from evopolicy_coordinator.answers import Answers
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire import codec, keys
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.intake import Intake
-from evopolicy_coordinator.service import Service
+from evopolicy_coordinator.server.answers import Answers
+from evopolicy_coordinator.server.intake import Intake
+from evopolicy_coordinator.server.service import Service
+from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
-from evopolicy_coordinator.state import ROLES, Identity
-from evopolicy_coordinator.store import Store
-from evopolicy_coordinator.uploads import Uploads
+from evopolicy_coordinator.storage.state_folder import ROLES, Identity
+from evopolicy_coordinator.storage.store import Store
 
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"

@@ -11,17 +11,17 @@ import msgspec
 import pytest
 from store_rows import blob, outcome_row, run_row, state_row, submit_row
 
-from evopolicy_common import codec
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
-from evopolicy_coordinator import uploads as uploads_module
-from evopolicy_coordinator.answers import MAX_PAGE_BYTES, Answers
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire import codec
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
-from evopolicy_coordinator.store import Store
-from evopolicy_coordinator.uploads import Uploads
+from evopolicy_coordinator.server import uploads as uploads_module
+from evopolicy_coordinator.server.answers import MAX_PAGE_BYTES, Answers
+from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.storage.store import Store
 
 TRAIN = records.train_group("r-1", 0)
 

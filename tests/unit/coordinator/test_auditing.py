@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from store_rows import blob, outcome_row, run_row, state_row
 
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.trajectory import Recorder, decode
-from evopolicy_coordinator import auditing
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.trajectory import Recorder, decode
 from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.events import AuditCompared, AuditPrepared
 from evopolicy_coordinator.core.records import AuditRow, OutcomeRow
-from evopolicy_coordinator.store import Reader, Store
-from evopolicy_coordinator.upkeep import collect
+from evopolicy_coordinator.server import auditing
+from evopolicy_coordinator.storage.store import Reader, Store
+from evopolicy_coordinator.storage.upkeep import collect
 
 GROUP = "r-1/s0/train"
 ACTIONS = [np.array([0.25], np.float32), [1, 2.5], {"a": float("nan")}, np.float64(-0.0), None, "left"]

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator import certs
-from evopolicy_coordinator.certs import Pair
+from evopolicy_coordinator.pki import certs
+from evopolicy_coordinator.pki.certs import Pair
 
 NOW = dt.datetime(2031, 5, 6, 7, 8, 9, tzinfo=dt.UTC)
 AUTHORITY = certs.make_authority("lab", NOW)

@@ -11,9 +11,9 @@ import pytest
 from own_certs import of
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator import certs_cli
-from evopolicy_coordinator.machines import Machines
-from evopolicy_coordinator.state import StateFolder
+from evopolicy_coordinator.cli import certs as certs_cli
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.storage.state_folder import StateFolder
 
 
 @pytest.fixture

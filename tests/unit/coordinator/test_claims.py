@@ -11,9 +11,9 @@ import pytest
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages.operator import Claim, ClaimState
-from evopolicy_coordinator.claims import Claims
-from evopolicy_coordinator.store import Store
-from evopolicy_coordinator.writer import Writer
+from evopolicy_coordinator.server.claims import Claims
+from evopolicy_coordinator.storage.store import Store
+from evopolicy_coordinator.storage.writer import Writer
 
 
 def with_claims(path: Path, work: Callable[[Claims], Coroutine[Any, Any, None]]) -> None:

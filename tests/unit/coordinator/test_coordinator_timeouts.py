@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 from service_world import Asked, World, play
 
-from evopolicy_common import keys
 from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import operator
-from evopolicy_coordinator import service, store, upkeep
-from evopolicy_coordinator.store import Store
+from evopolicy_common.wire import keys
+from evopolicy_coordinator.server import service
+from evopolicy_coordinator.storage import store, upkeep
+from evopolicy_coordinator.storage.store import Store
 
 SOON_S = 0.2
 

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evopolicy_common import catalogue
-from evopolicy_coordinator.data_cli import app
+from evopolicy_coordinator.cli.data import app
 
 
 def call(*args: object) -> Result:

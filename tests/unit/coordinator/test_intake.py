@@ -10,19 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from store_rows import blob
 
-from evopolicy_common import codec, keys
-from evopolicy_common.blobs import BlobStore
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.messages.worker import Message
-from evopolicy_coordinator import request_checks
-from evopolicy_coordinator.intake import Intake
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire import codec, keys
+from evopolicy_coordinator.server import request_checks
+from evopolicy_coordinator.server.intake import Intake
+from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
-from evopolicy_coordinator.state import ROLES, Identity
-from evopolicy_coordinator.uploads import Uploads
+from evopolicy_coordinator.storage.state_folder import ROLES, Identity
 
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"

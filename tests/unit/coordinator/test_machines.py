@@ -8,9 +8,10 @@ import pytest
 from own_certs import CLUSTER, DAYS, OwnCerts, now, of
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator import backup, certs, machines
-from evopolicy_coordinator.machines import Machines
-from evopolicy_coordinator.store import Store
+from evopolicy_coordinator.pki import certs, machines
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.storage import backup
+from evopolicy_coordinator.storage.store import Store
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from evopolicy_coordinator.remote_door import remote_door
+from evopolicy_coordinator.server.remote_door import remote_door
 
 
 class Unreadable:

@@ -16,13 +16,13 @@ import structlog
 from service_world import Asked, World, play, register
 from structlog.testing import capture_logs
 
-from evopolicy_common import keys
 from evopolicy_common.errors import DamagedStoreError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_coordinator import process, service
+from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.server import process, service
 
 
 def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:

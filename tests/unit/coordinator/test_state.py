@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common import credentials
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.scratch import scratch_folder
-from evopolicy_coordinator.state import StateFolder, reachable, resolve_listen
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.wire import credentials
+from evopolicy_coordinator.storage.state_folder import StateFolder, reachable, resolve_listen
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from store_rows import blob, outcome_row, run_row, state_row, submit_row
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_coordinator import store as store_module
-from evopolicy_coordinator import upkeep
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import EvaluationRow, WorkerRow, head_of
-from evopolicy_coordinator.store import SCHEMA_VERSION, Reader, Store, train_run
+from evopolicy_coordinator.storage import store as store_module
+from evopolicy_coordinator.storage import upkeep
+from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
 
 TRAIN = records.train_group("r-1", 0)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from evopolicy_common import codec
 from evopolicy_common.messages.worker import Fingerprint, LeaseRequest, Refused, Register, Registered
-from evopolicy_coordinator.turned_away import KEPT, KEPT_S, TurnedAwayWorkers
+from evopolicy_common.wire import codec
+from evopolicy_coordinator.server.turned_away import KEPT, KEPT_S, TurnedAwayWorkers
 
 KEY = "evopolicy/v1/c/work/register"
 REFUSED = Refused(status="wrong_protocol", message="another version")

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common.trajectory import Recorder, Trajectory, decode
-from evopolicy_coordinator.verify_compare import (
+from evopolicy_common.records.trajectory import Recorder, Trajectory, decode
+from evopolicy_coordinator.verify.compare import (
     actions_of,
     files_difference,
     first_difference,

@@ -14,8 +14,8 @@ from store_rows import run_row
 
 from evopolicy_common.errors import StorageError
 from evopolicy_coordinator.core.effects import Effect, Log, Persist
-from evopolicy_coordinator.store import Store
-from evopolicy_coordinator.writer import Outbox, Writer
+from evopolicy_coordinator.storage.store import Store
+from evopolicy_coordinator.storage.writer import Outbox, Writer
 
 
 def persist(number: int) -> Persist:

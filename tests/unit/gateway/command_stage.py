@@ -11,10 +11,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from evopolicy_gateway.harnesses.agent_log import AgentLog
-from evopolicy_gateway.harnesses.agent_process import environment_of
+from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
+from evopolicy_gateway.agent_supervisor.agent_process import environment_of
+from evopolicy_gateway.agent_supervisor.clock import Activity
 from evopolicy_gateway.harnesses.base import Ending, Stage
-from evopolicy_gateway.harnesses.clock import Activity
 from evopolicy_gateway.harnesses.command import CommandHarness
 
 PATIENCE_S = 30.0

@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 from frozen import freezer
 
-from evopolicy_gateway import alone, control
-from evopolicy_gateway.control import (
+from evopolicy_gateway.http.door import Door
+from evopolicy_gateway.operator import alone, control
+from evopolicy_gateway.operator.control import (
     AgentEnded,
     AgentSurvives,
     AnyEvent,
@@ -24,9 +25,8 @@ from evopolicy_gateway.control import (
     StartAgent,
     StopAgent,
 )
-from evopolicy_gateway.door import Door
-from evopolicy_gateway.layout import OpenedRun, RunFolder, save
-from evopolicy_gateway.operations import Operations
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 
 PATIENCE_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
@@ -40,7 +40,7 @@ class Keeper:
         self.folder.mkdir(exist_ok=True)
         self.lock = root / "keeper.lock"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "evopolicy_gateway.harnesses.keeper"],
+            [sys.executable, "-m", "evopolicy_gateway.agent_supervisor.keeper"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -10,8 +10,9 @@ from pathlib import Path
 OPERATOR = """
 import asyncio, sys
 from pathlib import Path
-from evopolicy_gateway import children, processes
-from evopolicy_gateway.children import Child
+from evopolicy_gateway.operator import children
+from evopolicy_gateway.run import processes
+from evopolicy_gateway.operator.children import Child
 
 async def main():
     processes.become_subreaper()

@@ -7,8 +7,8 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from evopolicy_gateway import control
-from evopolicy_gateway.control import AnyEvent, CloseRun
+from evopolicy_gateway.operator import control
+from evopolicy_gateway.operator.control import AnyEvent, CloseRun
 
 LONG: dict[str, Any] = {"x" * 1000: {"input": list(range(400_000))}}
 

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure
 from evopolicy_common.messages.gateway import EpisodeFeedback, SubmitDone
-from evopolicy_common.summary import decode_summary
-from evopolicy_common.trajectory import Recorder
-from evopolicy_gateway.episode_files import episode_files, trajectory_files
-from evopolicy_gateway.formatting import (
+from evopolicy_common.records.summary import decode_summary
+from evopolicy_common.records.trajectory import Recorder
+from evopolicy_gateway.submits.episode_files import episode_files, trajectory_files
+from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,
     EpisodeScore,
     episode_name,

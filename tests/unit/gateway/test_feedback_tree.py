@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.blobs import sync_filesystem
-from evopolicy_gateway import feedback
-from evopolicy_gateway.feedback import SubmitTree
+from evopolicy_common.records.blobs import sync_filesystem
+from evopolicy_gateway.submits import feedback
+from evopolicy_gateway.submits.feedback import SubmitTree
 
 
 def names(folder: Path) -> list[str]:

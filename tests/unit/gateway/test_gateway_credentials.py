@@ -7,13 +7,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from evopolicy_common import credentials
-from evopolicy_common.blobs import write_atomically
-from evopolicy_common.credentials import Credentials, TlsFiles
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway import gateway
-from evopolicy_gateway.layout import OpenedRun, RunFolder
-from evopolicy_gateway.operations import find_credentials
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials, TlsFiles
+from evopolicy_gateway.operator.operations import find_credentials
+from evopolicy_gateway.run import gateway
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder
 
 RUNS_OWN = Credentials(
     cluster="c",

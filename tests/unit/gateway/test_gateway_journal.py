@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import StorageError
-from evopolicy_gateway.journal import Accepted, AnyEntry, Closed, Journal, Rejected, Requested, Settled
+from evopolicy_gateway.submits.journal import (
+    Accepted,
+    AnyEntry,
+    Closed,
+    Journal,
+    Rejected,
+    Requested,
+    Settled,
+)
 
 REQUESTED = Requested(
     key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None

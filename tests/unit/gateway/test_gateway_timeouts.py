@@ -23,12 +23,15 @@ from gateway_double import served
 from starlette.responses import PlainTextResponse
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway import http, play, server
+from evopolicy_gateway.agent_supervisor import agent_process
 from evopolicy_gateway.agents.client import Client, ProtocolError
-from evopolicy_gateway.children import Child
-from evopolicy_gateway.harnesses import agent_process, base, cli_agent, command, turn
+from evopolicy_gateway.harnesses import base, cli_agent, command, turn
+from evopolicy_gateway.http import server
+from evopolicy_gateway.http import service as http
 from evopolicy_gateway.jail import settings as jail_settings
-from evopolicy_gateway.play import RunPlay
+from evopolicy_gateway.operator.children import Child
+from evopolicy_gateway.run import play
+from evopolicy_gateway.run.play import RunPlay
 
 SOON_S = 0.2
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
@@ -140,8 +143,8 @@ def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
 
 KEEPER = """
 import asyncio, sys
-from evopolicy_gateway.control import StartAgent, StopAgent
-from evopolicy_gateway.harnesses import keeper
+from evopolicy_gateway.operator.control import StartAgent, StopAgent
+from evopolicy_gateway.agent_supervisor import keeper
 from evopolicy_gateway.harnesses.base import Harness
 
 class Deaf(Harness):
@@ -316,7 +319,7 @@ def test_giving_up_a_run_ends_although_nobody_hears_of_it(
 
 UNKILLABLE = """
 import subprocess, sys
-from evopolicy_gateway import processes
+from evopolicy_gateway.run import processes
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
 processes.KILL_PATIENCE_S = 0.2
 signal_all, processes._signal_all = processes._signal_all, lambda pids, number: None

@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.operator import RunProgress
-from evopolicy_common.run_record import decode_run_record, encode_run_record
+from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_common.terminal import Terminal
-from evopolicy_gateway import control
-from evopolicy_gateway.control import AgentDoing, Progress
-from evopolicy_gateway.journal import Rejected
-from evopolicy_gateway.layout import Staged
-from evopolicy_gateway.options import cases_of, limits_of, one_environment
-from evopolicy_gateway.play import Plan
-from evopolicy_gateway.record import run_record
-from evopolicy_gateway.run_options import RunOptions
-from evopolicy_gateway.runs import RunResult, exit_code, report
-from evopolicy_gateway.times import Times
-from evopolicy_gateway.watch import watching
+from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
+from evopolicy_gateway.cli.run_options import RunOptions
+from evopolicy_gateway.operator import control
+from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.runs import RunResult, exit_code, report
+from evopolicy_gateway.operator.watch import watching
+from evopolicy_gateway.run.layout import Staged
+from evopolicy_gateway.run.play import Plan
+from evopolicy_gateway.run.record import run_record
+from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.submits.journal import Rejected
 
 
 def plan(tmp_path: Path, **fields: Any) -> Plan:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from own_processes import alive
 
-from evopolicy_gateway.processes import descendants, end_orphans
+from evopolicy_gateway.run.processes import descendants, end_orphans
 
 KEEPER = """
 import os, subprocess, sys, time
-from evopolicy_gateway import processes
+from evopolicy_gateway.run import processes
 processes.become_subreaper()
 stubborn = "import os, signal, time; signal.signal(15, signal.SIG_IGN); {} open(os.environ['N'] + str(os.getpid()), 'w'); time.sleep(1000)"
 kinds = ["", "os.setsid() if os.getpgrp() != os.getpid() else 0;", "os.fork() and os._exit(0);",
@@ -77,7 +77,7 @@ while not os.path.exists(sys.argv[1]) and os.getppid() == parent:
 
 SEARCHER = """
 import subprocess, sys
-from evopolicy_gateway import processes
+from evopolicy_gateway.run import processes
 processes.become_subreaper()
 breeder = subprocess.Popen([sys.executable, "-c", sys.argv[1], *sys.argv[2:]])
 for _ in range(400):

@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from finished_run import finished
 
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
-from evopolicy_gateway import replays
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_gateway.run import replays
 
 MP4 = [b"mp4 %d" % index for index in range(3)]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.blobs import BlobStore
-from evopolicy_common.bundles import MAX_BYTES, load
-from evopolicy_gateway.snapshots import take
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.bundles import MAX_BYTES, load
+from evopolicy_gateway.submits.snapshots import take
 
 
 def system(tmp_path: Path) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from evopolicy_gateway.times import Stopwatch, Times
+from evopolicy_gateway.run.times import Stopwatch, Times
 
 
 def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import Terminal, harmless
-from evopolicy_gateway.control import AgentDoing, Progress
+from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.watch import Lines, LiveTable, first_line
 from evopolicy_gateway.suite.suite_view import LinesView, TableView
-from evopolicy_gateway.watch import Lines, LiveTable, first_line
 
 STEERING = (
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from gateway_double import LINE, opened
 
-from evopolicy_common.blobs import digest_of
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_gateway.agents_md import NO_URLS, agents_md, urls_at
-from evopolicy_gateway.info import info_document
-from evopolicy_gateway.initial_policy import constant_action, initial_policy
-from evopolicy_gateway.layout import RunFolder, run_folder
-from evopolicy_gateway.task import task_markdown
-from evopolicy_gateway.workspace import stage
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_gateway.http.info import info_document
+from evopolicy_gateway.http.task import task_markdown
+from evopolicy_gateway.run.layout import RunFolder, run_folder
+from evopolicy_gateway.workspace.agents_md import NO_URLS, agents_md, urls_at
+from evopolicy_gateway.workspace.initial_policy import constant_action, initial_policy
+from evopolicy_gateway.workspace.staging import stage
 
 URLS = urls_at("127.0.0.1", 4711, "ab" * 16)
 

@@ -11,10 +11,10 @@ import msgspec
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.scratch import scratch_folder
-from evopolicy_worker import slot_messages as messages
+from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import START_TIMEOUT_S
+from evopolicy_worker.slots import slot_messages as messages
 
 
 def available_tiers(

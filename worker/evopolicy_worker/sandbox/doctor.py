@@ -13,8 +13,8 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common import host
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes import host
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import jail, seccomp, why_not
 

@@ -84,7 +84,7 @@ def command(tier: Tier, scratch: Path, *, draws: bool = False) -> tuple[str, ...
 
     `draws`: with the graphics devices of this machine. SandboxError when bubblewrap is not installed.
     """
-    python = (sys.executable, "-P", "-m", "evopolicy_worker.env_process")
+    python = (sys.executable, "-P", "-m", "evopolicy_worker.episodes.env_process")
     return (*_bubblewrap(scratch, draws), *python) if tier == "bwrap" else python
 
 

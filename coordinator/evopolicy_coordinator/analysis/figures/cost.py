@@ -9,10 +9,10 @@ from statistics import fmean
 import matplotlib
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from evopolicy_coordinator.analysis.behaviour.structure import FEATURES
 from evopolicy_coordinator.analysis.figures.style import INK, RC, Plot, new_figure
 from evopolicy_coordinator.analysis.palette import Look
-from evopolicy_coordinator.analysis.records import rows
-from evopolicy_coordinator.analysis.structure import FEATURES
+from evopolicy_coordinator.analysis.reading.records import rows
 from evopolicy_coordinator.analysis.study import Study
 
 _FEATURE_TITLES = ("Functions", "Branches", "Loops", "Nesting depth", "State attributes")

@@ -11,13 +11,13 @@ import msgspec
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
+from evopolicy_coordinator.analysis.behaviour.trace import Trace, TraceRow, diff, sources
 from evopolicy_coordinator.analysis.html.small_timeline import small_timeline
 from evopolicy_coordinator.analysis.palette import Look
-from evopolicy_coordinator.analysis.records import Run, Submit
-from evopolicy_coordinator.analysis.scores import suite_title, title_of
+from evopolicy_coordinator.analysis.reading.records import Run, Submit
+from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
 from evopolicy_coordinator.analysis.study import Study
-from evopolicy_coordinator.analysis.tables import Column, Table, shown
-from evopolicy_coordinator.analysis.trace import Trace, TraceRow, diff, sources
+from evopolicy_coordinator.analysis.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
 """Rows from which a table has a filter."""

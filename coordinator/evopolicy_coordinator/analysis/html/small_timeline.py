@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from html import escape
 
-from evopolicy_coordinator.analysis.edits import Transition
+from evopolicy_coordinator.analysis.behaviour.edits import Transition
+from evopolicy_coordinator.analysis.behaviour.phases import events_of, phases
 from evopolicy_coordinator.analysis.palette import EDIT_COLOURS
-from evopolicy_coordinator.analysis.phases import events_of, phases
-from evopolicy_coordinator.analysis.records import Submit
+from evopolicy_coordinator.analysis.reading.records import Submit
 
 _WIDTH, _LEFT, _RIGHT = 900.0, 14.0, 20.0
 _BAND_TOP, _BAND_HEIGHT, _MARKS, _AXIS, _HEIGHT = 16.0, 30.0, 62.0, 78.0, 112.0

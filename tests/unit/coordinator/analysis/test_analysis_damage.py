@@ -17,10 +17,10 @@ from run_dirs import write_run
 
 from evopolicy_coordinator.analysis import tables_of, trace
 from evopolicy_coordinator.analysis.html.pages import trace_page
-from evopolicy_coordinator.analysis.latex import to_latex
-from evopolicy_coordinator.analysis.reader import load_runs
+from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.analysis.study import study_of
-from evopolicy_coordinator.analysis.tables import to_csv, to_markdown
+from evopolicy_coordinator.analysis.tables.latex import to_latex
+from evopolicy_coordinator.analysis.tables.table import to_csv, to_markdown
 
 VERSIONS = [
     Version(policy(gain=1.0), (-200.0, -100.0), -180.0, says="I start."),

@@ -14,12 +14,13 @@ import pytest
 from invented_policies import Version, policy
 from run_dirs import write_run
 
-from evopolicy_coordinator.analysis import agent_log, line_diff
 from evopolicy_coordinator.analysis import write as writing
-from evopolicy_coordinator.analysis.agent_log import read_agent_log
-from evopolicy_coordinator.analysis.line_diff import n_changed, unified
-from evopolicy_coordinator.analysis.reader import load_runs
-from evopolicy_coordinator.analysis.sources import parse, reachable_modules
+from evopolicy_coordinator.analysis.behaviour import line_diff
+from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed, unified
+from evopolicy_coordinator.analysis.reading import agent_log
+from evopolicy_coordinator.analysis.reading.agent_log import read_agent_log
+from evopolicy_coordinator.analysis.reading.reader import load_runs
+from evopolicy_coordinator.analysis.reading.sources import parse, reachable_modules
 from evopolicy_coordinator.analysis.study import study
 from evopolicy_coordinator.analysis.write import write_report
 
@@ -98,7 +99,7 @@ def test_a_number_without_measure_leaves_its_run_out(tmp_path: Path, field: str,
 def test_any_exception_while_a_run_is_read_leaves_out_that_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from evopolicy_coordinator.analysis import reader
+    from evopolicy_coordinator.analysis.reading import reader
 
     write_run(tmp_path, VERSIONS, entry="Hostile")
     write_run(tmp_path, VERSIONS, entry="Honest")

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_table import TABLE
 
-from evopolicy_coordinator.analysis.latex import latex_text, to_latex
-from evopolicy_coordinator.analysis.tables import Column, Table
+from evopolicy_coordinator.analysis.tables.latex import latex_text, to_latex
+from evopolicy_coordinator.analysis.tables.table import Column, Table
 
 WORDS = "what the agent said of its submit, in some more words than go into a line of a page"
 

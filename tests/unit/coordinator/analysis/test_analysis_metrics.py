@@ -10,13 +10,17 @@ from hypothesis import strategies as st
 from invented_policies import Version, policy
 from run_dirs import write_run
 
-from evopolicy_common.run_record import Tokens
-from evopolicy_coordinator.analysis.audit import audit_signals, token_use
-from evopolicy_coordinator.analysis.edits import classify, edit_rates
-from evopolicy_coordinator.analysis.evolution import Step, area, best_at, episodes_to
-from evopolicy_coordinator.analysis.reader import load_runs, read_run
-from evopolicy_coordinator.analysis.scores import RANDOM_ENTRY, references, score_table
-from evopolicy_coordinator.analysis.structure import edit_size_bins, selected_structures, structure_means
+from evopolicy_common.records.run_record import Tokens
+from evopolicy_coordinator.analysis.behaviour.audit import audit_signals, token_use
+from evopolicy_coordinator.analysis.behaviour.edits import classify, edit_rates
+from evopolicy_coordinator.analysis.behaviour.structure import (
+    edit_size_bins,
+    selected_structures,
+    structure_means,
+)
+from evopolicy_coordinator.analysis.reading.reader import load_runs, read_run
+from evopolicy_coordinator.analysis.scoring.evolution import Step, area, best_at, episodes_to
+from evopolicy_coordinator.analysis.scoring.scores import RANDOM_ENTRY, references, score_table
 from evopolicy_coordinator.analysis.study import study_of
 
 BROKEN = Version({"policy.py": "import nothing\n"}, (0.0,) * 2, None, "import_error")

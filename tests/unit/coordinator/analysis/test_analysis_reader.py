@@ -9,14 +9,19 @@ import pytest
 from invented_policies import Version, policy
 from run_dirs import write_run
 
-from evopolicy_coordinator.analysis.comparability import (
+from evopolicy_coordinator.analysis.reading.comparability import (
     IN_QUESTION,
     UNKNOWN_ISOLATION,
     MixedRunsError,
     mixtures,
 )
-from evopolicy_coordinator.analysis.reader import count_changed_lines, find_run_dirs, load_runs, read_run
-from evopolicy_coordinator.analysis.records import rows
+from evopolicy_coordinator.analysis.reading.reader import (
+    count_changed_lines,
+    find_run_dirs,
+    load_runs,
+    read_run,
+)
+from evopolicy_coordinator.analysis.reading.records import rows
 from evopolicy_coordinator.analysis.study import study
 
 VERSIONS = [

@@ -9,15 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_coordinator.analysis import paper
-from evopolicy_coordinator.analysis.normalised import normalise, normalised
-from evopolicy_coordinator.analysis.ranking import (
+from evopolicy_coordinator.analysis.scoring import paper
+from evopolicy_coordinator.analysis.scoring.normalised import normalise, normalised
+from evopolicy_coordinator.analysis.scoring.ranking import (
     bootstrap_mean,
     competition_ranks,
     leaderboard,
     rank_score,
 )
-from evopolicy_coordinator.analysis.scores import Cell, ScoreTable, read_score_csv
+from evopolicy_coordinator.analysis.scoring.scores import Cell, ScoreTable, read_score_csv
 
 ENVS = ("gym/acrobot", "gym/racing", "gym/ant5")
 FAMILIES = ("gym_box2d", "mujoco", "minigrid", "robotics_driving")

@@ -13,22 +13,15 @@ from run_dirs import write_run
 from small_table import TABLE
 
 from evopolicy_coordinator.analysis import figures_of, study
-from evopolicy_coordinator.analysis.agent_log import read_agent_log
-from evopolicy_coordinator.analysis.edits import classify
+from evopolicy_coordinator.analysis.behaviour.edits import classify
+from evopolicy_coordinator.analysis.behaviour.phases import events_of, phases
+from evopolicy_coordinator.analysis.behaviour.trace import diff, trace
 from evopolicy_coordinator.analysis.figures.edits import wilson
 from evopolicy_coordinator.analysis.figures.style import inline_svg, new_figure, svg_text
 from evopolicy_coordinator.analysis.palette import looks
-from evopolicy_coordinator.analysis.phases import events_of, phases
-from evopolicy_coordinator.analysis.reader import read_run
-from evopolicy_coordinator.analysis.tables import (
-    Column,
-    Table,
-    best_marks,
-    shown,
-    to_csv,
-    to_markdown,
-)
-from evopolicy_coordinator.analysis.trace import diff, trace
+from evopolicy_coordinator.analysis.reading.agent_log import read_agent_log
+from evopolicy_coordinator.analysis.reading.reader import read_run
+from evopolicy_coordinator.analysis.tables.table import Column, Table, best_marks, shown, to_csv, to_markdown
 
 
 def test_csv_keeps_full_precision_and_empty_fields() -> None:

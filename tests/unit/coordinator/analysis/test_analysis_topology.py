@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from evopolicy_coordinator.analysis.sources import reachable_modules, source_digest
-from evopolicy_coordinator.analysis.topology import Features, describe
+from evopolicy_coordinator.analysis.behaviour.topology import Features, describe
+from evopolicy_coordinator.analysis.reading.sources import reachable_modules, source_digest
 
 BASE = '''
 import math

@@ -11,7 +11,7 @@ from core_rig import Rig, result, split_of
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.operator import ELSEWHERE
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core.records import PermitRow
 
 HERE = "kernel-of-w1"

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_gateway.agent_supervisor.clock import AgentClock
+from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
 from evopolicy_gateway.harnesses.claude_code import ClaudeReader
-from evopolicy_gateway.harnesses.clock import AgentClock
 from evopolicy_gateway.harnesses.codex import usage_of
 from evopolicy_gateway.harnesses.configured import ConfiguredCli, ConfiguredReader, values
-from evopolicy_gateway.harnesses.redaction import Redaction
 from evopolicy_gateway.harnesses.trouble import MAX_BACKOFF_S, backoff_s, trouble_of
 from evopolicy_gateway.harnesses.usage import MAX_COUNT, Usage
 

@@ -10,19 +10,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from evopolicy_common.credentials import Credentials
 from evopolicy_common.messages.operator import ClaimState, RunFinished
-from evopolicy_common.run_record import RunRecord
-from evopolicy_gateway.control import AgentDoing
-from evopolicy_gateway.layout import RunFolder
-from evopolicy_gateway.play import Plan
-from evopolicy_gateway.record import run_record
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run.play import Plan
+from evopolicy_gateway.run.record import run_record
+from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
-from evopolicy_gateway.times import Times
 
 PATIENCE_S = 30.0
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common import host
+from evopolicy_common.processes import host
 from evopolicy_worker.sandbox import doctor, jail, why_not
 
 

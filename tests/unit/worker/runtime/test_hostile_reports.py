@@ -16,21 +16,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from slots import QUICK, Slots, make_job, misbehaving
 
-from evopolicy_common import codec
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.worker import HandIn, JobResult
-from evopolicy_common.trajectory import Recorder
-from evopolicy_worker import environments, frames
-from evopolicy_worker import slot_messages as messages
+from evopolicy_common.records.trajectory import Recorder
+from evopolicy_common.wire import codec
+from evopolicy_worker import environments
 from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.toy import Line
-from evopolicy_worker.episodes import Player, Progress
-from evopolicy_worker.monitor import Monitor
-from evopolicy_worker.policy_process import BundleFiles, PolicyProcess
+from evopolicy_worker.episodes import frames
+from evopolicy_worker.episodes.loop import Player, Progress
+from evopolicy_worker.episodes.monitor import Monitor
+from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
-from evopolicy_worker.slot import bundle_files
+from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slots.slot import bundle_files
 
 SPACES: list[dict[str, Any]] = [
     {"type": "Discrete", "n": 5},
@@ -104,7 +105,7 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
         played.append(None, action, 0.0, False, False, {})
     outcome = EpisodeOutcome(index=0, episode_return=0.0, length=1, terminated=False, truncated=True)
     for each in (recorder, played):
-        from evopolicy_worker.episodes import _blob
+        from evopolicy_worker.episodes.loop import _blob
 
         outcome = msgspec.structs.replace(outcome, trajectory=_blob(each.finish()))
         assert handed_in(outcome) == outcome

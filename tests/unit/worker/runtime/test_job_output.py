@@ -6,10 +6,10 @@ import msgspec
 import pytest
 from slots import QUICK, Slots, make_job, misbehaving
 
-from evopolicy_common import codec
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome, PolicyFailure
-from evopolicy_worker import episodes
+from evopolicy_common.wire import codec
+from evopolicy_worker.episodes import loop as episodes
 
 LOUD = "[os.write(k, b'x' * 65536) for k in (1, 2) for _ in range(2)]"
 

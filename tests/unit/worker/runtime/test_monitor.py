@@ -7,7 +7,7 @@ import sys
 
 _PROGRAM = """
 import os, time
-from evopolicy_worker.monitor import Monitor
+from evopolicy_worker.episodes.monitor import Monitor
 
 def bug():
     raise LookupError("a bug")

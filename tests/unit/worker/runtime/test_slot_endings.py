@@ -23,9 +23,10 @@ from slots import HONEST, QUICK, Slots, begun, family, make_job, misbehaving, pi
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_worker import endings, monitor
-from evopolicy_worker.endings import FAULTS, TABLE, Ending, First, How
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.episodes import monitor
+from evopolicy_worker.slots import endings
+from evopolicy_worker.slots.endings import FAULTS, TABLE, Ending, First, How
+from evopolicy_worker.slots.slot import Slot
 
 PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)
 
@@ -213,7 +214,7 @@ def place_of_env(pids: list[int]) -> int:
     return next(
         k
         for k, line in enumerate(lines)
-        if b"bwrap" not in line[0] and b"evopolicy_worker.env_process" in line
+        if b"bwrap" not in line[0] and b"evopolicy_worker.episodes.env_process" in line
     )
 
 
@@ -435,8 +436,8 @@ def test_a_policy_that_is_stopped_for_good_is_started_again(slots: Slots) -> Non
 def test_a_slot_whose_environment_is_stopped_for_good_is_given_up(
     slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evopolicy_worker.slot.STOPPED_S", 1.0)
-    monkeypatch.setattr("evopolicy_worker.slot._LOOK_S", 0.2)
+    monkeypatch.setattr("evopolicy_worker.slots.slot.STOPPED_S", 1.0)
+    monkeypatch.setattr("evopolicy_worker.slots.slot._LOOK_S", 0.2)
     slot = slots.new()
     slots.run(slot.start())
     with pytest.raises(SlotDiedError):

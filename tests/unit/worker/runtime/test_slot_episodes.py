@@ -11,8 +11,9 @@ import pytest
 from slots import HONEST, Slots, make_job, rows
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker import environments, float_environment
-from evopolicy_worker.episodes import random_actions
+from evopolicy_worker import environments
+from evopolicy_worker.episodes import float_environment
+from evopolicy_worker.episodes.loop import random_actions
 from evopolicy_worker.sandbox.jail import ENVIRONMENT
 
 TIERS = ("bwrap", "landlock", "none")

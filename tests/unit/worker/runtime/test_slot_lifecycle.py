@@ -13,7 +13,7 @@ from slots import HONEST, STUCK, Slots, begun, family, make_job, pid_of, runs
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker.sandbox import available_tiers, jail, why_not
-from evopolicy_worker.slot import Slot
+from evopolicy_worker.slots.slot import Slot
 
 
 def test_a_cancelled_job_returns_at_once_and_the_slot_plays_the_next(slots: Slots) -> None:

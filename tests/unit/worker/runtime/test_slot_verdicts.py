@@ -7,8 +7,9 @@ import pytest
 from slots import HONEST, QUICK, Slots, misbehaving, rows
 
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
-from evopolicy_worker import environments, frames
-from evopolicy_worker.episodes import random_actions
+from evopolicy_worker import environments
+from evopolicy_worker.episodes import frames
+from evopolicy_worker.episodes.loop import random_actions
 
 
 def limits(**changes: float) -> ResourceLimits:

@@ -2,7 +2,7 @@
 
 Runs inside the sandbox, in one process with the policy, which may change all of it: nothing here is trusted by the
 worker. Frames: a request is `<u32 length, u8 kind, 3 pad, i64 argument>` and its payload, a reply is `<u32 length,
-u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evopolicy_worker.frames` is the other end.
+u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evopolicy_worker.episodes.frames` is the other end.
 Standard library and numpy only: the sandbox shows nothing else.
 """
 

@@ -1,0 +1,67 @@
+"""`logs/agent.jsonl`: the agent's raw stream, a JSON document a line, kept within bounds."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from evopolicy_gateway.agent_supervisor.redaction import Redaction
+
+MAX_LINE_BYTES = 1 << 20
+MAX_LOG_BYTES = 1 << 30
+"""An agent that floods its output fills no disk: beyond it only a last line says so."""
+
+
+class AgentLog:
+    """Appends, without keys and tokens; every line reaches the file at once. What the disk refuses is lost, the agent goes on."""
+
+    def __init__(self, path: Path, redact: Redaction | None = None) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("ab", buffering=0)
+        self._left = MAX_LOG_BYTES - path.stat().st_size
+        self.redact = redact or Redaction()
+        self.last_errors: deque[str] = deque(maxlen=20)
+        """What came on stderr last, for a message about why a program ended."""
+
+    def raw(self, line: bytes, stream: str) -> None:
+        """A line of the agent as it came when it is JSON on stdout, else wrapped with the name of its stream."""
+        line = line.rstrip(b"\r\n")
+        if stream == "stderr":
+            self.last_errors.append(line[:500].decode("utf-8", "replace").strip())
+        if stream == "stdout" and line.startswith(b"{") and len(line) <= MAX_LINE_BYTES:
+            try:
+                orjson.loads(line)
+            except orjson.JSONDecodeError:
+                pass
+            else:
+                self._write(line)
+                return
+        cut = line[:MAX_LINE_BYTES]
+        document: dict[str, Any] = {"type": stream, "text": cut.decode("utf-8", "backslashreplace")}
+        if len(cut) < len(line):
+            document["cut_bytes"] = len(line) - len(cut)
+        self.note(document)
+
+    def note(self, document: dict[str, Any]) -> None:
+        """A line of ours, such as a prompt."""
+        self._write(orjson.dumps(document))
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _write(self, line: bytes) -> None:
+        if self._left <= 0:
+            return
+        line = self.redact(line)
+        self._left -= len(line) + 1
+        if self._left <= 0:
+            line = orjson.dumps(
+                {"type": "log_full", "text": f"more than {MAX_LOG_BYTES} bytes: the rest is not kept"}
+            )
+        try:
+            self._file.write(line + b"\n")
+        except OSError:
+            pass

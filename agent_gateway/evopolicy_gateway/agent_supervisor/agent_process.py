@@ -1,0 +1,119 @@
+"""One program of an agent: its pipes, read line by line without ever holding more than one line."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncIterator, Mapping, Sequence
+from pathlib import Path
+
+from evopolicy_common.processes.leash import leashed
+from evopolicy_gateway.agent_supervisor.agent_log import MAX_LINE_BYTES, AgentLog
+
+_CHUNK = 64 << 10
+_LAST_WORDS_S = 1.0
+
+
+class AgentProcess:
+    """Running program in a session of its own. Everything it says goes to the agent's log."""
+
+    def __init__(self, process: asyncio.subprocess.Process, log: AgentLog) -> None:
+        self._process = process
+        self._log = log
+        self._stderr = asyncio.create_task(self._drain_stderr())
+
+    @classmethod
+    async def start(
+        cls,
+        program: list[str],
+        cwd: Path,
+        environment: Mapping[str, str],
+        log: AgentLog,
+        *,
+        talks: bool,
+        pass_fds: Sequence[int] = (),
+    ) -> AgentProcess:
+        """Starts it; OSError when that fails. `talks`: it has a stdin to be written to."""
+        process = await asyncio.create_subprocess_exec(
+            *leashed(program, signal.SIGKILL),
+            cwd=cwd,
+            env=dict(environment),
+            stdin=asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,
+            pass_fds=tuple(pass_fds),
+        )
+        return cls(process, log)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def lines(self) -> AsyncIterator[bytes]:
+        """Lines of stdout until it ends; what is longer than `MAX_LINE_BYTES` comes cut."""
+        assert self._process.stdout is not None
+        async for line in _lines(self._process.stdout):
+            self._log.raw(line, "stdout")
+            yield line
+
+    async def say(self, line: bytes) -> bool:
+        """Writes a line to its stdin; False when it no longer listens. Waits for a reader only as long as it lives."""
+        stdin = self._process.stdin
+        if stdin is None or stdin.is_closing():
+            return False
+        try:
+            stdin.write(line + b"\n")
+            await stdin.drain()
+        except (BrokenPipeError, ConnectionResetError):
+            return False
+        return True
+
+    def hang_up(self) -> None:
+        """Ends its stdin: nothing more is said to it."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
+    async def ended(self) -> int:
+        """Its exit status (negative: the signal that ended it)."""
+        # `Process.wait` would wait for the pipes too, which a daemonised child can hold open for ever.
+        while self._process.returncode is None:  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
+        return self._process.returncode
+
+    async def close(self) -> None:
+        """Stops reading; to be called when the program is gone."""
+        # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+        await asyncio.wait([self._stderr], timeout=_LAST_WORDS_S)
+        self._stderr.cancel()
+        await asyncio.gather(self._stderr, return_exceptions=True)
+        self.hang_up()
+        # asyncio closes the pipes of a process only when all their other ends are closed.
+        self._process._transport.close()  # type: ignore[attr-defined]
+
+    async def _drain_stderr(self) -> None:
+        assert self._process.stderr is not None
+        async for line in _lines(self._process.stderr):
+            self._log.raw(line, "stderr")
+
+
+async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[bytes]:
+    buffer = bytearray()
+    while chunk := await stream.read(_CHUNK):
+        buffer += chunk
+        *whole, rest = bytes(buffer).split(b"\n")
+        for line in whole:
+            yield line
+        buffer = bytearray(rest)
+        if len(buffer) > MAX_LINE_BYTES:
+            yield bytes(buffer)
+            buffer.clear()
+    if buffer:
+        yield bytes(buffer)
+
+
+def environment_of(urls: Mapping[str, str]) -> dict[str, str]:
+    """The operator's variables without this project's own, with the URLs."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("EVOPOLICY")}
+    return kept | dict(urls)

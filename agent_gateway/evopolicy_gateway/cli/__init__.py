@@ -1,0 +1,1 @@
+"""The `evopolicy` and `evopolicy-gateway` commands."""

@@ -1,0 +1,137 @@
+"""Options that several commands share, and how their values become settings. A wrong value is a ConfigError."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import msgspec
+import typer
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError, RequestError
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
+from evopolicy_common.messages.operator import HiddenCases
+from evopolicy_gateway.http.submit_request import Bounds, ids_in
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
+Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.")]
+Limits = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit", help="A policy's limit, such as act_wall_s=5 or memory_bytes=2e9; may be repeated."
+    ),
+]
+DataFolder = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder of split files (`evopolicy data make`); default: derived from the state's secret."
+    ),
+]
+StateFolder = Annotated[
+    Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
+]
+TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
+Audit = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="SHARE",
+        help="Share of the episodes that a second local worker plays again from their actions, compared bit for bit.",
+    ),
+]
+
+HiddenIsolation = Literal["related", "strict", "off"]
+Isolation = Annotated[
+    str | None,
+    typer.Option(
+        "--hidden-isolation",
+        help="Of the cluster brought up here: related (default), no hidden episode shares a kernel with an agent whose run "
+        "shares its cases; strict, with any agent; off.",
+    ),
+]
+HiddenCasesOption = Annotated[
+    str,
+    typer.Option(
+        "--hidden-cases",
+        help="Validation and held-out cases: shared by all runs of an environment, or per-run (nothing can be paired).",
+    ),
+]
+
+
+def tier_of(text: str) -> Tier:
+    """The sandbox tier that `--tier` names. ConfigError when there is none of that name."""
+    return one_of("--tier", text, Tier)  # type: ignore[return-value]
+
+
+def default_exp_id() -> str:
+    """From the time, so that every run has a folder of its own."""
+    return time.strftime("%Y%m%d-%H%M%S")
+
+
+def one_environment(env: str) -> str:
+    """The suite id that `env` names. ConfigError when it names none or several."""
+    found = catalogue.resolve([env])
+    if len(found) != 1:
+        raise ConfigError(f"--env {env} names {len(found)} environments; this command takes one")
+    return found[0]
+
+
+def limits_of(texts: Sequence[str]) -> ResourceLimits:
+    """`NAME=VALUE` texts over the usual limits."""
+    usual = ResourceLimits()
+    values: dict[str, float | int] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        known = ", ".join(usual.__struct_fields__)
+        if not equals or name not in usual.__struct_fields__:
+            raise ConfigError(f"--limit {text!r}: say it as NAME=VALUE; names are {known}")
+        try:
+            number = float(value)
+        except ValueError:
+            raise ConfigError(f"--limit {text!r}: {value!r} is no number") from None
+        if not 0 < number < float("inf"):
+            raise ConfigError(f"--limit {text!r}: a limit is a finite number above zero")
+        if number > (most := LARGEST_LIMITS.get(name, LARGEST_LIMIT)):
+            raise ConfigError(f"--limit {text!r}: {name} can be {most:,} at most")
+        values[name] = int(number) if isinstance(getattr(usual, name), int) else number
+    return msgspec.structs.replace(usual, **values)
+
+
+def cases_of(text: str) -> tuple[int, ...]:
+    """Case ids of a text such as `0-3,7`."""
+    # How many cases there are, the coordinator knows; here only nonsense is kept out.
+    bounds = Bounds(n_env_instances=10**6, min_episodes=1, max_episodes=4096, remaining_budget=4096)
+    try:
+        ids = ids_in(text, bounds)
+    except RequestError as error:
+        raise ConfigError(f"--cases {text!r}: {error.message.replace('env_instances', 'it')}") from error
+    if not ids:
+        raise ConfigError(f"--cases {text!r} names no case; say it as 0-3,7")
+    return ids
+
+
+def isolation_of(text: str | None, *, local: bool) -> str | None:
+    """What `--hidden-isolation` asks of a cluster brought up here; None for its default. ConfigError where it is wrong."""
+    if text is not None and not local:
+        raise ConfigError(
+            "--hidden-isolation goes with a cluster brought up here; elsewhere it is the coordinator's:"
+            " evopolicy-coordinator --hidden-isolation"
+        )
+    return None if text is None else one_of("--hidden-isolation", text, HiddenIsolation)
+
+
+def hidden_cases_of(text: str) -> HiddenCases:
+    """The hidden cases that `--hidden-cases` names. ConfigError when there are none of that name."""
+    return one_of("--hidden-cases", text, Literal["shared", "per-run"]).replace("-", "_")  # type: ignore[return-value]
+
+
+def one_of(option: str, text: str, kind: object) -> str:
+    """`text`, which is one of the values of the Literal `kind`. ConfigError naming `option` when it is not."""
+    allowed = get_args(kind)
+    if text not in allowed:
+        raise ConfigError(f"{option} {text!r}: there are {', '.join(allowed)}")
+    return text

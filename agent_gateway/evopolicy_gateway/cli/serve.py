@@ -1,0 +1,216 @@
+"""`evopolicy-gateway`: serves one run's workspace over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import orjson
+import structlog
+import typer
+
+from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_app, setup_logging
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.processes.preflight import explained
+from evopolicy_gateway.http.door import AgentPlace, place_of
+from evopolicy_gateway.operator import control
+from evopolicy_gateway.operator.alone import alone
+from evopolicy_gateway.operator.control import Orders, Progress, Ready, RunClosed, Waits
+from evopolicy_gateway.run.gateway import Close, Gateway, folder_of
+from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.submits.desk import Desk
+from evopolicy_gateway.workspace import staging as workspace
+from evopolicy_gateway.workspace.agents_md import Urls
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+@app.command()
+def serve(
+    run_directory: Annotated[
+        Path, typer.Argument(help="Folder of an open run, as `evopolicy run` made it.", show_default=False)
+    ],
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Endpoint of the coordinator, in place of the one in the folder.")
+    ] = None,
+    credentials_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--credentials",
+            help="Folder of `evopolicy-coordinator certs issue gateway`, in place of the credentials in the folder.",
+        ),
+    ] = None,
+    agent_host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOOT_ID|unknown",
+            help="Kernel that the agent runs on (there: cat /proc/sys/kernel/random/boot_id), unknown for any; default:"
+            " this machine's.",
+        ),
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print them as one JSON object.")] = False,
+    controlled: Annotated[
+        bool,
+        typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
+    ] = False,
+) -> None:
+    """Serves the workspace of one run on a loopback port, and prints the variables that its agent is started with.
+
+    Example: evopolicy-gateway runs/evolve/gym_acrobot/first
+
+    `evopolicy run` starts it by itself; started by hand it takes an open run over after a crash, on the same port. Nobody
+    watches the agent then: when it has ended, `evopolicy finish` closes the run. Ctrl-C leaves the run open.
+    """
+    setup_logging()
+    with _failures_in_the_log() if controlled else fail_on_our_errors():
+        folder = folder_of(run_directory)
+        place = None if agent_host is None else place_of(agent_host)
+        # The command that controls a gateway holds the folder for both.
+        with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
+            closed = asyncio.run(
+                _serve(folder, tuple(connect or ()), credentials_file, place, json_output, controlled)
+            )
+    sys.stdout.flush()
+    # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
+    os._exit(0 if closed or not controlled else 3)
+
+
+@contextlib.contextmanager
+def _failures_in_the_log() -> Iterator[None]:
+    """For a log that holds JSON lines only: what ends the process is one of them."""
+    try:
+        yield
+    except ConfigError as error:
+        log.error("the gateway cannot serve", error=str(error))
+        raise SystemExit(USAGE_ERROR) from error
+    except Exception as error:
+        foreseen = explained(error) if isinstance(error, OSError) else None
+        if foreseen is None and isinstance(error, EvopolicyError):
+            foreseen = str(error)
+        if foreseen is None:
+            log.exception("the gateway failed", error=str(error))
+        else:
+            log.error("the gateway failed", error=foreseen)
+        raise SystemExit(FAILURE) from error
+
+
+async def _serve(
+    folder: RunFolder,
+    connect: tuple[str, ...],
+    credentials_file: Path | None,
+    place: AgentPlace | None,
+    json_output: bool,
+    controlled: bool,
+) -> bool:
+    def ready(urls: Urls, desk: Desk) -> None:
+        told = urls.environment() | workspace.variables(folder)
+        if controlled:
+            opened = desk.run
+            undrawn = opened.video != "off" and not opened.env.renders
+            notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
+            control.emit(
+                Ready(
+                    variables=urls.environment(),
+                    notes=notes if undrawn else (),
+                    held_s=round(desk.held_s, 3),
+                    permit_s=round(gateway.permit_s, 3),
+                )
+            )
+        elif json_output:
+            print(orjson.dumps(told).decode(), flush=True)
+        else:
+            print("".join(f"{name}={value}\n" for name, value in told.items()), end="", flush=True)
+
+    def changed(desk: Desk) -> None:
+        if controlled:
+            control.emit(progress_of(desk))
+
+    said = ""
+
+    def waits(what: str) -> None:
+        nonlocal said
+        if what == said:
+            return
+        said = what
+        if controlled:
+            control.emit(Waits(waits_for=what))
+        elif what:
+            print(f"waiting for {what}", file=sys.stderr, flush=True)
+
+    gateway = Gateway(
+        folder,
+        connect,
+        credentials_file,
+        on_ready=ready,
+        on_change=changed,
+        on_wait=waits,
+        alone=not controlled,
+        place=place,
+    )
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, gateway.tell, None)
+    listener = asyncio.create_task(_listen(gateway)) if controlled else None
+    try:
+        closed = await gateway.run()
+    finally:
+        if listener is not None:
+            listener.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await listener
+    if closed and controlled:
+        control.emit(RunClosed())
+    return closed
+
+
+async def _listen(gateway: Gateway) -> None:
+    orders = Orders()
+    while True:
+        order = await orders.next()
+        if order is None:
+            gateway.tell(None)
+            return
+        if isinstance(order, control.CloseRun):
+            gateway.tell(Close(reason=order.reason, agent=order.agent))
+
+
+def progress_of(desk: Desk) -> Progress:
+    """What the operator's live view shows of a run."""
+    settled = [ticket for ticket in desk.tickets if ticket.status is not None]
+    means = [ticket.mean for ticket in settled if ticket.mean is not None]
+    running = desk.in_flight
+    return Progress(
+        episode_budget=desk.run.episode_budget,
+        remaining_budget=desk.state.remaining_budget,
+        n_submits=desk.state.n_submits,
+        n_rejected=desk.n_rejected,
+        submit_id=None if running is None else running.submit_id,
+        n_episodes=0 if running is None else running.n_episodes,
+        n_done=0 if running is None else running.n_done,
+        waits_for="" if running is None else running.waits_for,
+        last_submit_id=settled[-1].submit_id if settled else None,
+        last_status=settled[-1].status if settled else None,
+        last_mean=settled[-1].mean if settled else None,
+        best_mean=max(means, default=None),
+        in_flight_s=round(desk.in_flight_s, 3),
+        feedback_s=round(desk.feedback_s, 3),
+        held_s=round(desk.held_s, 3),
+        spent=desk.spent,
+        cancelled=desk.cancelled,
+    )
+
+
+def main() -> None:
+    """The console script."""
+    run_app(app)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""`evopolicy suite`: plays a sweep, says beforehand what it will do, and goes on where it was when started again.
+
+Exit codes: 0 every run completed, 1 something failed or was not begun, 2 a wrong option or file, 3 a run ended without an ok
+submit, 4 an agent failed, 5 a run was cancelled, 130 interrupted (started again it goes on).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.processes.preflight import check_loopback, check_writable
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.terminal import Terminal, terminal
+from evopolicy_gateway.cli import options
+from evopolicy_gateway.operator.alone import alone
+from evopolicy_gateway.operator.runs import Cluster, connected, exit_code
+from evopolicy_gateway.suite import decisions, suite_file, suite_index
+from evopolicy_gateway.suite.decisions import Changed, Decision
+from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
+from evopolicy_gateway.suite.suite_index import FINISHED, Index
+from evopolicy_gateway.suite.suite_view import JsonView, results_table, viewing
+from evopolicy_gateway.suite.sweep import Sweep, look
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """What the command was asked for."""
+
+    suite: SuiteFile
+    runs: tuple[SuiteRun, ...]
+    root: Path
+    where: Cluster
+    changed: Changed
+    dry_run: bool
+    as_json: bool
+
+
+def suite(
+    file: Annotated[
+        str, typer.Argument(help="TOML file, or a shipped one: smoke.toml, core16.toml, core16-paper.toml.")
+    ],
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Bring up a coordinator and a worker here for the sweep.")
+    ] = False,
+    runs: Annotated[Path | None, typer.Option(help="The sweep's folder; default: runs/NAME.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Glob of run names, such as 'evolve/*'; may be repeated.")
+    ] = None,
+    parallel: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Runs at once, over the file's.")
+    ] = None,
+    changed: Annotated[
+        str, typer.Option(help="Runs whose settings the file has changed: refuse, keep, rerun.")
+    ] = "refuse",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and stop.")] = False,
+    slots: options.Slots = 2,
+    state: Annotated[
+        Path | None,
+        typer.Option(help="State of the --local coordinator; default: .cluster in the sweep's folder."),
+    ] = None,
+    data: options.DataFolder = None,
+    audit: options.Audit = 0.0,
+    hidden_isolation: options.Isolation = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
+) -> None:
+    """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was."""
+    with fail_on_our_errors():
+        if local and (connect or credentials_file):
+            raise ConfigError("--local brings up a cluster of its own; it does not go with --connect")
+        if audit and not local:
+            raise ConfigError(
+                "--audit goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --audit"
+            )
+        isolation = options.isolation_of(hidden_isolation, local=local)
+        if changed not in ("refuse", "keep", "rerun"):
+            raise ConfigError(f"--changed {changed!r}: there are refuse, keep, rerun")
+        wanted = suite_file.read(file)
+        if parallel is not None:
+            limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
+            wanted = msgspec.structs.replace(wanted, parallel=limits)
+        expanded = suite_file.expand(wanted, Path.cwd(), tuple(only or ()))
+        root = (runs or Path("runs") / wanted.name).absolute()
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        if local:
+            where = Cluster(
+                local_slots=slots,
+                state=state or root / ".cluster",
+                data=data,
+                audit=audit,
+                hidden_isolation=isolation,
+            )
+        order = Order(
+            suite=wanted,
+            runs=tuple(expanded),
+            root=root,
+            where=where,
+            changed=changed,  # type: ignore[arg-type]
+            dry_run=dry_run,
+            as_json=as_json,
+        )
+        try:
+            code = asyncio.run(_suite(order))
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
+    if code:
+        raise typer.Exit(code)
+
+
+async def _suite(order: Order) -> int:
+    console = terminal(stderr=order.as_json)
+    check_writable(order.root, "--runs")
+    check_loopback()
+    with alone(order.root / ".lock", order.root):
+        index = suite_index.load(order.root, order.suite.name)
+        env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
+        tiers = {run.settings.sandbox_tier for run in order.runs}
+        async with connected(order.where, env_ids, tiers) as (operations, gateway, failed):
+            started_in = Path.cwd()
+            decided = [
+                decisions.decide(
+                    run, await look(run, order.root, started_in, index, operations), order.changed
+                )
+                for run in order.runs
+            ]
+            _tell(order, index, decided, console)
+            decisions.check_changes(decided, order.changed)
+            if order.dry_run:
+                return 0
+            begun = [one.run for one in decided if one.kind in ("new", "resume", "restart")]
+            suite_file.check_agents_start(begun, started_in)
+            for one in decided:
+                if one.kind == "keep":
+                    _keep(order, index, one)
+            suite_index.save(order.root, index)
+            names = [run.name for run in order.runs]
+            with viewing(names, order.suite.parallel.machine, console, as_json=order.as_json) as view:
+                for one in decided:
+                    if one.kind == "keep":
+                        view.kept(one.run.name, index.runs.get(one.run.name))
+                sweep = Sweep(order.suite, order.root, started_in, index, operations, gateway, view)
+                await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
+    entries = [index.runs[name] for name in names if name in index.runs]
+    if not order.as_json:
+        console.print(results_table(entries))
+        if (told := suite_index.told(index)) is not None:
+            console.print(told)
+        console.print(f"index: {order.root / suite_index.FILE_NAME}", soft_wrap=True)
+    missing = [("error", "")] * (len(names) - len(entries))
+    return exit_code([*missing, *((entry.state, entry.closed_reason) for entry in entries)])
+
+
+def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal) -> None:
+    known = {run.name for run in order.runs}
+    # Runs that --only leaves out are still the file's.
+    in_file = {run.name for run in suite_file.expand(order.suite, Path.cwd())}
+    left_alone = [name for name in index.runs if name not in known and name not in in_file]
+    for line in decisions.told(decided, left_alone):
+        console.print(line, soft_wrap=True)
+    needed, free = decisions.feedback_bytes(decided), shutil.disk_usage(order.root).free
+    if needed:
+        fits = "" if needed <= free else "; it may not fit: make room, or choose another --runs"
+        console.print(
+            f"feedback takes at most {bytes_text(needed)} of the {bytes_text(free)} that are free in"
+            f" {order.root}{fits}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    if order.as_json:
+        view = JsonView([], 1)
+        for one in decided:
+            view.event("planned", one.run.name, what=one.kind, attempt=one.attempt, why=one.why)
+
+
+def _keep(order: Order, index: Index, decision: Decision) -> None:
+    """Brings the index in line with a finished run's own record."""
+    run = decision.run
+    folder = run.folder(order.root)
+    entry = index.runs.get(run.name)
+    if folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
+        record = decode_run_record(folder.run_json.read_bytes())
+        known = {"digest": run.digest, "settings": msgspec.to_builtins(run.defining)}
+        if entry is not None:
+            known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}
+        index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, **known)

@@ -1,0 +1,80 @@
+"""The document of `GET /info`; pure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.messages.gateway import RunOpened, RunState
+from evopolicy_common.records.run_record import PROTOCOL_VERSION
+from evopolicy_gateway.submits.tickets import Ticket
+from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
+
+
+def info_document(
+    run: RunOpened,
+    state: RunState,
+    finalized: bool,
+    in_flight: Ticket | None,
+    last_warning: str | None = None,
+) -> dict[str, Any]:
+    """What an agent may know of the run, as plain values."""
+    env = run.env
+    env_meta: dict[str, Any] = {
+        "env": env.env,
+        "env_version": env.env_version,
+        "n_env_instances": run.n_env_instances,
+        "max_episode_steps": env.max_episode_steps,
+        "obs_space": env.obs_space,
+        "action_space": env.action_space,
+        "obs_storage": env.obs_storage,
+    }
+    if env.reward_components:
+        env_meta["reward_components"] = {
+            name: env.reward_texts.get(name, "") for name in env.reward_components
+        }
+    limits = msgspec.to_builtins(run.limits)
+    return {
+        "protocol_version": PROTOCOL_VERSION,
+        "state": {
+            "remaining_budget": state.remaining_budget,
+            "n_submits": state.n_submits,
+            "is_finalized": finalized or state.is_finalized,
+        },
+        "env_meta": env_meta,
+        "episode_budget": run.episode_budget,
+        "min_episodes_per_submit": run.min_episodes_per_submit,
+        "max_episodes_per_submit": run.max_episodes_per_submit,
+        "resource_limits": {"rollout_wall_s": run.limits.episode_wall_s} | limits,
+        "allowed_imports": list(run.allowed_imports),
+        "denied_imports": list(run.denied_imports),
+        "policy_scope": run.policy_scope,
+        "observations": run.observations,
+        "sandbox_tier": run.sandbox_tier,
+        "video": run.video,
+        "deterministic": env.deterministic,
+        "end_grace_s": LAST_WORDS_S,
+        "last_warning": last_warning,
+        "submit_in_flight": None if in_flight is None else progress_document(in_flight, state),
+    }
+
+
+def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str, Any]:
+    """A submit that runs: how far it is and, when nothing of it runs, what it waits for.
+
+    `held_s`: seconds that it waited because the cluster's other work had the machines; they count against no limit.
+    """
+    n_done, waits_for, held_s = ticket.n_done, ticket.waits_for, ticket.held_s
+    seen = state.in_flight if state is not None else None
+    if seen is not None and ticket.accepted is not None and seen.submit_index == ticket.accepted.submit_index:
+        n_done, waits_for = max(n_done, seen.n_done), waits_for or seen.waits_for
+        held_s = max(held_s, seen.held_s)
+    return {
+        "submit_id": ticket.index,
+        "status": "running",
+        "n_episodes": ticket.n_episodes,
+        "n_done": n_done,
+        "waits_for": waits_for,
+        "held_s": round(held_s, 1),
+    }

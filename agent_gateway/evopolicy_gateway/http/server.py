@@ -1,0 +1,142 @@
+"""The HTTP service on a loopback port, or where the operator's `Door` says; the same after every restart.
+
+A client that takes its time is cut off: over its headers, over reading an answer, and between two requests.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from collections.abc import AsyncIterator, Iterator
+
+import msgspec
+import uvicorn
+from starlette.types import ASGIApp
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.preflight import LOOPBACK, no_loopback
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_gateway.http.door import Door
+from evopolicy_gateway.http.patience import PatientProtocol
+from evopolicy_gateway.run.layout import RunFolder, save
+from evopolicy_gateway.workspace.agents_md import Urls, urls_at, urls_below
+
+_REBIND_TRIES = 20
+_REBIND_PAUSE_S = 0.25
+KEEP_ALIVE_S = 30
+CLOSE_GRACE_S = 1
+
+
+class Address(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a run's service is, kept through restarts."""
+
+    host: str
+    port: int
+    token: str
+    """128 random bits, hex: the first part of every path."""
+    bearer: str = ""
+    """256 random bits, hex, that every request carries; empty on loopback where no door was asked for."""
+    url: str = ""
+    """How the agent reaches it; empty for `http://host:port`."""
+
+    def urls(self) -> Urls:
+        if self.url:
+            return urls_below(self.url, self.token, bearer=bool(self.bearer))
+        found = urls_at(self.host, self.port, self.token)
+        return msgspec.structs.replace(found, bearer=bool(self.bearer))
+
+
+async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
+    """A bound socket: on the port of the last time, or on a free one and then noted for the next time.
+
+    ConfigError when the old port, or the one that was asked for, is not to be had.
+    """
+    if folder.service.exists():
+        address = msgspec.json.decode(folder.service.read_bytes(), type=Address)
+        return await _rebind(address), address
+    token = secrets.token_hex(16)
+    if not folder.door.exists():
+        try:
+            sock = _bound(LOOPBACK, 0)
+        except OSError as error:
+            raise ConfigError(no_loopback(error)) from error
+        address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
+    else:
+        door = msgspec.json.decode(folder.door.read_bytes(), type=Door)
+        try:
+            sock = _bound(door.host, door.port)
+        except OSError as error:
+            where = f"{door.host}:{door.port}"
+            raise ConfigError(f"--http {where}: cannot listen there: {error.strerror or error}") from error
+        bearer = secrets.token_hex(32)
+        address = Address(
+            host=door.host, port=sock.getsockname()[1], token=token, bearer=bearer, url=door.url
+        )
+        write_atomically(folder.bearer, f"{bearer}\n".encode(), mode=0o600)
+    save(folder.service, address)
+    return sock, address
+
+
+@contextlib.asynccontextmanager
+async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Task[None]]:
+    """Serves `app` inside the `async with`; the task ends early only when the service failed."""
+    config = uvicorn.Config(
+        app,
+        http=PatientProtocol,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        proxy_headers=False,
+        backlog=64,
+        limit_concurrency=256,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=CLOSE_GRACE_S,
+        h11_max_incomplete_event_size=32 << 10,
+    )
+    server = _Server(config)
+    sock.listen(config.backlog)  # from here on nobody is refused, whenever the server gets to it
+    task = asyncio.create_task(server.serve(sockets=[sock]), name="http")
+    try:
+        yield task
+    finally:
+        server.should_exit = True
+        await asyncio.gather(task, return_exceptions=True)
+        sock.close()
+
+
+class _Server(uvicorn.Server):
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leaves signals to the process: a submit in flight must be left in order."""
+        yield
+
+
+async def _rebind(address: Address) -> socket.socket:
+    for _ in range(_REBIND_TRIES):
+        try:
+            return _bound(address.host, address.port)
+        except OSError as error:
+            reason = error
+        await asyncio.sleep(_REBIND_PAUSE_S)
+    raise ConfigError(
+        f"port {address.port} on {address.host}, which this run's agent knows, is taken: {reason.strerror};"
+        " end what listens there and start the gateway again"
+    )
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    family, kind, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    sock = socket.socket(family, kind)
+    # An address whose last connections are still in TIME_WAIT must be had again at once.
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind(where)
+    except OSError:
+        sock.close()
+        raise
+    return sock

@@ -1,0 +1,282 @@
+"""The agent's HTTP service: `/info`, `/task`, `/submit`, all below a secret path token.
+
+Rules: the token is compared in constant time and everything else is the same 404; where the service is open to other hosts
+a bearer token comes before that, and without it everything is the same 401; nothing of a request is ever a path of
+the file system; a body is read only as far as a submit may be long; an error says what the agent can act on and nothing
+of this machine; no answer depends on whether the one who asked still listens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+from typing import Any
+
+import orjson
+import structlog
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from evopolicy_common.errors import RequestError
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_gateway.http.info import info_document, progress_document
+from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES, refuse_size
+from evopolicy_gateway.http.task import task_markdown
+from evopolicy_gateway.submits.desk import RUN_CLOSED, Desk
+from evopolicy_gateway.submits.tickets import ConflictError, Ticket
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+BODY_WAIT_S = 30.0
+"""A body that has not arrived by then is not waited for."""
+DECIDED_WAIT_S = 5.0
+"""How long `?wait=false` waits for the coordinator's word before it answers 202 all the same."""
+MAX_KEY_CHARS = 200
+LINGER = (256 << 20, 120.0)
+"""Bytes and seconds for which the rest of a refused body is read before the connection is closed."""
+STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
+"""The same for one without the bearer token."""
+
+
+def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
+    """The service of one run; `bearer` empty: none is asked for."""
+    task = task_markdown(desk.run).encode()
+
+    async def info(request: Request) -> Response:
+        state = await desk.refresh()
+        return _json(200, info_document(desk.run, state, desk.spent, desk.in_flight, desk.last_warning))
+
+    async def task_text(request: Request) -> Response:
+        return Response(task, media_type="text/markdown; charset=utf-8")
+
+    async def submit(request: Request) -> Response:
+        key = request.headers.get("idempotency-key")
+        if key is not None and not (0 < len(key) <= MAX_KEY_CHARS and key.isprintable()):
+            raise RequestError(
+                "budget_invalid", f"an Idempotency-Key has 1 to {MAX_KEY_CHARS} printable characters"
+            )
+        wait = request.query_params.get("wait", "true").lower()
+        if wait not in ("true", "false"):
+            raise RequestError("budget_invalid", "the query parameter wait is 'true' or 'false'")
+        try:
+            body = await _read_body(request)
+        except RequestError as error:
+            await desk.note_rejected(error)
+            raise
+        ticket = await desk.submit(body, key)
+        if wait == "true":
+            await ticket.done.wait()
+        else:
+            await _within(ticket.decided, DECIDED_WAIT_S)
+        return _of_ticket(ticket, desk)
+
+    async def ask_submit(request: Request) -> Response:
+        ticket = desk.find(request.path_params["submit_id"])
+        if ticket is None:
+            raise HTTPException(404)
+        return _of_ticket(ticket, desk)
+
+    async def finalize(request: Request) -> Response:
+        raise HTTPException(405)
+
+    app = Starlette(
+        routes=[
+            Route("/info", info, methods=["GET"]),
+            Route("/task", task_text, methods=["GET"]),
+            Route("/submit", submit, methods=["POST"]),
+            Route("/submit/{submit_id}", ask_submit, methods=["GET"]),
+            # The published service ends a run by itself and says so of this path.
+            Route("/finalize", finalize, methods=["GET", "POST"]),
+        ],
+        exception_handlers={
+            HTTPException: _http_error,
+            RequestError: _request_error,
+            ClientDisconnect: _gone,
+            Exception: _our_error,
+        },
+    )
+    app.router.redirect_slashes = False
+    return _TokenGate(app, token, bearer)
+
+
+def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
+    """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
+    if ticket.error is not None:
+        raise ticket.error
+    summary = ticket.summary()
+    if summary is None:
+        return _json(202, progress_document(ticket))
+    last = desk.spent and ticket is desk.tickets[-1]
+    head = orjson.dumps(
+        {
+            "submit_id": ticket.index,
+            "status": ticket.status,
+            "is_finalized": last,
+            "feedback": f"feedback/{ticket.submit_id}",
+            "policy_failures": ticket.policy_failures,
+            "warning": ticket.warning,
+        }
+    )
+    body = head[:-1] + b',"summary":' + summary + b"}"
+    return Response(body, media_type="application/json")
+
+
+async def _read_body(request: Request) -> bytes:
+    """The body, or a refusal as soon as it is known to be too long."""
+    told = request.headers.get("content-length", "")
+    if told.isdecimal() and (len(told) > 18 or int(told) > MAX_BODY_BYTES):
+        refuse_size(int(told[:18]))
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_WAIT_S):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > MAX_BODY_BYTES:
+                    refuse_size(None)
+    except TimeoutError as error:
+        raise RequestError("budget_invalid", f"the body did not arrive within {BODY_WAIT_S:g} s") from error
+    return bytes(body)
+
+
+async def _within(event: asyncio.Event, seconds: float) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await event.wait()
+    except TimeoutError:
+        pass
+
+
+def _json(status: int, document: dict[str, Any]) -> Response:
+    return Response(orjson.dumps(document), status_code=status, media_type="application/json")
+
+
+_STRANGER = Response(
+    orjson.dumps({"error": {"message": "this service wants a bearer token"}}),
+    status_code=401,
+    media_type="application/json",
+    headers={"WWW-Authenticate": "Bearer"},
+)
+
+
+_STOPPING = Response(
+    orjson.dumps(
+        {
+            "status": "closed",
+            "error": {
+                "message": "the gateway stops; what it has accepted goes on: ask again, with the same Idempotency-Key"
+            },
+        }
+    ),
+    status_code=503,
+    media_type="application/json",
+)
+
+
+async def _request_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestError)
+    document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
+    if isinstance(error, ConflictError):
+        return _json(409, document | {"submit_id": error.index})
+    codes = {RUN_CLOSED: 409, CANCELLED: 409, "closed": 503, "gateway_failed": 500}
+    return _json(codes.get(error.status, 400), document)
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    words = {404: "there is nothing here", 405: "this method is not for this URL"}
+    message = words.get(error.status_code, "the request cannot be served")
+    response = _json(error.status_code, {"error": {"message": message}})
+    response.headers.update(error.headers or {})
+    return response
+
+
+async def _gone(request: Request, error: Exception) -> Response:
+    return Response(status_code=400)
+
+
+async def _our_error(request: Request, error: Exception) -> Response:
+    log.error("request failed", path=request.url.path[-80:], exc_info=error)
+    return _json(500, {"error": {"message": "the gateway failed; nothing was changed by this request"}})
+
+
+class _TokenGate:
+    """Lets through what knows the token, without it; lets a client that is still sending hear a refusal."""
+
+    def __init__(self, app: ASGIApp, token: str, bearer: str) -> None:
+        self._app = app
+        self._token = token.encode()
+        self._bearer = bearer.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        if self._bearer and not self._bears(scope):
+            stranger = _Exchange(scope, receive, send, STRANGER_LINGER)
+            await _STRANGER(scope, stranger.receive, stranger.send)
+            return
+        _, _, rest = scope["path"].partition("/")
+        token, slash, path = rest.partition("/")
+        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
+            path = slash = ""
+        inner = dict(scope) | {"path": slash + path, "raw_path": None, "root_path": ""}
+        exchange = _Exchange(scope, receive, send, LINGER)
+        try:
+            await self._app(inner, exchange.receive, exchange.send)
+        except asyncio.CancelledError:
+            # The service ends while this request waits. Nobody is told to stop: the server only waits for this to return.
+            if not exchange.answered:
+                await _STOPPING(scope, exchange.receive, exchange.send)
+
+    def _bears(self, scope: Scope) -> bool:
+        """Whether the request carries the bearer token, once."""
+        given = [value for name, value in scope["headers"] if name == b"authorization"]
+        kind, _, word = b"".join(given[:1]).partition(b" ")
+        alike = hmac.compare_digest(word.strip(), self._bearer)
+        return alike and len(given) == 1 and kind.lower() == b"bearer"
+
+
+class _Exchange:
+    """Ends a refusal only when the rest of the body was read and thrown away, within bounds.
+
+    A server that closes while the client still sends resets the connection, and the client never reads the refusal.
+    """
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send, linger: tuple[int, float]) -> None:
+        self._left, self._linger_s = linger
+        self._receive = receive
+        self._send = send
+        self._refused = False
+        self.answered = False
+        """Whether the answer has begun."""
+        # Who waits for "100 Continue" sends no body to a refusal.
+        self._unread = (b"expect", b"100-continue") not in scope["headers"]
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        if message["type"] != "http.request" or not message.get("more_body", False):
+            self._unread = False
+        return message
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self._refused = message["status"] >= 400
+            self.answered = True
+        last = message["type"] == "http.response.body" and not message.get("more_body", False)
+        if not (last and self._refused and self._unread):
+            await self._send(message)
+            return
+        await self._send({**message, "more_body": True})
+        try:
+            async with asyncio.timeout(self._linger_s):
+                await self._discard()
+        except TimeoutError:
+            pass
+        await self._send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    async def _discard(self) -> None:
+        while self._unread and self._left > 0:
+            self._left -= len((await self.receive()).get("body", b""))

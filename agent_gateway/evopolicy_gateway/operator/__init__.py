@@ -1,0 +1,1 @@
+"""Operators' commands: several runs at once, the questions that they ask a cluster, and the view of it."""

@@ -1,0 +1,214 @@
+"""Several runs on one cluster: an operator's cluster, or one of this machine brought up for them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+from rich.table import Table
+
+from evopolicy_common.cli import end_on_sigterm
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
+from evopolicy_common.processes.preflight import explained
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.terminal import Terminal
+from evopolicy_common.wire import transport
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.operator.operations import Operations, find_credentials
+from evopolicy_gateway.operator.watch import Watch, watching
+from evopolicy_gateway.run.play import Plan, RunPlay
+
+EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
+_AGENT_FAILED = ("agent_failed", "silent")
+"""Of a command that plays runs, the gravest first; 0 when every run completed."""
+
+
+class Cluster(msgspec.Struct, frozen=True, kw_only=True):
+    """Which cluster a command uses: a local one with so many slots, or the one that is named (or this machine's own)."""
+
+    connect: tuple[str, ...] = ()
+    file: Path | None = None
+    """The operator's credentials."""
+    local_slots: int | None = None
+    state: Path | None = None
+    data: Path | None = None
+    audit: float = 0.0
+    """Of a local one: share of the episodes that a second worker plays again."""
+    hidden_isolation: str | None = None
+    """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
+
+
+class RunResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run came to, for people and scripts."""
+
+    env: str
+    run_directory: str
+    status: str
+    """`completed`, `no_ok_submit`, `error`, `cancelled`."""
+    error: str | None = None
+    final_score: float | None = None
+    """Held-out mean return."""
+    random_score: float | None = None
+    """Of uniform random actions on the same cases."""
+    best_submit_index: int | None = None
+    n_submits: int = 0
+    budget_used: int = 0
+    closed_reason: str = ""
+    wall_s: float = 0.0
+    in_question: bool = False
+    """Audits found results of it disputed, or a forger among those who played it."""
+    wrong_option: bool = False
+    """It was never opened, for an option's sake."""
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
+) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
+    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+
+    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
+    """
+    end_on_sigterm()
+    async with contextlib.AsyncExitStack() as stack:
+        failed: asyncio.Future[None] | None = None
+        file = where.file
+        if where.local_slots is not None:
+            cluster = await stack.enter_async_context(
+                local_cluster(
+                    "local",
+                    state=where.state,
+                    data=where.data,
+                    audit=where.audit,
+                    hidden_isolation=where.hidden_isolation,
+                )
+            )
+            await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
+            file, failed = cluster.operator_file, cluster.failed
+        operator, gateway = find_credentials(where.connect, file)
+        link = await stack.enter_async_context(transport.connect(operator))
+        yield Operations(link), gateway, failed
+
+
+async def play_all(
+    plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal
+) -> list[RunResult]:
+    """Plays all plans, so many agents at once; one that fails does not stop the others."""
+    results: dict[int, RunResult] = {}
+    with watching(console) as watch:
+        settings = [plan.settings for plan in plans]
+        async with connected(
+            where, [one.env for one in settings], {one.sandbox_tier for one in settings}
+        ) as (operations, gateway, failed):
+            gate = asyncio.Semaphore(parallel)
+
+            async def one(index: int, plan: Plan) -> None:
+                await gate.acquire()
+                with contextlib.ExitStack() as place:
+                    # Once its agent is gone, the next one begins while this run is scored.
+                    place.callback(gate.release)
+                    results[index] = await _play(plan, operations, gateway, watch, place.close)
+
+            async def everything() -> None:
+                async with asyncio.TaskGroup() as group:
+                    for index, plan in enumerate(plans):
+                        group.create_task(one(index, plan))
+
+            await unless_failed(asyncio.create_task(everything()), failed)
+    if all(result.wrong_option for result in results.values()):
+        raise ConfigError(results[0].error or "")
+    return [results[index] for index in range(len(plans))]
+
+
+def exit_code(ends: Iterable[tuple[str, str]]) -> int:
+    """For the gravest of some runs' ends, each told as its status and why its agent stopped: see `EXIT_CODES`."""
+    found = {_end(status, closed_reason) for status, closed_reason in ends}
+    return next((code for end, code in EXIT_CODES.items() if end in found), 0)
+
+
+def _end(status: str, closed_reason: str) -> str:
+    if closed_reason in _AGENT_FAILED and status != "cancelled":
+        return "agent_failed"
+    return status if status in EXIT_CODES or status == "completed" else "error"
+
+
+def report(results: Sequence[RunResult], console: Terminal) -> None:
+    """A table of what the runs came to, and where each of them is."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("environment", "score", "random", "best submit", "budget used", "ended"):
+        table.add_column(title, justify="right" if title in ("score", "random") else "left")
+    for result in results:
+        best = "" if result.best_submit_index is None else f"submit {result.best_submit_index}"
+        shown = result.closed_reason.replace("_", " ") if result.status == "completed" else result.status
+        table.add_row(
+            result.env,
+            _number(result.final_score),
+            _number(result.random_score),
+            best,
+            str(result.budget_used),
+            shown,
+        )
+    console.print(table)
+    for result in results:
+        if result.error:
+            console.print(f"{result.env}: {result.error}", soft_wrap=True)
+        if result.in_question:
+            text = f"{result.env}: audits put these results in question; see `audit` in run.json"
+            console.print(text, soft_wrap=True)
+        console.print(f"run directory: {result.run_directory}", soft_wrap=True)
+
+
+async def _play(
+    plan: Plan,
+    operations: Operations,
+    gateway: Credentials,
+    watch: Watch,
+    on_agent_gone: Callable[[], None],
+) -> RunResult:
+    play = RunPlay(plan, operations, gateway, watch, on_agent_gone=on_agent_gone)
+    try:
+        return _result(plan, await (play.go_on() if plan.resume else play.play()))
+    except ConfigError as error:
+        return RunResult(
+            env=plan.settings.env,
+            run_directory=str(plan.folder.root),
+            status="error",
+            error=str(error),
+            wrong_option=True,
+        )
+    except (EvopolicyError, OSError) as error:
+        why = explained(error) if isinstance(error, OSError) else str(error)
+        if why is None:
+            raise
+        watch.note(plan.settings.env, f"failed: {why}")
+        return RunResult(
+            env=plan.settings.env, run_directory=str(plan.folder.root), status="error", error=why
+        )
+
+
+def _result(plan: Plan, record: RunRecord) -> RunResult:
+    outcome = record.outcome
+    reference = outcome.random_reference
+    return RunResult(
+        env=record.env,
+        run_directory=str(plan.folder.root),
+        status=outcome.status,
+        error=outcome.error,
+        final_score=outcome.final_score,
+        random_score=None if reference is None else reference.mean_return,
+        best_submit_index=outcome.best_submit_index,
+        n_submits=len(list(plan.folder.checkpoints.glob("submit_*"))),
+        budget_used=outcome.budget_used,
+        closed_reason=outcome.closed_reason,
+        wall_s=record.timing.wall_s,
+        in_question=record.audit is not None and record.audit.in_question,
+    )
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

@@ -1,0 +1,296 @@
+"""Playing cases outside any run: `evopolicy try` and `evopolicy random`."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import pstdev
+
+import msgspec
+from rich.progress import Progress
+from rich.table import Table
+
+from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
+from evopolicy_common.messages.operator import Evaluate
+from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.processes.notices import Waiting
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.records import bundles
+from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.operator.runs import Cluster, connected
+from evopolicy_gateway.submits.episode_files import trajectory_files
+from evopolicy_gateway.submits.formatting import cut_text
+
+
+class Trial(msgspec.Struct, frozen=True, kw_only=True):
+    """A policy to be tried."""
+
+    env: str
+    policy: Path
+    split: Split
+    cases: tuple[int, ...]
+    out: Path
+    tier: Tier
+    limits: ResourceLimits
+
+
+class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode of a trial."""
+
+    case: int
+    episode_return: float | None
+    """None where nothing was played, because the first case showed that there is no Policy to play."""
+    length: int
+    failure: str | None = None
+    """Category, step and message, when the policy failed. Uniform random actions played from that step on."""
+    failed_at: int | None = None
+    """The step at which it failed; None where it did not, or failed before its first."""
+    folder: str | None = None
+
+    @property
+    def played_by(self) -> str:
+        """Whose actions the return is of."""
+        if self.episode_return is None:
+            return "not played"
+        if self.failure is None:
+            return "policy"
+        return f"policy to step {self.failed_at}, then random" if self.failed_at else "random"
+
+
+class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a trial came to."""
+
+    env: str
+    mean_return: float | None
+    """Over the cases in which the policy did not fail; None where there is none."""
+    std_return: float | None
+    """Population standard deviation over the same cases."""
+    n_failed: int
+    """Cases in which the policy failed; their returns, mostly of random actions, are in no mean."""
+    episodes: tuple[TriedEpisode, ...]
+    folder: str | None = None
+    other_cases_next_time: bool = False
+    """The cases came from the secret of a cluster that is gone now: another call has others under the same ids."""
+
+
+async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
+    """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
+    bundle = _bundle(trial.policy)
+    check_writable(trial.out, "--out")
+    console = terminal(stderr=as_json)
+    results: list[TrialResult] = []
+
+    async def work(operations: Operations) -> None:
+        await operations.upload(bundle)
+        message = Evaluate(
+            token="",
+            key=uuid.uuid4().hex,
+            env=trial.env,
+            bundle=bundle.digest,
+            split=trial.split,
+            cases=trial.cases,
+            sandbox_tier=trial.tier,
+            limits=trial.limits,
+        )
+        outcomes = await _outcomes(operations, message, console)
+        folder = await asyncio.to_thread(_new_folder, trial.out, trial.env)
+        episodes = [
+            await _tried(outcome, case, folder, operations)
+            for outcome, case in zip(outcomes, trial.cases, strict=True)
+        ]
+        results.append(_result(trial.env, episodes, where, folder))
+
+    async with connected(where, [trial.env], {trial.tier}) as (operations, _, failed):
+        await unless_failed(asyncio.create_task(work(operations)), failed)
+    _print(results, as_json, console)
+    return int(any(episode.failure for episode in results[0].episodes))
+
+
+async def play_random(
+    env_ids: Sequence[str],
+    split: str,
+    cases: tuple[int, ...] | None,
+    where: Cluster,
+    *,
+    as_json: bool,
+) -> int:
+    """Plays uniform random actions and prints the returns."""
+    console = terminal(stderr=as_json)
+    results: list[TrialResult] = []
+
+    async def work(operations: Operations) -> None:
+        for env_id in env_ids:
+            message = Evaluate(
+                token="",
+                key=uuid.uuid4().hex,
+                env=env_id,
+                bundle=None,
+                split=msgspec.convert(split, Split),
+                cases=cases,
+                record="actions",
+                # No policy plays, so nothing needs a sandbox; a worker of another cluster may offer no tier `none`.
+                sandbox_tier="bwrap" if where.local_slots is None else "none",
+            )
+            outcomes = await _outcomes(operations, message, console)
+            ids = range(len(outcomes)) if cases is None else cases
+            episodes = [
+                TriedEpisode(case=case, episode_return=outcome.episode_return, length=outcome.length)
+                for outcome, case in zip(outcomes, ids, strict=True)
+            ]
+            results.append(_result(env_id, episodes, where))
+
+    async with connected(where, env_ids, ()) as (operations, _, failed):
+        await unless_failed(asyncio.create_task(work(operations)), failed)
+    if as_json or len(results) == 1:
+        _print(results, as_json, console)
+    else:
+        _print_means(results, console)
+    return 0
+
+
+async def _outcomes(operations: Operations, message: Evaluate, console: Terminal) -> list[EpisodeOutcome]:
+    """All outcomes in the order asked for."""
+    outcomes: list[EpisodeOutcome] = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(message.env, total=None)
+        waiting = Waiting()
+        async for outcome, total, waits_for in operations.evaluate(message):
+            if outcome is not None:
+                outcomes.append(outcome)
+                waiting.goes_on()
+            elif waiting.worth_saying(waits_for):
+                console.print(f"{message.env}: waiting for {waits_for}", soft_wrap=True)
+            progress.update(task, completed=len(outcomes), total=total)
+    return sorted(outcomes, key=lambda outcome: outcome.index)
+
+
+async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: Operations) -> TriedEpisode:
+    target = folder / f"ep_{outcome.index:03d}"
+    packed = None if outcome.trajectory is None else await operations.fetch(outcome.trajectory)
+    await asyncio.to_thread(_write, target, packed, outcome)
+    failed, failure, failed_at = outcome.failure, None, None
+    if failed is not None:
+        failed_at = failed.step_index
+        at = "" if failed_at is None else f" at step {failed_at}"
+        failure = f"{failed.category}{at}: {failed.message}"
+    return TriedEpisode(
+        case=case,
+        episode_return=outcome.episode_return if outcome.length else None,
+        length=outcome.length,
+        failure=failure,
+        failed_at=failed_at,
+        folder=str(target),
+    )
+
+
+def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
+    target.mkdir()
+    files = {} if packed is None else trajectory_files(packed, None)
+    files["stdout.txt"] = cut_text(outcome.stdout)
+    files["stderr.txt"] = cut_text(outcome.stderr)
+    if outcome.failure is not None:
+        files["error.txt"] = outcome.failure.traceback.encode() or outcome.failure.message.encode()
+    for name, data in files.items():
+        (target / name).write_bytes(data)
+
+
+def _bundle(policy: Path) -> bundles.Bundle:
+    folder = policy if (policy / "policy.py").is_file() else policy / "system"
+    if not (folder / "policy.py").is_file():
+        raise ConfigError(f"{policy} holds no policy.py")
+    try:
+        return bundles.snapshot(folder)
+    except BundleError as error:
+        raise ConfigError(f"{folder}: {error}") from error
+
+
+def _new_folder(out: Path, env: str) -> Path:
+    base = out / env.replace("/", "_")
+    base.mkdir(parents=True, exist_ok=True)
+    number = 0
+    while True:
+        folder = base / f"try_{number:03d}"
+        try:
+            folder.mkdir()
+            return folder.absolute()
+        except FileExistsError:
+            number += 1
+
+
+def _result(
+    env: str, episodes: Sequence[TriedEpisode], where: Cluster, folder: Path | None = None
+) -> TrialResult:
+    returns = [
+        one.episode_return for one in episodes if one.failure is None and one.episode_return is not None
+    ]
+    mean = math.fsum(returns) / len(returns) if returns else None
+    return TrialResult(
+        env=env,
+        mean_return=mean,
+        std_return=None if mean is None else pstdev(returns, mean),
+        n_failed=sum(one.failure is not None for one in episodes),
+        episodes=tuple(episodes),
+        folder=None if folder is None else str(folder),
+        other_cases_next_time=where.local_slots is not None and where.state is None and where.data is None,
+    )
+
+
+def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> None:
+    if as_json:
+        say_json(results)
+        return
+    for result in results:
+        table = Table(box=None, pad_edge=False)
+        for title in ("case", "return", "steps", "played by", "failure"):
+            table.add_column(title, justify="right" if title in ("case", "return", "steps") else "left")
+        for one in result.episodes:
+            shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
+            table.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
+        console.print(table)
+        console.print(_summary(result), soft_wrap=True)
+        if result.folder is not None:
+            console.print(f"trajectories: {result.folder}", soft_wrap=True)
+    _tell_of_cases(results, console)
+
+
+def _summary(result: TrialResult) -> str:
+    n, failed = len(result.episodes), result.n_failed
+    if result.mean_return is None:
+        return f"{result.env}: no mean return, the policy failed in {'all ' * (n > 1)}{_cases(n)}"
+    over = f"{n - failed} of {_cases(n)}" if failed else _cases(n)
+    left_out = f"; {_cases(failed)} left out, in which the policy failed" if failed else ""
+    return (
+        f"{result.env}: mean return {result.mean_return:.4g}, population standard deviation {result.std_return:.4g},"
+        f" over {over}{left_out}"
+    )
+
+
+def _cases(n: int) -> str:
+    return f"{n} case{'s' * (n != 1)}"
+
+
+def _tell_of_cases(results: Sequence[TrialResult], console: Terminal) -> None:
+    if any(result.other_cases_next_time for result in results):
+        console.print(
+            "note: this cluster's cases end with it, the next call has others under the same ids;"
+            " --state DIR, --data DIR or --connect keeps them the same",
+            soft_wrap=True,
+        )
+
+
+def _print_means(results: Sequence[TrialResult], console: Terminal) -> None:
+    table = Table(box=None, pad_edge=False)
+    for title in ("environment", "episodes", "mean return", "population std"):
+        table.add_column(title, justify="left" if title == "environment" else "right")
+    for result in results:
+        table.add_row(
+            result.env, str(len(result.episodes)), f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
+        )
+    console.print(table)
+    _tell_of_cases(results, console)

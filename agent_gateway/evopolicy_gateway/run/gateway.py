@@ -1,0 +1,222 @@
+"""One run's gateway as a process: session, desk and HTTP service together, until the run is closed or it is told to stop.
+
+It holds the run's capability and nothing else of the cluster. Stopped without a word (signal, death, its operator gone) it
+leaves the run open: started again on the same folder it goes on where it was.
+
+Nothing is served, and so no agent started or told of, before the coordinator permits the agent to be alive where it is. The
+run's closing ends the permit, so it comes after the agent's end: the parent says so, or else the operator (`evopolicy finish`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import ConfigError, RefusedError
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.refusals import RUN_OVER
+from evopolicy_gateway.http.door import AgentPlace, agent_place, ends_unseen
+from evopolicy_gateway.http.server import bind, serving
+from evopolicy_gateway.http.service import make_app
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run.session import Session
+from evopolicy_gateway.submits.desk import Desk
+from evopolicy_gateway.submits.journal import Closed, Journal
+from evopolicy_gateway.workspace import staging as workspace
+from evopolicy_gateway.workspace.agents_md import Urls
+
+_LOOK_S = 1.0
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class Close(msgspec.Struct, frozen=True, kw_only=True):
+    """The agent and all its children are gone: tell the coordinator so."""
+
+    reason: str
+    agent: dict[str, Any] = {}
+
+
+class Gateway:
+    """Runs once. `tell` may be called from the same event loop at any time."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        connect: tuple[str, ...] = (),
+        credentials_file: Path | None = None,
+        *,
+        on_ready: Callable[[Urls, Desk], None],
+        on_change: Callable[[Desk], None],
+        on_wait: Callable[[str], None] = lambda waits_for: None,
+        alone: bool,
+        place: AgentPlace | None = None,
+    ) -> None:
+        """`connect` and `credentials_file` (its folder) replace those of the run; its capability stays.
+
+        `on_wait` is told what it waits for beside the agent, empty for nothing any more. `alone`: nobody else watches the
+        agent. `place`: where the agent is, if not where the run's folder says.
+        """
+        self._folder = folder
+        self._connect = connect
+        self._credentials_file = credentials_file
+        self._on_ready = on_ready
+        self._on_change = on_change
+        self._on_wait = on_wait
+        self._alone = alone
+        self._place = place
+        self._stopped = asyncio.Event()
+        """Told to leave the run open."""
+        self.permit_s = 0.0
+        """Seconds for which the agent's permit was waited for."""
+        self._told: asyncio.Future[Close | None] = asyncio.get_running_loop().create_future()
+        self._changed = asyncio.Event()
+
+    def tell(self, close: Close | None) -> None:
+        """Ends the gateway: closing the run, or (None) leaving it open, also where its closing waits."""
+        if close is None:
+            self._stopped.set()
+        if not self._told.done():
+            self._told.set_result(close)
+
+    async def run(self) -> bool:
+        """Serves until told to end; whether the run was closed. Raises what makes it impossible to go on."""
+        found, run = _load(self._folder, self._connect, self._credentials_file)
+        sock, address = await bind(self._folder)
+        journal = Journal(self._folder.journal)
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                link = await self._unless_stopped(
+                    stack.enter_async_context(transport.connect(found, timeout_s=None))
+                )
+                if link is None:
+                    return False
+                session = Session(link, run)
+                try:
+                    opened = await self._unless_stopped(session.open())
+                    if opened is None or not await self._permitted(session):
+                        return False
+                except RefusedError as error:
+                    if error.status not in RUN_OVER:
+                        raise
+                    log.warning("the run takes no more", status=error.status, why=error.message)
+                    return True
+                workspace.stage(self._folder, opened, address.urls())
+                blobs = BlobStore(self._folder.blobs)
+                desk = Desk(session, opened, self._folder.workspace, journal, blobs, self._changed.set)
+                http = await stack.enter_async_context(
+                    serving(make_app(desk, address.token, address.bearer), sock)
+                )
+                log.info("serving", run=run, env=opened.env.env, port=address.port)
+                self._on_ready(address.urls(), desk)
+                try:
+                    close = await self._watch(desk, http)
+                    return close is not None and await self._close(session, journal, desk, close)
+                finally:
+                    await desk.stop()
+        finally:
+            sock.close()
+            journal.close()
+
+    async def _permitted(self, session: Session) -> bool:
+        """Whether the agent may be alive, or need not be any more; False when told to leave the run open first."""
+        if self._alone:
+            self._folder.unwatched.touch(mode=0o600)
+        asked = time.monotonic()
+        permit = asyncio.ensure_future(
+            session.permit(self._place or agent_place(self._folder), self._on_wait)
+        )
+        waited: list[asyncio.Future[Any]] = [permit, self._told]
+        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+        self.permit_s = time.monotonic() - asked
+        self._on_wait("")
+        if permit.done():
+            return permit.result()
+        permit.cancel()
+        await asyncio.gather(permit, return_exceptions=True)
+        return not self._stopped.is_set()
+
+    async def _watch(self, desk: Desk, http: asyncio.Task[None]) -> Close | None:
+        """Passes changes on until told to end."""
+        self._changed.set()
+        while True:
+            changed = asyncio.ensure_future(self._changed.wait())
+            waited: list[asyncio.Future[Any]] = [changed, self._told, desk.fatal, http]
+            await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+            changed.cancel()
+            if desk.fatal.done():
+                desk.fatal.result()
+            if http.done():
+                http.result()
+                raise ConfigError("the HTTP service ended by itself")
+            if self._told.done():
+                return self._told.result()
+            self._changed.clear()
+            self._on_change(desk)
+            if self._alone and (desk.spent or self._folder.finish.exists()):
+                return Close(reason="budget_spent" if desk.spent else "agent_stopped")
+
+    async def _close(self, session: Session, journal: Journal, desk: Desk, close: Close) -> bool:
+        # The agent has no more to say, but what it asked for last is still played and written.
+        desk.closed = True
+        await desk.idle()
+        if not await self._agent_gone(desk):
+            return False
+        await session.close(close.reason, close.agent)
+        await asyncio.to_thread(journal.append, Closed(reason=close.reason))
+        log.info("run closed", reason=close.reason)
+        return True
+
+    async def _agent_gone(self, desk: Desk) -> bool:
+        """True when the agent has ended, as far as anybody can tell; False when told to leave the run open first."""
+        unseen = self._alone or ends_unseen(self._folder)
+        while unseen and not (desk.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
+            self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._stopped.wait(), _LOOK_S)
+            await desk.refresh()
+        self._on_wait("")
+        return not self._stopped.is_set()
+
+    async def _unless_stopped(self, wanted: Any) -> Any:
+        """The result, or None when told to leave the run open first."""
+        task, stopped = asyncio.ensure_future(wanted), asyncio.ensure_future(self._stopped.wait())
+        await asyncio.wait([task, stopped], return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        if task.done():
+            return task.result()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        return None
+
+
+def _load(
+    folder: RunFolder, connect: tuple[str, ...], file: Path | None
+) -> tuple[credentials.Credentials, str]:
+    if not folder.opened.exists():
+        raise ConfigError(
+            f"{folder.root} holds no open run ({folder.state.name}/{folder.opened.name} is missing);"
+            " runs are opened by `evopolicy run`"
+        )
+    found = credentials.read(folder.credentials)
+    run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+    if file is not None:
+        found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
+    return credentials.at(found, connect), run
+
+
+def folder_of(path: Path) -> RunFolder:
+    """The run folder at `path`; ConfigError when there is no such folder."""
+    if not path.is_dir():
+        raise ConfigError(
+            f"{path} is not a folder; name a run directory such as runs/evolve/gym_acrobot/first"
+        )
+    return RunFolder(path.absolute())

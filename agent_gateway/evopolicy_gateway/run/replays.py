@@ -1,0 +1,61 @@
+"""`replays/heldout_NNN/video.mp4`: the selected checkpoint's held-out episodes, as workers recorded them.
+
+Rules: which episodes there are is the run's option `replays` (off, first, all), or `video` where that is not given. NNN is
+the position in the split, from 0; the case's seed is nowhere. A recording is an extra: one that a worker could not make, or
+the cluster has no more, is left out, and nothing else of the run depends on it. What was fetched before is not fetched again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from evopolicy_common.errors import RefusedError
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.records.blobs import digest_of, write_atomically
+from evopolicy_common.records.run_record import Replay
+from evopolicy_gateway.operator.operations import Operations
+
+FOLDER = "replays"
+
+
+async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tuple[Replay, ...]:
+    """Writes the recordings under the run directory `root`; one `Replay` each, in the split's order."""
+    index = finished.best_submit_index
+    if finished.settings.recorded_heldout == "off" or index is None:
+        return ()
+    found: list[Replay] = []
+    async for outcome in operations.recorded(finished.run, "heldout", index):
+        if outcome.video is None:
+            continue
+        path = f"{FOLDER}/heldout_{outcome.index:03d}/video.mp4"
+        target = root / path
+        if not await asyncio.to_thread(_has, target, outcome.video.digest):
+            try:
+                data = await operations.fetch(outcome.video)
+            except RefusedError:
+                continue
+            await asyncio.to_thread(_write, target, data)
+        found.append(
+            Replay(
+                path=path,
+                split="heldout",
+                episode=outcome.index,
+                submit_index=index,
+                episode_return=outcome.episode_return,
+                length=outcome.length,
+            )
+        )
+    return tuple(sorted(found, key=lambda replay: replay.episode))
+
+
+def _has(path: Path, digest: str) -> bool:
+    try:
+        return digest_of(path.read_bytes()) == digest
+    except OSError:
+        return False
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data)

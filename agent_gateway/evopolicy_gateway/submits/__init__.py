@@ -1,0 +1,1 @@
+"""Submits, from a request's bytes to committed feedback."""

@@ -1,0 +1,84 @@
+"""The feedback tree on disk: episodes stream into `submit_NNN.partial/`, one rename makes it `submit_NNN/`.
+
+Rules: everything in a folder is durable before the rename, `summary.json` is written last; a folder without `.partial`
+is whole and never changes; what an agent may have put in the way is removed, never followed. What is in a `.partial`
+need not be durable, as it is written again after a crash: one flush of the file system at the end serves all its files.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from evopolicy_common.processes.scratch import give_back_rights, remove_tree
+from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
+
+SUMMARY = "summary.json"
+
+
+class SubmitTree:
+    """One submit's folder while it is written. Not thread-safe; every call may block on the disk and raise OSError.
+
+    After an OSError call `begin` and write everything again.
+    """
+
+    def __init__(self, feedback: Path, submit_id: str) -> None:
+        self._feedback = feedback
+        self._partial = feedback / f"{submit_id}.partial"
+        self._final = feedback / submit_id
+
+    @property
+    def final(self) -> Path:
+        return self._final
+
+    def begin(self) -> None:
+        """An empty `.partial` folder, whatever was there before."""
+        give_back_rights(self._feedback.parent)
+        if self._feedback.is_symlink() or not self._feedback.is_dir():
+            _remove(self._feedback)
+            self._feedback.mkdir(parents=True)
+        _remove(self._partial)
+        (self._partial / "episodes").mkdir(parents=True)
+
+    def put_episode(self, name: str, files: Mapping[str, bytes]) -> None:
+        """An episode's folder with its files; shows up whole."""
+        episodes = self._partial / "episodes"
+        hidden = episodes / f".{name}"
+        _remove(hidden)
+        _remove(episodes / name)
+        hidden.mkdir()
+        for file_name, data in files.items():
+            _write(hidden / file_name, data)
+        hidden.rename(episodes / name)
+
+    def drop_episode(self, name: str) -> None:
+        """Takes an episode's folder back; what is not there is no error."""
+        _remove(self._partial / "episodes" / name)
+
+    def commit(self, summary: bytes, errors: bytes | None) -> None:
+        """Writes `errors.txt` (unless None), then `summary.json`, and gives the folder its name."""
+        if errors is not None:
+            _write(self._partial / "errors.txt", errors)
+        _write(self._partial / SUMMARY, summary)
+        sync_filesystem(self._partial)
+        # Left by a gateway that died between the rename and its journal, or put there by the agent.
+        _remove(self._final)
+        self._partial.rename(self._final)
+        fsync_directory(self._feedback)
+
+
+def _write(path: Path, data: bytes) -> None:
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o444)
+    with os.fdopen(fd, "wb") as file:
+        file.write(data)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        remove_tree(path)
+        if path.exists():
+            raise OSError(errno.ENOTEMPTY, "cannot be removed", str(path))
+    else:
+        path.unlink(missing_ok=True)

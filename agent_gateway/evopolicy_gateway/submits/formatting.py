@@ -1,0 +1,312 @@
+"""Feedback as bytes: pure functions from what happened to what the files hold, the same bytes every time.
+
+JSON has no NaN and no infinities, so they are the texts `"NaN"`, `"Inf"` and `"-Inf"` wherever a number may stand.
+numpy numbers are written in the shortest form that reads back as the same number of their own dtype.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import orjson
+
+from evopolicy_common.messages.environment import ObservationForm
+from evopolicy_common.messages.episode import NO_POLICY, TIME_LIMITS, PolicyFailure
+from evopolicy_common.messages.gateway import SubmitDone
+from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
+
+MAX_TEXT_BYTES = 64 << 10
+"""Of stdout.txt, stderr.txt, error.txt, errors.txt each."""
+
+
+_MAX_WARNED = 300
+"""Characters of a policy's own message in a warning."""
+
+
+class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
+    """What the summary needs of one episode."""
+
+    index: int
+    """Request index."""
+    episode_return: float
+    length: int
+    """Steps."""
+    failure: PolicyFailure | None
+    """How the policy failed; None when it did not."""
+    reward_components: dict[str, float] = {}
+
+
+def digits(episode_budget: int) -> int:
+    """Width of submit and episode numbers in names."""
+    return max(3, len(str(episode_budget)))
+
+
+def submit_id(index: int, episode_budget: int) -> str:
+    """`submit_NNN`: a submit's name in answers and its folder's."""
+    return f"submit_{index:0{digits(episode_budget)}d}"
+
+
+def episode_name(global_index: int, episode_budget: int) -> str:
+    """`ep_XXX`: counts attempted episodes through the run."""
+    return f"ep_{global_index:0{digits(episode_budget)}d}"
+
+
+def json_bytes(value: Any) -> bytes:
+    """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and odd objects as text."""
+    try:
+        data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        pass
+    else:
+        # orjson writes NaN and infinities as null: without one there was none. Nearly every row ends here.
+        if b"null" not in data:
+            return data
+    plain = _plain(value)
+    try:
+        return orjson.dumps(plain, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        # What a hostile policy can make: lone surrogates, integers of more than 64 bits.
+        return json.dumps(_odd(plain), ensure_ascii=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def trajectory_row(
+    t: int, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, info: Any
+) -> bytes:
+    """One line of `trajectory.jsonl`; `obs` is None where observations are stored beside it."""
+    row = {
+        "t": t,
+        "obs": obs,
+        "action": action,
+        "reward": reward,
+        "terminated": terminated,
+        "truncated": truncated,
+        "info": info,
+    }
+    return json_bytes(row) + b"\n"
+
+
+def cut_text(data: bytes) -> bytes:
+    """At most `MAX_TEXT_BYTES` of a stream."""
+    return data[:MAX_TEXT_BYTES]
+
+
+def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes:
+    """A failure as a line of `errors.txt` or, with the step, of an episode's `error.txt`; cut to 64 KiB.
+
+    `at` is Unix time in seconds.
+    """
+    line: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "timestamp": utc_text(at),
+        "category": failure.category,
+        "message": failure.message,
+        "traceback": failure.traceback,
+    }
+    if with_step:
+        line["step_index"] = failure.step_index
+    if failure.limit is not None:
+        line |= {"limit": failure.limit, "used": failure.used}
+    return _fitting(line)
+
+
+def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes:
+    """The line of `errors.txt` that says why a submit is not ok; its category is the submit's status.
+
+    The cause's own category leads the message where the two differ.
+    """
+    if failure is None:
+        message = {
+            "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
+            "quarantined": "the policy brought its slot down three times; it is not played again",
+            "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
+        }.get(status, f"the submit ended with {status}")
+        failure_fields: dict[str, Any] = {"message": message, "traceback": ""}
+    else:
+        same = failure.category == status or failure.category in NO_POLICY
+        message = failure.message if same else f"{failure.category}: {failure.message}"
+        failure_fields = {"message": message, "traceback": failure.traceback}
+    return _fitting(
+        {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": status} | failure_fields
+    )
+
+
+def summary_bytes(
+    env: str,
+    submit_index: int,
+    done: SubmitDone,
+    scores: Sequence[EpisodeScore],
+    observations: ObservationForm = "arrays",
+) -> bytes:
+    """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order."""
+    plain = _plain(msgspec.to_builtins(_summary(env, submit_index, done, scores, observations)))
+    return msgspec.json.format(msgspec.json.encode(plain), indent=2) + b"\n"
+
+
+def _summary(
+    env: str,
+    submit_index: int,
+    done: SubmitDone,
+    scores: Sequence[EpisodeScore],
+    observations: ObservationForm,
+) -> Summary:
+    ok = done.status == "ok"
+    ordered = sorted(scores, key=lambda score: score.index)
+    if ok and [score.index for score in ordered] != list(range(done.n_episodes)):
+        raise ValueError(f"submit {submit_index} has {len(ordered)} of {done.n_episodes} episodes")
+    returns = tuple(score.episode_return for score in ordered)
+    components = tuple(score.reward_components for score in ordered)
+    with_components = ok and any(components)
+    lengths = tuple(score.length for score in ordered)
+    return Summary(
+        schema_version=SCHEMA_VERSION,
+        submit_index=submit_index,
+        env=env,
+        status=done.status,
+        n_episodes=done.n_episodes,
+        first_global_episode=done.first_global_episode,
+        env_instances=done.env_instances if ok else None,
+        remaining_budget=done.remaining_budget,
+        submit_started_at=utc_text(done.started_at),
+        submit_completed_at=utc_text(done.completed_at),
+        wall_time_seconds=round(max(0.0, done.completed_at - done.started_at), 6),
+        returns=returns if ok else None,
+        mean_return=_mean(returns) if ok else None,
+        std_return=_std(returns) if ok else None,
+        min_return=min(returns) if ok else None,
+        max_return=max(returns) if ok else None,
+        episode_lengths=lengths if ok else None,
+        mean_episode_length=_mean(lengths) if ok else None,
+        timeouts=_where(ordered, TIME_LIMITS) if ok else None,
+        errors=_where(ordered, None) if ok else None,
+        reward_components_mean=_component_means(components) if with_components else None,
+        reward_components_per_episode=components if with_components else None,
+        policy_failures=len(_where(ordered, None)) if ok else None,
+        warning=_warning(ordered, observations) if ok else None,
+    )
+
+
+def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm) -> str | None:
+    """What an agent must not overlook in the numbers of an ok submit; None where no episode failed."""
+    failures = [score.failure for score in scores if score.failure is not None]
+    if not failures:
+        return None
+    first, n = failures[0], len(scores)
+    where = "before the first step" if first.step_index is None else f"at step {first.step_index}"
+    which = f"ALL {n} episodes" if len(failures) == n else f"{len(failures)} of {n} episodes"
+    text = f"the policy failed in {which} (first {where}, {first.category}: {first.message[:_MAX_WARNED]})."
+    if len(failures) == n:
+        text += " Random actions played the rest, so these returns say nothing about your policy."
+    else:
+        text += " Random actions played the rest of these episodes, which `errors` lists."
+    if observations == "arrays" and len(failures) == n and first.category == "act_error":
+        text += " Observations arrive as numpy arrays in this run, not as nested lists."
+    return text + " Each error.txt has the traceback."
+
+
+def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) -> tuple[int, ...]:
+    """Local indices of the episodes that failed in one of `categories` (None: in any)."""
+    return tuple(
+        score.index
+        for score in scores
+        if score.failure is not None and (categories is None or score.failure.category in categories)
+    )
+
+
+def _component_means(components: Sequence[dict[str, float]]) -> dict[str, float]:
+    names = list(dict.fromkeys(name for parts in components for name in parts))
+    return {name: _mean([parts.get(name, 0.0) for parts in components]) for name in names}
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Arithmetic mean, correctly rounded; NaN or infinite when a value is."""
+    return _exact_sum(values) / len(values)
+
+
+def _std(values: Sequence[float]) -> float:
+    """Population standard deviation (divides by n)."""
+    mean = _mean(values)
+    deviations = [value - mean for value in values]
+    return math.sqrt(_exact_sum([deviation * deviation for deviation in deviations]) / len(values))
+
+
+def _exact_sum(values: Sequence[float]) -> float:
+    try:
+        return math.fsum(values)
+    except (ValueError, OverflowError):  # infinities of both signs, or a sum beyond the range of floats
+        return float(np.sum(np.asarray(values, dtype=np.float64)))
+
+
+def _fitting(line: dict[str, Any]) -> bytes:
+    """The line with its traceback, then its message, cut until it fits 64 KiB; of a traceback the end tells most."""
+    for field in ("traceback", "message"):
+        text = str(line[field])
+        keep = len(text)
+        while keep and len(json_bytes(line)) >= MAX_TEXT_BYTES:
+            keep = keep * 3 // 4
+            line[field] = (
+                f"[cut] {text[len(text) - keep :]}" if field == "traceback" else f"{text[:keep]} [cut]"
+            )
+    return json_bytes(line) + b"\n"
+
+
+def _plain(value: Any) -> Any:
+    """`value` with every number that JSON cannot say as text; arrays stay arrays where all of them are finite."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else _name(value)
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, np.ndarray):
+        return _plain_array(value)
+    if isinstance(value, np.generic):
+        return _plain_scalar(value)
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return bytes(value).decode("utf-8", "backslashreplace")
+    return str(value)
+
+
+def _plain_array(array: np.ndarray[Any, Any]) -> Any:
+    if array.ndim == 0:
+        return _plain(array[()])
+    if array.dtype.kind == "f":
+        if array.dtype.itemsize > 8:
+            array = array.astype(np.float64)
+        if np.isfinite(array).all():
+            return np.ascontiguousarray(array)
+        return [_plain(item) for item in array]
+    if array.dtype.kind in "iub":
+        return np.ascontiguousarray(array)
+    return [_plain(item) for item in array.tolist()]
+
+
+def _plain_scalar(value: np.generic) -> Any:
+    if isinstance(value, np.floating):
+        if not np.isfinite(value):
+            return _name(float(value))
+        return float(value) if value.dtype.itemsize > 8 else value
+    return _plain(value.item())
+
+
+def _name(value: float) -> str:
+    if math.isnan(value):
+        return "NaN"
+    return "Inf" if value > 0 else "-Inf"
+
+
+def _odd(value: Any) -> Any:
+    """For the standard library's encoder: numpy as lists."""
+    if isinstance(value, dict):
+        return {key: _odd(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_odd(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
+    return value

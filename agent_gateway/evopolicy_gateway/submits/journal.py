@@ -1,0 +1,216 @@
+"""What the gateway must not forget: every request before it is sent, and what came of it. JSON lines, fsynced.
+
+It lies outside the workspace. After a restart the gateway asks again by key whatever has no end here, and completes the
+feedback tree from the answers. A torn last line (the machine died while it was written) is cut off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, StorageError
+from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_common.records.blobs import fsync_directory
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
+    """A line of the journal."""
+
+
+class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
+    """A submit that passed the checks; written before anything of it is sent."""
+
+    key: str
+    """Idempotency key towards the coordinator."""
+    client_key: str | None
+    """The agent's `Idempotency-Key`."""
+    body_digest: str
+    """SHA-256 of the request's body, hex."""
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    """Digest of the snapshot; its bytes are in the blob store beside the journal."""
+    bundle_error: PolicyFailure | None
+
+
+class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
+    """The coordinator has it: durable and charged."""
+
+    key: str
+    submit_index: int
+    first_global_episode: int
+    remaining_budget: int
+
+
+class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
+    """Its feedback is committed."""
+
+    key: str
+    status: str
+    summary: str
+    """The text of `summary.json`, byte for byte."""
+
+
+class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
+    """The coordinator did not take it; nothing was charged."""
+
+    key: str
+    status: str
+    message: str
+
+
+class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
+    """A request that broke the format or the bounds: refused here, before the snapshot."""
+
+    status: str
+    message: str
+    at: float
+    """Unix time, seconds."""
+    after_submits: int
+    """Accepted submits before it."""
+
+
+class Died(Entry, frozen=True, kw_only=True, tag="died"):
+    """A gateway ended while it worked on a submit, or on the feedback of some of its episodes."""
+
+    key: str
+    episodes: tuple[int, ...] = ()
+    """Their request indexes; empty: it was the submit as a whole."""
+
+
+class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
+    """A submit that the gateway could not go on with, twice: it has no feedback, and is not tried again."""
+
+    key: str
+    message: str
+
+
+class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
+    """The coordinator was told that no more submits come."""
+
+    reason: str
+
+
+AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside | Closed
+_decoder = msgspec.json.Decoder(AnyEntry)
+
+
+class AtWork:
+    """Which episodes' files are being made, kept so that a process which is killed over one is known to have been.
+
+    One small record each, written in place: it has to survive the process only, and costs microseconds.
+    """
+
+    _RECORD = 64
+
+    def __init__(self, path: Path) -> None:
+        """`died_over` holds what the last process left; it is to be written down before the first `begin`."""
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self.died_over: list[tuple[str, int]] = []
+        """Submit's key and request index."""
+        data = os.pread(self._fd, 1 << 16, 0)
+        for at in range(0, len(data), self._RECORD):
+            key, _, index = (
+                data[at : at + self._RECORD].rstrip(b"\0").decode("ascii", "replace").partition(" ")
+            )
+            if key and index.isdecimal():
+                self.died_over.append((key, int(index)))
+        self._free: list[int] = []
+        self._n_records = 0
+
+    def clear(self) -> None:
+        """What was left is written down elsewhere."""
+        os.ftruncate(self._fd, 0)
+
+    @contextlib.contextmanager
+    def on(self, key: str, index: int) -> Iterator[None]:
+        """While inside, the episode is being worked on. To be entered and left on one thread."""
+        if not self._free:
+            self._free.append(self._n_records * self._RECORD)
+            self._n_records += 1
+        at = self._free.pop()
+        record = f"{key} {index}".encode()[: self._RECORD]
+        os.pwrite(self._fd, record.ljust(self._RECORD, b"\0"), at)
+        try:
+            yield
+        finally:
+            os.pwrite(self._fd, bytes(self._RECORD), at)
+            self._free.append(at)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+class Journal:
+    """The journal's file, opened for appending. `append` blocks on the disk."""
+
+    def __init__(self, path: Path) -> None:
+        """Opens or makes it. StorageError when a line other than the last cannot be read."""
+        self._path = path
+        self.at_work = AtWork(path.with_name("at-work"))
+        """The episodes whose files are being made."""
+        self.entries: list[AnyEntry] = []
+        """The lines that were there when it was opened, oldest first."""
+        self.places: list[int] = []
+        """Where each of these begins, for `read`."""
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._file = os.fdopen(fd, "r+b", buffering=0)
+        try:
+            self._load()
+            fsync_directory(path.parent)
+        except BaseException:
+            self.close()
+            raise
+
+    def append(self, entry: AnyEntry) -> int:
+        """Durable when it returns its place, for `read`; StorageError when the disk refuses, and then nothing was added.
+
+        It is not kept in memory: a run has thousands of episodes, and the answers name each.
+        """
+        start = self._file.seek(0, os.SEEK_END)
+        try:
+            _write_all(self._file.fileno(), msgspec.json.encode(entry) + b"\n")
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            os.ftruncate(self._file.fileno(), start)
+            raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
+        return start
+
+    def read(self, place: int) -> AnyEntry:
+        """The line that begins there."""
+        with self._path.open("rb") as file:
+            file.seek(place)
+            entry: AnyEntry = _decoder.decode(file.readline())
+            return entry
+
+    def forget(self) -> None:
+        """Lets go of the lines that were there when it was opened."""
+        self.entries, self.places = [], []
+
+    def close(self) -> None:
+        self._file.close()
+        self.at_work.close()
+
+    def _load(self) -> None:
+        data = self._file.read() or b""
+        whole = data.rfind(b"\n") + 1
+        place = 0
+        for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
+            try:
+                self.entries.append(_decoder.decode(line))
+                self.places.append(place)
+                place += len(line)
+            except DECODE_ERRORS as error:
+                raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error
+        if whole != len(data):
+            os.ftruncate(self._file.fileno(), whole)
+
+
+def _write_all(fd: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]

@@ -1,0 +1,1 @@
+"""An agent's workspace before the agent starts."""

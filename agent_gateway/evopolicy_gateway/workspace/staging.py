@@ -1,0 +1,46 @@
+"""Stages the workspace before the agent starts: `AGENTS.md`, `system/policy.py`, `feedback/`. Once, and never again."""
+
+from __future__ import annotations
+
+import msgspec
+
+from evopolicy_common.messages.gateway import RunOpened
+from evopolicy_common.records.blobs import digest_of, write_atomically
+from evopolicy_common.records.run_record import PROTOCOL_VERSION
+from evopolicy_gateway.run.layout import RunFolder, Staged, save
+from evopolicy_gateway.workspace.agents_md import NO_URLS, Urls, agents_md
+from evopolicy_gateway.workspace.initial_policy import initial_policy
+
+
+def variables(folder: RunFolder) -> dict[str, str]:
+    """What an agent's process is told beside the URLs, as the published variables."""
+    return {
+        "EVOPOLICYGYM_WORKSPACE": str(folder.workspace),
+        "EVOPOLICYGYM_SYSTEM": str(folder.system),
+        "EVOPOLICYGYM_FEEDBACK": str(folder.feedback),
+        "EVOPOLICYGYM_AGENTS": str(folder.agents_md),
+        "EVOPOLICYGYM_PROTOCOL": PROTOCOL_VERSION,
+    }
+
+
+def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
+    """Makes the workspace of `run`, or leaves it as it is when that was done before.
+
+    `AGENTS.md` gets mode 0444. StorageError when the disk refuses.
+    """
+    if folder.staged.exists():
+        return msgspec.json.decode(folder.staged.read_bytes(), type=Staged)
+    folder.system.mkdir(parents=True, exist_ok=True)
+    folder.feedback.mkdir(exist_ok=True)
+    policy = initial_policy(run.env.action_space).encode()
+    write_atomically(folder.system / "policy.py", policy)
+    write_atomically(folder.agents_md, agents_md(run, urls).encode(), mode=0o444)
+    staged = Staged(
+        agents_md_hash=digest_of(agents_md(run, NO_URLS).encode()),
+        initial_policy_hash=digest_of(policy),
+        n_train=run.n_env_instances,
+        min_episodes_per_submit=run.min_episodes_per_submit,
+        max_episodes_per_submit=run.max_episodes_per_submit,
+    )
+    save(folder.staged, staged)
+    return staged

@@ -1,0 +1,1 @@
+"""Processes and the machine: children, temporary folders, checks before a command begins."""

@@ -1,0 +1,176 @@
+"""A cluster of this machine's own, for as long as a command runs: a coordinator and its workers as child processes.
+
+Rules: they end with the command, whatever ends it; workers first, so that they hand back what they hold. One that dies is
+started again, as both sides go on where they were; one that refuses its options, or dies again and again, is an error.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+from collections.abc import AsyncIterator, Collection, Sequence
+from pathlib import Path
+
+from evopolicy_common.cli import USAGE_ERROR
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes.child_process import ChildProcess
+from evopolicy_common.processes.notices import told_if_slow
+from evopolicy_common.processes.preflight import check_scratch, check_writable
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.wire.ready import Ready, read_ready
+
+START_PATIENCE_S = 60.0
+END_GRACE_S = 10.0
+_RESTART_PAUSE_S = 0.5
+_MAX_DEATHS = 10
+
+
+class LocalCluster:
+    """A running coordinator, and the means to give it workers."""
+
+    def __init__(self, ready: Ready, processes: _Processes, *, audited: bool) -> None:
+        self.operator_file = Path(ready.credentials["operator"])
+        self.failed = processes.failed
+        """Done only with the ConfigError that tells which process cannot be kept up, and why."""
+        self._worker_file = ready.credentials["worker"]
+        self._processes = processes
+        self._audited = audited
+
+    async def start_workers(
+        self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
+    ) -> None:
+        """A worker that offers these environments; of an audited cluster two, which divide the slots between them.
+
+        `tiers`: sandbox tiers that will be asked for. Where one does not work here the cluster fails with the remedy.
+        """
+        # Who starts this cluster is the one who chooses the tiers of what it plays.
+        program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed"]
+        program += ["--credentials", self._worker_file]
+        for env_id in env_ids:
+            program += ["--env", env_id]
+        for tier in sorted(tiers):
+            program += ["--need-tier", tier]
+        second = max(1, slots // 2) if self._audited else 0
+        for name, n in (("worker", max(1, slots - second)), ("worker-2", second)):
+            if n:
+                await self._processes.keep_up(name, [*program, "--slots", str(n)])
+
+
+@contextlib.asynccontextmanager
+async def local_cluster(
+    kind: str,
+    *,
+    state: Path | None = None,
+    data: Path | None = None,
+    audit: float = 0.0,
+    hidden_isolation: str | None = None,
+) -> AsyncIterator[LocalCluster]:
+    """A coordinator inside the `async with`; it and its workers are taken down at its end. Enter it on the main thread.
+
+    `kind` names its logs and its folder. `state` None: a folder that is thrown away. `audit`: share of the episodes that
+    a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. ConfigError when the coordinator does not come up (the folder may be in use).
+    """
+    with contextlib.ExitStack() as folders:
+        root = folders.enter_context(scratch_folder(kind)) if state is None else state
+        check_scratch()  # where workers keep their sandboxes
+        check_writable(root, "--state")
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # Of this process alone: the folder may be in use, and the file that is there another's.
+        ready_file = root / f"{kind}-{os.getpid()}.json"
+        ready_file.unlink(missing_ok=True)
+        folders.callback(ready_file.unlink, missing_ok=True)
+        coordinator = [
+            *_module("evopolicy_coordinator.cli"),
+            *("--state", str(root), "--ready-file", str(ready_file)),
+        ]
+        if data is not None:
+            coordinator += ["--data", str(data.absolute())]
+        if audit:
+            coordinator += ["--audit", str(audit)]
+        if hidden_isolation is not None:
+            coordinator += ["--hidden-isolation", hidden_isolation]
+        processes = _Processes(root / "logs", kind)
+        try:
+            await processes.keep_up("coordinator", coordinator)
+            try:
+                with told_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
+                    async with asyncio.timeout(START_PATIENCE_S):
+                        ready = await read_ready(ready_file, processes.failed)
+            except TimeoutError as error:
+                raise ConfigError(
+                    f"the local coordinator did not start within {START_PATIENCE_S:g} s"
+                ) from error
+            yield LocalCluster(ready, processes, audited=bool(audit))
+        finally:
+            await processes.end()
+
+
+async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:
+    """Waits for `work`; when the local cluster fails first, its error. `failed` None: the cluster is not ours."""
+    try:
+        await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
+        if failed is not None and failed.done() and not work.done():
+            failed.result()
+        await work
+    finally:
+        if not work.done():
+            work.cancel()
+            await asyncio.gather(work, return_exceptions=True)
+
+
+class _Processes:
+    """Programs that are kept running until all of them are ended."""
+
+    def __init__(self, logs: Path, kind: str) -> None:
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._logs = logs
+        self._kind = kind
+        self._running: list[ChildProcess] = []
+        self._keepers: list[asyncio.Task[None]] = []
+
+    async def keep_up(self, name: str, program: Sequence[str]) -> None:
+        child = await self._start(name, program)
+        keeper = asyncio.create_task(self._keep_up(child, name, program))
+        keeper.add_done_callback(self._given_up)
+        self._keepers.append(keeper)
+
+    async def end(self) -> None:
+        for task in self._keepers:
+            task.cancel()
+        await asyncio.gather(*self._keepers, return_exceptions=True)
+        if not self.failed.cancel():
+            self.failed.exception()  # looked at, so that asyncio does not complain that nobody did
+        for child in reversed(self._running):
+            await child.end(END_GRACE_S)
+
+    async def _keep_up(self, child: ChildProcess, name: str, program: Sequence[str]) -> None:
+        deaths = 0
+        while True:
+            code = await child.ended()
+            self._running.remove(child)
+            deaths += 1
+            said = child.last_words() or f"see {child.log}"
+            if code == USAGE_ERROR:
+                raise ConfigError(said)
+            if deaths == _MAX_DEATHS:
+                raise ConfigError(f"{name} ends again and again: {said}")
+            await asyncio.sleep(_RESTART_PAUSE_S)
+            child = await self._start(name, program)
+
+    async def _start(self, name: str, program: Sequence[str]) -> ChildProcess:
+        child = await ChildProcess.start(program, self._logs / f"{self._kind}-{name}.log")
+        self._running.append(child)
+        return child
+
+    def _given_up(self, keeper: asyncio.Task[None]) -> None:
+        if not keeper.cancelled() and not self.failed.done():
+            error = keeper.exception()
+            assert error is not None
+            self.failed.set_exception(error)
+
+
+def _module(name: str) -> list[str]:
+    return [sys.executable, "-P", "-m", name]

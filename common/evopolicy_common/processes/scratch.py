@@ -1,0 +1,134 @@
+"""Folders in the system's temporary folder that are thrown away, also after their owner was killed.
+
+Rules: a folder belongs to the process that holds the lock on its file `owner`, from before that file has its name; it goes
+with the owner, or at the next start of anything of its kind by the same user. One whose maker was killed before it had that
+file goes once it is a minute old. Short paths, for unix sockets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import itertools
+import os
+import secrets
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from evopolicy_common.processes.preflight import check_scratch
+
+_OWNER = "owner"
+_MAKING_S = 60.0
+"""More than it takes from the folder to its file."""
+
+
+@contextlib.contextmanager
+def scratch_folder(kind: str) -> Iterator[Path]:
+    """A new private folder `evopolicy-<kind>-…` inside the `with`; clears away what killed owners have left.
+
+    ConfigError when the system's temporary folder is full.
+    """
+    check_scratch()
+    clear_stale(kind)
+    root = Path(tempfile.mkdtemp(prefix=f"evopolicy-{kind}-"))
+    lock = -1
+    try:
+        lock = _own(root)
+        yield root
+    finally:
+        remove_tree(root)
+        if lock >= 0:
+            os.close(lock)
+
+
+def clear_stale(kind: str) -> int:
+    """Removes this user's folders of that kind whose owner is gone, and returns how many."""
+    cleared = 0
+    for root in Path(tempfile.gettempdir()).glob(f"evopolicy-{kind}-*"):
+        with contextlib.suppress(OSError):
+            if root.is_symlink() or root.lstat().st_uid != os.getuid():
+                continue
+            try:
+                lock = os.open(root / _OWNER, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            except FileNotFoundError:
+                if time.time() - root.lstat().st_mtime > _MAKING_S:
+                    remove_tree(root)
+                    cleared += 1
+                continue
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                remove_tree(root)
+                cleared += 1
+            finally:
+                os.close(lock)
+    return cleared
+
+
+def remove_tree(folder: Path) -> None:
+    """Removes a folder with all that is in it, as far as this user may; never raises for what is in it.
+
+    A program that was locked up in it may have nested folders deeper than Python recurses, or taken away its own rights.
+    Nobody may be changing the folder meanwhile.
+    """
+    with contextlib.suppress(RecursionError):
+        shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists() and not folder.is_symlink():
+        with contextlib.suppress(OSError):
+            _flatten_away(folder)
+
+
+def give_back_rights(folder: Path) -> None:
+    """Lets this user list, enter and write to its own folder again, where a program that worked in it took that away.
+
+    What is not there is no error.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & stat.S_IRWXU != stat.S_IRWXU:
+            folder.chmod(mode | stat.S_IRWXU)
+
+
+def _flatten_away(folder: Path) -> None:
+    """Brings what is in folders up into `folder`, level by level, and removes it there."""
+    folder.chmod(0o700)
+    root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        names = (f"{secrets.token_hex(8)}-{n}" for n in itertools.count())
+        left = os.listdir(root)
+        while left:
+            name = left.pop()
+            if not _is_folder(name, root):
+                os.unlink(name, dir_fd=root)
+                continue
+            os.chmod(name, 0o700, dir_fd=root)
+            inner = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
+            try:
+                for child in os.listdir(inner):
+                    if _is_folder(child, inner):
+                        # To give a folder another parent is to write to it.
+                        os.chmod(child, 0o700, dir_fd=inner)
+                    os.rename(child, here := next(names), src_dir_fd=inner, dst_dir_fd=root)
+                    left.append(here)
+            finally:
+                os.close(inner)
+            os.rmdir(name, dir_fd=root)
+    finally:
+        os.close(root)
+    folder.rmdir()
+
+
+def _is_folder(name: str, parent: int) -> bool:
+    return stat.S_ISDIR(os.stat(name, dir_fd=parent, follow_symlinks=False).st_mode)
+
+
+def _own(root: Path) -> int:
+    """The lock on the folder, held until it is closed."""
+    unnamed = root / f".{_OWNER}"
+    lock = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    unnamed.rename(root / _OWNER)
+    return lock

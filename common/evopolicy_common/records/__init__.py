@@ -1,0 +1,1 @@
+"""Files that outlive a process: blobs, bundles, trajectories, `run.json`, `summary.json`."""

@@ -1,0 +1,125 @@
+"""Where two run directories differ, leaving out the published list of what may: `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
+
+What is left must be equal byte for byte, JSON files up to the excluded fields: the same agent on the same cases comes to
+the same run whatever the number of workers, their order, and the failures on the way.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import fnmatch
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from evopolicy_common.processes.left_files import left_files
+
+EXCLUDED_FILES: Mapping[str, str] = {
+    "logs/*": "what happened on the way, with its times",
+    "workspace/AGENTS.md": "names the gateway's port and its random token",
+}
+"""Patterns of paths in a run directory that are not compared, and why."""
+
+EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
+    "run.json": {
+        "exp_id": "the run's own name",
+        "attempt": "counts what was begun anew",
+        "run": "the coordinator's name of the run",
+        "timing": "times",
+        "agent.retries": "counts what was asked again",
+        "outcome.auxiliary.infrastructure_retries": "counts what was played again",
+        "audit": "which workers played, and played again",
+        "versions.agents_md_hash": "of a file that names the gateway's port",
+    },
+    "summary.json": {
+        "submit_started_at": "a time",
+        "submit_completed_at": "a time",
+        "wall_time_seconds": "a time",
+    },
+    "errors.txt": {"timestamp": "a time"},
+    "error.txt": {"timestamp": "a time"},
+}
+"""Fields that are not compared, by the name of their file, and why. The text files hold JSON lines."""
+
+MAX_PARSED_BYTES = 64 << 20
+"""A file above this is an agent's, whatever its name, and compared as it is."""
+MAX_COMPARED_BYTES = 1 << 30
+"""An agent may leave files of any size that take no room."""
+
+
+def left_out() -> list[str]:
+    """The published list, a line for each: what is not compared, and why."""
+    files = [f"{pattern}: {why}" for pattern, why in EXCLUDED_FILES.items()]
+    fields = EXCLUDED_FIELDS.items()
+    return files + [f"{file}, {name}: {why}" for file, names in fields for name, why in names.items()]
+
+
+def differences(left: Path, right: Path) -> list[str]:
+    """One line for each file or field in which two run directories differ; empty when they are the same run."""
+    ours, theirs = _files(left), _files(right)
+    found = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
+    found += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
+    for name in sorted(ours.keys() & theirs.keys()):
+        found += _file_differences(name, ours[name], theirs[name])
+    return found
+
+
+def _files(root: Path) -> dict[str, Path]:
+    """Regular files by their path in the run, those that are excluded aside."""
+    paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
+    return {
+        name: path
+        for name, path in paths.items()
+        if not any(fnmatch.fnmatchcase(name, pattern) for pattern in EXCLUDED_FILES)
+    }
+
+
+def _file_differences(name: str, left: Path, right: Path) -> list[str]:
+    sizes = [path.stat().st_size for path in (left, right)]
+    if min(sizes) > MAX_COMPARED_BYTES:
+        return [f"{name}: {sizes[0]} and {sizes[1]} bytes, too many to compare"]
+    if filecmp.cmp(left, right, shallow=False):
+        return []
+    excluded = EXCLUDED_FIELDS.get(name.rpartition("/")[2])
+    if excluded is None or max(sizes) > MAX_PARSED_BYTES:
+        return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
+    try:
+        ours, theirs = (_parse(name, path.read_bytes()) for path in (left, right))
+        return [
+            f"{name}: {path or 'content'}: {_short(a)} and {_short(b)}"
+            for path, a, b in _value_differences("", ours, theirs)
+            if not any(path == each or path.startswith(f"{each}.") for each in excluded)
+            and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
+        ]
+    except ValueError as error:
+        return [f"{name}: cannot be read: {error}"]
+    except RecursionError:
+        return [
+            f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same, nested too deeply to be read"
+        ]
+
+
+def _parse(name: str, data: bytes) -> Any:
+    if name.endswith(".txt"):
+        return dict(enumerate(map(json.loads, data.splitlines())))
+    return json.loads(data)
+
+
+def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any, Any]]:
+    """Paths at which two JSON values differ, with both values; a missing field differs from every value."""
+    if isinstance(left, dict) and isinstance(right, dict):
+        found = []
+        for key in [*left, *(key for key in right if key not in left)]:
+            below = f"{path}.{key}" if path else str(key)
+            found += _value_differences(below, left.get(key, ...), right.get(key, ...))
+        return found
+    # NaN is no JSON here, so equality is exact.
+    return [] if type(left) is type(right) and left == right else [(path, left, right)]
+
+
+def _short(value: Any) -> str:
+    if value is ...:
+        return "nothing"
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

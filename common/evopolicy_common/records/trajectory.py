@@ -1,0 +1,332 @@
+"""An episode as bytes: what the policy received and returned, and what came of it, step by step.
+
+Rules that this module owns:
+- The same rows give the same bytes; every number comes back bit for bit, NaN and infinities included.
+- Rows are packed in blocks; pictures are compressed one by one as they come, and never lie in memory uncompressed.
+- A block is columns, one for each leaf of the observation: `magic, header, {length, zstd(msgpack block)}…, 0`.
+- Bytes that are not a whole trajectory of this version raise ProtocolError, whatever they are.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.environment import ObservationForm
+from evopolicy_common.messages.episode import Record
+from evopolicy_common.records import columns
+
+MAGIC = b"evotraj1"
+BLOCK_BYTES = 4 << 20
+"""Observations of about so many bytes make a block."""
+PICTURE_BYTES = 4096
+"""Arrays of this size or more are compressed as they come."""
+PICTURES_BLOCK_BYTES = 64 << 20
+"""A block of pictures, uncompressed."""
+BLOCK_ROWS = columns.MAX_ROWS
+MAX_BLOCK_BYTES = 1 << 28
+"""No larger block is made or decoded."""
+MAX_ROWS = 1 << 22
+"""Steps of an episode."""
+MAX_BYTES = 4 << 30
+"""No trajectory is decoded whose blocks and pictures come to more, unpacked. 27,000 frames of Atari are 2.7 GB."""
+MAX_VALUES = 1 << 23
+"""The same for the values in its blocks, arrays counting as one: Python's objects take more than bytes do."""
+_MAX_HEADER_BYTES = 4096
+_UNCOUNTED_BYTES = 4 << 20
+"""The first blocks, up to so many bytes, are decoded without a count of their values."""
+
+_LENGTH = struct.Struct("<I")
+_TERMINATED, _TRUNCATED = 1, 2
+_QUICK_BYTES = 256 << 10
+"""Blocks above this are compressed at level 1: pictures, for which speed matters more."""
+
+
+class Row(NamedTuple):
+    """One step. `obs` is what the policy received before it, `action` what it returned."""
+
+    t: int
+    obs: Any
+    """numpy array, int, str, dict or tuple (nested lists in place of arrays and tuples with `observations` "lists");
+    None when observations are not recorded."""
+    action: Any
+    """As the policy returned it, before repair: array, plain number, string, list, dict, None (a tuple as a list where
+    actions differ in form)."""
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+
+class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
+    """A decoded episode of `n` steps."""
+
+    n: int
+    record: Record
+    """With "actions" there are no observations and no infos, and actions are those played, after repair."""
+    observations: ObservationForm
+    """The form in which the policy received them."""
+    obs: Any
+    """Columns in the shape of the observation: a numpy array (n × the leaf's shape), or a list of strings, for each
+    leaf, in dicts and tuples; None when observations are not recorded or there is no step."""
+    actions: Sequence[Any] | NDArray[Any]
+    """n actions; an array (n × shape) where all are arrays of one shape and dtype, else a list."""
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    infos: list[dict[str, Any]]
+    obs_at: Callable[[int], Any]
+    """The observation of one step, as `Row.obs`."""
+
+    def rows(self) -> Iterator[Row]:
+        """The steps in order."""
+        arrays = isinstance(
+            self.actions, np.ndarray
+        )  # of which indexing makes scalars where they have no axes
+        for t in range(self.n):
+            yield Row(
+                t,
+                self.obs_at(t),
+                np.asarray(self.actions[t]) if arrays else self.actions[t],
+                float(self.rewards[t]),
+                bool(self.terminated[t]),
+                bool(self.truncated[t]),
+                self.infos[t] if self.infos else {},
+            )
+
+
+class Recorder:
+    """Takes an episode's steps one by one and packs them. Not thread-safe."""
+
+    def __init__(self, record: Record = "full", observations: ObservationForm = "arrays") -> None:
+        self._full = record == "full"
+        header = columns.encoder.encode({"record": record, "observations": observations})
+        self._parts: list[bytes] = [MAGIC, _LENGTH.pack(len(header)), header]
+        self._block_rows = 0
+        self._n_packed = 0
+        self._pictures: columns.Pictures | None = None
+        self._clear()
+
+    def append(
+        self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
+    ) -> None:
+        """Record one step. `obs` and arrays in `action` are kept, not copied: they must not change afterwards."""
+        if self._full:
+            if not self._rewards:
+                self._begin_block(obs)
+            if self._pictures is None:
+                self._obs.append(obs)
+            elif not self._pictures.add(obs):
+                # Not the shape of those before: a new block, of whatever this is.
+                self._flush()
+                self._begin_block(obs)
+                if self._pictures is None or not self._pictures.add(obs):
+                    self._obs.append(obs)
+            self._infos.append(info)
+        elif not self._rewards:
+            self._block_rows = BLOCK_ROWS
+        self._actions.append(action)
+        self._rewards.append(reward)
+        self._flags.append((terminated and _TERMINATED) | (truncated and _TRUNCATED))
+        if len(self._rewards) >= self._block_rows:
+            self._flush()
+
+    def finish(self) -> bytes:
+        """The trajectory's bytes. The recorder is not used afterwards."""
+        if self._rewards:
+            self._flush()
+        return b"".join([*self._parts, _LENGTH.pack(0)])
+
+    def _begin_block(self, obs: Any) -> None:
+        """Decided by the block's first row alone, so that equal rows give equal bytes."""
+        size = max(1, _size(obs))
+        is_picture = isinstance(obs, np.ndarray) and size >= PICTURE_BYTES
+        self._pictures = columns.Pictures(obs) if is_picture else None
+        self._block_rows = max(
+            1, min(BLOCK_ROWS, (PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES) // size)
+        )
+
+    def _clear(self) -> None:
+        self._pictures = None
+        self._obs: list[Any] = []
+        self._actions: list[Any] = []
+        self._rewards: list[float] = []
+        self._flags = bytearray()
+        self._infos: list[dict[str, Any]] = []
+
+    def _flush(self) -> None:
+        block = {
+            "obs": self._pack_observations() if self._full else None,
+            "actions": columns.pack(self._actions),
+            "rewards": np.array(self._rewards, dtype="<f8").tobytes(),
+            "flags": bytes(self._flags),
+            "infos": self._infos if any(self._infos) else len(self._infos),
+        }
+        packed = columns.encode(block)
+        self._n_packed += len(self._rewards)
+        if len(packed) > MAX_BLOCK_BYTES or self._n_packed > MAX_ROWS:
+            raise ProtocolError(
+                f"an episode of {self._n_packed:,} steps with a block of {len(packed):,} bytes cannot be recorded;"
+                f" {MAX_ROWS:,} and {MAX_BLOCK_BYTES:,} are the limits"
+            )
+        level = 1 if len(packed) > _QUICK_BYTES else 3
+        compressed = zstandard.ZstdCompressor(level=level).compress(packed)
+        self._parts += [_LENGTH.pack(len(compressed)), compressed]
+        self._clear()
+
+    def _pack_observations(self) -> list[Any]:
+        return columns.pack(self._obs) if self._pictures is None else self._pictures.packed()
+
+
+def decode(data: bytes) -> Trajectory:
+    """The episode in `data`; ProtocolError when it is none."""
+    try:
+        return _decode(data)
+    except (
+        msgspec.DecodeError,
+        zstandard.ZstdError,
+        struct.error,
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        IndexError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+    ) as error:
+        raise ProtocolError(f"{len(data)} bytes are not a trajectory: {error}") from error
+
+
+def _decode(data: bytes) -> Trajectory:
+    if data[: len(MAGIC)] != MAGIC:
+        raise ValueError("they do not begin with the format's mark")
+    frames = _frames(data)
+    header = columns.decoder.decode(next(frames, b"")[:_MAX_HEADER_BYTES])
+    full = header["record"] == "full"
+    blocks = _blocks(frames, full)
+    lists = header["observations"] == "lists"
+    observed = (
+        columns.join([block.obs for block in blocks if block.obs is not None]) if full and blocks else None
+    )
+    acted = columns.join([block.actions for block in blocks]) if blocks else columns.Values([])
+    flags = np.frombuffer(b"".join(block.flags for block in blocks), dtype=np.uint8)
+    rewards = np.frombuffer(b"".join(block.rewards for block in blocks), dtype="<f8").astype(np.float64)
+    infos = [info for block in blocks for info in block.infos]
+    n = len(rewards)
+    form = _as_lists if lists else _same
+
+    def obs_at(t: int) -> Any:
+        return None if observed is None else form(observed.row(t))
+
+    return Trajectory(
+        n=n,
+        record="full" if full else "actions",
+        observations="lists" if lists else "arrays",
+        obs=None if observed is None else observed.values(),
+        actions=acted.array if isinstance(acted, columns.Arrays) and not acted.scalar else acted.rows(),
+        rewards=rewards,
+        terminated=(flags & _TERMINATED) != 0,
+        truncated=(flags & _TRUNCATED) != 0,
+        infos=infos,
+        obs_at=obs_at,
+    )
+
+
+class _Block(NamedTuple):
+    """The rows of one block."""
+
+    obs: columns.Column | None
+    actions: columns.Column
+    rewards: bytes
+    flags: bytes
+    infos: list[dict[str, Any]]
+
+
+def _blocks(frames: Iterator[bytes], full: bool) -> list[_Block]:
+    """The blocks in `frames`, of which nothing is taken at its word: sizes and counts are held to the limits first."""
+    decompressor = zstandard.ZstdDecompressor()
+    blocks: list[_Block] = []
+    n_bytes = n_values = n_rows = 0
+    for frame in frames:
+        size = zstandard.frame_content_size(frame)
+        if not 0 < size <= min(MAX_BLOCK_BYTES, columns.most_of(frame)):
+            raise ValueError(f"a block of {len(frame)} bytes claims {size}")
+        n_bytes += size
+        packed = decompressor.decompress(frame)
+        if n_bytes > _UNCOUNTED_BYTES:
+            n_values += columns.count_values(packed, MAX_VALUES - n_values)
+        if n_values > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES:,} values")
+        block = columns.decoder.decode(packed)
+        n = len(block["rewards"]) // 8
+        n_rows += n
+        if not 0 < n <= BLOCK_ROWS or n_rows > MAX_ROWS:
+            raise ValueError(f"a block of {n} rows, {n_rows} in all")
+        obs = columns.unpack(block["obs"], pictures=True) if full else None
+        if block["obs"] and block["obs"][0] == "pictures" and isinstance(obs, columns.Arrays):
+            n_bytes += obs.array.nbytes
+        if n_bytes > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES:,} bytes")
+        actions = columns.unpack(block["actions"])
+        infos = block["infos"]
+        if isinstance(infos, int):
+            infos = [{} for _ in range(n)] if infos == n else []
+        lengths = {
+            len(actions),
+            len(block["flags"]),
+            len(infos) if full else n,
+            n if obs is None else len(obs),
+        }
+        if lengths != {n}:
+            raise ValueError(f"columns of {n} rows have {sorted(lengths)}")
+        blocks.append(_Block(obs, actions, block["rewards"], block["flags"], infos))
+    return blocks
+
+
+def _frames(data: bytes) -> Iterator[bytes]:
+    at = len(MAGIC)
+    while True:
+        (length,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        if not length:
+            break
+        if at + length > len(data):
+            raise ValueError("cut short")
+        yield data[at : at + length]
+        at += length
+    if at != len(data):
+        raise ValueError(f"{len(data) - at} bytes follow the end")
+
+
+def _size(obs: Any) -> int:
+    """Bytes of an observation, roughly."""
+    if isinstance(obs, np.ndarray):
+        return int(obs.nbytes)
+    if isinstance(obs, dict):
+        return sum(map(_size, obs.values()))
+    if isinstance(obs, tuple):
+        return sum(map(_size, obs))
+    return len(obs) if isinstance(obs, str) else 8
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _as_lists(value: Any) -> Any:
+    """What a policy that asked for lists received."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: _as_lists(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_as_lists(item) for item in value]
+    return value

@@ -1,0 +1,1 @@
+"""Requests between processes: keys, encoding, sessions, credentials, refusals."""

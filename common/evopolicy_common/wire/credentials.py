@@ -1,0 +1,200 @@
+"""Who may speak to a cluster, as files: `STATE/credentials/<role>.json`, mode 0600, never an argument or a variable.
+
+The coordinator writes them for its own machine. So that commands there find the cluster they are pointed at, it also
+leaves a copy's path under the user's own registry folder, by endpoint; a command given `--connect ENDPOINT` and no
+credentials file looks there.
+
+Another machine has a folder of its own, from `evopolicy-coordinator certs issue`: such a file beside its certificates,
+which it names by paths relative to itself. Wherever credentials are named, the file or its folder may be.
+
+Rule: tokens and results cross a network inside TLS only, unless the file says that its coordinator was started with
+`--insecure-tcp`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import stat
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.records.blobs import digest_of, write_atomically
+
+Role = Literal["worker", "gateway", "operator"]
+MachineRole = Literal["worker", "gateway", "operator", "router"]
+"""What a machine's certificate is issued for: a role, or a router before the coordinator."""
+
+
+class TlsFiles(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Paths of PEM files for mutual TLS between machines; in a file they may be relative to its folder."""
+
+    root_ca: str
+    certificate: str
+    private_key: str
+
+
+class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What one role needs to reach a cluster and to be let in."""
+
+    cluster: str
+    role: Role
+    endpoints: tuple[str, ...]
+    """Zenoh endpoints of the coordinator or of routers before it, such as `tls/10.0.0.5:7447`."""
+    user: str
+    password: str
+    token: str
+    """Worker: join token. Operator: operator token. Gateway: the run's capability; empty in the role's own file."""
+    tls: TlsFiles | None = None
+    insecure_tcp: bool = False
+    """Whether `tcp/` may be spoken beyond this machine: the coordinator's `--insecure-tcp`, which travels with its files."""
+
+
+def default_state_dir() -> Path:
+    """The coordinator's state folder when none is named: `$EVOPOLICY_STATE` or one in the user's state home."""
+    named = os.environ.get("EVOPOLICY_STATE")
+    return Path(named) if named else state_home() / "coordinator"
+
+
+def registry_dir() -> Path:
+    """Where this user's clusters on this machine are found by endpoint."""
+    return state_home() / "clusters"
+
+
+def write(credentials: Credentials, path: Path) -> None:
+    """Writes the file with mode 0600, replacing what was there."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(credentials)), mode=0o600)
+
+
+def read(path: Path) -> Credentials:
+    """The credentials in `path`, its certificates by absolute paths.
+
+    ConfigError when it, or a certificate, is missing, it is malformed, or it or its private key is readable by others.
+    """
+    data = _read_private(path)
+    try:
+        found = msgspec.json.decode(data, type=Credentials)
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"{path} is not a credentials file: {error}") from error
+    if found.tls is None:
+        return found
+    folder = Path(os.path.abspath(path.parent))
+    tls = TlsFiles(
+        root_ca=str(folder / found.tls.root_ca),
+        certificate=str(folder / found.tls.certificate),
+        private_key=str(folder / found.tls.private_key),
+    )
+    for name in (tls.root_ca, tls.certificate):
+        if not Path(name).is_file():
+            raise ConfigError(f"{name}, which {path} names, is not there: copy the whole folder")
+    _read_private(Path(tls.private_key))
+    return msgspec.structs.replace(found, tls=tls)
+
+
+def at(credentials: Credentials, connect: tuple[str, ...]) -> Credentials:
+    """The same with `connect`, if it names any, as its endpoints. ConfigError when these may not be spoken to so."""
+    found = msgspec.structs.replace(credentials, endpoints=connect) if connect else credentials
+    check_endpoints(found)
+    return found
+
+
+def check_endpoints(credentials: Credentials) -> None:
+    """ConfigError for an endpoint that would carry secrets in the clear, or that needs certificates which are not there."""
+    for endpoint in credentials.endpoints:
+        protocol = endpoint.partition("/")[0]
+        if protocol == "tls":
+            if credentials.tls is None:
+                raise ConfigError(
+                    f"{endpoint}: these credentials have no certificate; use a folder made by"
+                    f" `evopolicy-coordinator certs issue {credentials.role} NAME`"
+                )
+        elif not (stays_on_machine(endpoint) or (protocol == "tcp" and credentials.insecure_tcp)):
+            raise ConfigError(
+                f"{endpoint} would carry tokens in the clear; use tls/HOST:PORT and a folder made by"
+                f" `evopolicy-coordinator certs issue {credentials.role} NAME`"
+            )
+
+
+def stays_on_machine(endpoint: str) -> bool:
+    """Whether what is sent to a Zenoh endpoint cannot leave this machine: a unix socket, or tcp to a loopback address."""
+    protocol, _, rest = endpoint.partition("/")
+    if protocol != "tcp":
+        return protocol == "unixsock-stream"
+    host = re.split("[?#]", rest)[0].rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def publish(endpoints: tuple[str, ...], folder: Path) -> None:
+    """Tells this user's commands that the credentials of these endpoints lie in `folder`."""
+    registry = registry_dir()
+    registry.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for endpoint in endpoints:
+        write_atomically(_registered(endpoint), str(folder.resolve()).encode(), mode=0o600, durable=False)
+
+
+def withdraw(endpoints: tuple[str, ...]) -> None:
+    """Takes `publish` back; what is not there is no error."""
+    for endpoint in endpoints:
+        _registered(endpoint).unlink(missing_ok=True)
+
+
+def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) -> Credentials:
+    """The credentials that a command uses, with its `--connect` endpoints put in place of the file's.
+
+    Looks at `file` if one is named (or, when that is a folder, at the role's file in it), else at the registry for the
+    endpoints, else at the default state folder. ConfigError says where it looked and what to do.
+    """
+    if file is not None and file.is_dir():
+        held = ", ".join(sorted(path.stem for path in file.glob("*.json"))) or "none"
+        file = file / f"{role}.json"
+        if not file.exists():
+            raise ConfigError(f"{file.parent} holds no {role} credentials (roles there: {held})")
+    if file is None:
+        folder = next(filter(None, map(_folder_of, connect)), None)
+        file = (folder or default_state_dir() / "credentials") / f"{role}.json"
+        if not file.exists():
+            where = f" for {', '.join(connect)}" if connect else ""
+            raise ConfigError(
+                f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or copy"
+                f" a folder here that its `certs issue {role} NAME` made, and name it with --credentials"
+            )
+    found = read(file)
+    if found.role != role:
+        raise ConfigError(f"{file} holds credentials of role {found.role!r}; this command needs {role!r}")
+    return at(found, connect)
+
+
+def _read_private(path: Path) -> bytes:
+    try:
+        mode = path.stat().st_mode
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read credentials {path}: {error.strerror}") from error
+    if stat.S_IMODE(mode) & 0o077:
+        raise ConfigError(
+            f"credentials {path} may be read by others (mode {stat.S_IMODE(mode):04o}): chmod 600 it"
+        )
+    return data
+
+
+def state_home() -> Path:
+    """Where this user's lasting files are that no command was told a place for."""
+    home = os.environ.get("XDG_STATE_HOME")
+    return (Path(home) if home else Path.home() / ".local" / "state") / "evopolicy"
+
+
+def _registered(endpoint: str) -> Path:
+    return registry_dir() / digest_of(endpoint.encode())[:32]
+
+
+def _folder_of(endpoint: str) -> Path | None:
+    path = _registered(endpoint)
+    return Path(path.read_text()) if path.exists() else None

@@ -1,0 +1,137 @@
+"""Typed requests to the coordinator, with patience: what workers, gateways and operators ask through.
+
+Every request of ours may be sent again, so an answer that does not come is asked for again, with back-off, until it does
+or the caller's patience ends. A refusal is an answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Generic, TypeVar
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
+from evopolicy_common.messages.operator import OperatorReply
+from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.processes.notices import AFTER_S, told_if_slow
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.transport import Link
+
+Reply = TypeVar("Reply")
+Wanted = TypeVar("Wanted")
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+FIRST_PAUSE_S = 0.05
+LONGEST_PAUSE_S = 0.5
+"""So that whoever waits goes on within a second of the coordinator's return."""
+ANSWER_S = 5.0
+"""How long one request may go unanswered before it is sent again, beyond the time that a long poll asks for."""
+WARN_AFTER_S = 10.0
+"""A request that has waited so long is logged, and again each time that it has waited twice as long."""
+
+
+class Requester(Generic[Reply]):
+    """Asks one speaker's requests over a link."""
+
+    def __init__(
+        self, link: Link, key_of: Callable[[str], str], replies: msgspec.msgpack.Decoder[Reply]
+    ) -> None:
+        """`key_of` makes a verb (`lease`, `submit`) the full key; `replies` decodes this speaker's answers."""
+        self._link = link
+        self._key_of = key_of
+        self._replies = replies
+
+    async def once(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
+        """The answer to one sending.
+
+        `wait_s` is how long the message itself asks the coordinator to wait. Raises RefusedError, TransportError when no answer came, ProtocolError for another answer.
+        """
+        with told_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
+            answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
+        return expect(codec.decode(self._replies, answer), wanted)
+
+    async def until_answered(
+        self,
+        verb: str,
+        message: Message,
+        wanted: type[Wanted],
+        *,
+        wait_s: float = 0.0,
+        patience_s: float | None = None,
+    ) -> Wanted:
+        """`once`, sent again until answered; TransportError when `patience_s` seconds went by without (None: never)."""
+        pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
+        started = time.monotonic()
+        while True:
+            try:
+                return await self.once(verb, message, wanted, wait_s=wait_s)
+            except TransportError as error:
+                waited = time.monotonic() - started
+                if patience_s is not None and waited > patience_s:
+                    raise
+                if waited > warn_after_s:
+                    warn_after_s = 2.0 * waited
+                    log.warning(
+                        "still waiting for the coordinator", verb=verb, waited_s=round(waited), why=str(error)
+                    )
+            await asyncio.sleep(pause * random.uniform(0.5, 1.5))
+            pause = min(LONGEST_PAUSE_S, pause * 2)
+
+    async def upload(self, sender: str, token: str, digest: str, data: bytes) -> None:
+        """Brings a blob to the coordinator in acknowledged chunks; what it already has is not sent again.
+
+        ProtocolError when it is larger than a blob may be.
+        """
+        if len(data) > codec.MAX_BLOB_BYTES:
+            raise ProtocolError(f"a blob of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
+        offset = 0
+        while True:
+            chunk = data[offset : offset + codec.CHUNK_BYTES]
+            ack = await self.until_answered(
+                "blob",
+                BlobPut(sender=sender, token=token, digest=digest, size=len(data), offset=offset, data=chunk),
+                BlobAck,
+            )
+            if ack.have >= len(data):
+                return
+            offset = ack.have
+
+    async def download(self, sender: str, token: str, digest: str) -> bytes:
+        """A blob from the coordinator, checked against its digest; ProtocolError when it is another, or too large."""
+        data = bytearray()
+        while True:
+            chunk = await self.until_answered(
+                "blob", BlobGet(sender=sender, token=token, digest=digest, offset=len(data)), BlobChunk
+            )
+            if chunk.size > codec.MAX_BLOB_BYTES:
+                raise ProtocolError(
+                    f"blob {digest} of {chunk.size:,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit"
+                )
+            data += chunk.data
+            if len(data) >= chunk.size or not chunk.data:
+                break
+        if len(data) != chunk.size or digest_of(bytes(data)) != digest:
+            raise ProtocolError(f"blob {digest} arrived damaged ({len(data)} of {chunk.size} bytes)")
+        return bytes(data)
+
+
+def operator_requests(link: Link) -> Requester[OperatorReply]:
+    """An operator's requests to the cluster of that link."""
+    return Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
+
+
+def expect(reply: object, wanted: type[Wanted]) -> Wanted:
+    """`reply` if it is a `wanted`; RefusedError when it is one, ProtocolError for any other message."""
+    if isinstance(reply, wanted):
+        return reply
+    if isinstance(reply, Refused):
+        raise RefusedError(reply.status, reply.message)
+    raise ProtocolError(f"expected {wanted.__name__}, got {type(reply).__name__}")

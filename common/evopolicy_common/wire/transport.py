@@ -1,0 +1,495 @@
+"""Zenoh sessions and the one pattern this project speaks over them: a query with one reply.
+
+Rules that this module keeps for everybody:
+- callbacks of Zenoh run on its threads and only hand over to the event loop;
+- nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire everyone's leases;
+- every declaration is held by an object, since dropping it undeclares it;
+- scouting is off and the admin space closed; who may say what is `access_control` below;
+- between machines it is mutual TLS: a machine has a certificate, a user name and a password of its own, and its rights
+  only where the certificate's common name and the user name are both its identity;
+- never fork a process that has a session open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import structlog
+import zenoh
+
+from evopolicy_common.errors import TransportError
+from evopolicy_common.processes.notices import told_if_slow
+from evopolicy_common.wire import keys
+from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+MAX_MESSAGE_BYTES = 16 << 20
+_REPLY_LANES = 8
+_CLOSE_S = 3.0
+STUCK_S = 2.0
+"""How much later than it should a session may end a query, before it is taken to be stuck."""
+
+
+class IncomingQuery:
+    """A request to be answered once, from any coroutine or thread."""
+
+    __slots__ = ("_query", "_server", "arrived", "key", "payload")
+
+    def __init__(self, server: Server, query: zenoh.Query) -> None:
+        self._server = server
+        self._query: zenoh.Query | None = query
+        self.arrived = time.monotonic()
+        """When it came in, however late the event loop gets to it."""
+        self.key = str(query.key_expr)
+        self.payload = bytes(query.payload) if query.payload is not None else b""
+
+    def reply(self, payload: bytes, lane: int = 0) -> None:
+        """Sends the one answer, off the event loop. Answers of one lane go in order; a stalled peer stalls its lane."""
+        query, self._query = self._query, None
+        if query is not None:
+            self._server.send(lane, query, self.key, payload)
+
+    def drop(self) -> None:
+        """Ends the query without an answer: the asker hears so at once."""
+        query, self._query = self._query, None
+        if query is not None:
+            query.drop()  # type: ignore[no-untyped-call]
+
+
+class Server:
+    """A listening session whose queries arrive on the event loop in batches. Made by `serve`."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        loop: asyncio.AbstractEventLoop,
+        on_queries: Callable[[list[IncomingQuery]], None],
+    ) -> None:
+        self._session = session
+        self._loop = loop
+        self._on_queries = on_queries
+        self._inbox: deque[IncomingQuery] = deque()
+        self._scheduled = False
+        self._lock = threading.Lock()
+        self._held: list[Any] = []
+        self._lanes: list[queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]] = []
+        for index in range(_REPLY_LANES):
+            lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None] = queue.SimpleQueue()
+            threading.Thread(target=_send_replies, args=(lane,), name=f"reply-{index}", daemon=True).start()
+            self._lanes.append(lane)
+
+    def declare(self, expressions: Iterable[str]) -> None:
+        """Answers queries on these key expressions from now on."""
+        for expression in expressions:
+            self._held.append(self._session.declare_queryable(expression, self._arrived, complete=True))
+
+    def watch_liveliness(self, expression: str, on_change: Callable[[str, bool], None]) -> None:
+        """Calls `on_change(key, alive)` on the event loop as liveliness tokens come and go."""
+
+        def changed(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self._loop.call_soon_threadsafe(on_change, str(sample.key_expr), alive)
+
+        self._held.append(self._session.liveliness().declare_subscriber(expression, changed, history=True))
+
+    def send(self, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
+        """Answers a query from the thread of its lane; the event loop never sends."""
+        self._lanes[lane % _REPLY_LANES].put((query, key, payload))
+
+    def close(self) -> None:
+        """Takes no more queries. What waits in a lane may go unanswered; the asker asks again."""
+        for lane in self._lanes:
+            lane.put(None)
+        self._held.clear()
+        _close(self._session)
+
+    def _arrived(self, query: zenoh.Query) -> None:
+        incoming = IncomingQuery(self, query)
+        with self._lock:
+            self._inbox.append(incoming)
+            if self._scheduled:
+                return
+            self._scheduled = True
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        with self._lock:
+            batch = list(self._inbox)
+            self._inbox.clear()
+            self._scheduled = False
+        self._on_queries(batch)
+
+
+class Link:
+    """A client's session. Made by `connect`; reconnects by itself for as long as it is open."""
+
+    def __init__(self, session: zenoh.Session, credentials: Credentials) -> None:
+        self.credentials = credentials
+        self._session = session
+        self._sender = ThreadPoolExecutor(max_workers=4, thread_name_prefix="ask")
+        self._held: list[Any] = []
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is linked now; a hint for messages to people."""
+        return bool(self._session.info.routers_zid())
+
+    async def ask(self, key: str, payload: bytes, timeout_s: float) -> bytes:
+        """The answer to one query.
+
+        Raises TransportError when none came in `timeout_s` seconds, or at once when nobody answers on that key or the
+        access rules forbid it. The request may have been carried out all the same: all requests of ours are safe to
+        send again.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[bytes | None] = loop.create_future()
+
+        def settle(value: bytes | None) -> None:
+            if not future.done():
+                future.set_result(value)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                _post(loop, settle, bytes(reply.ok.payload))
+
+        def on_drop() -> None:
+            _post(loop, settle, None)
+
+        send = partial(
+            self._session.get,
+            key,
+            zenoh.handlers.Callback(on_reply, on_drop),
+            payload=payload,
+            timeout=timeout_s,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        try:
+            await loop.run_in_executor(self._sender, send)
+            # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck. Not `wait_for`,
+            # which in Python 3.11 swallows a cancellation that comes together with the answer.
+            async with asyncio.timeout(timeout_s + STUCK_S):
+                answer = await future
+        except (zenoh.ZError, TimeoutError, RuntimeError) as error:
+            raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
+        if answer is None:
+            raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+        return answer
+
+    def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
+        """`ask` for a thread of its own, such as the heartbeat's."""
+        try:
+            replies = self._session.get(
+                key, payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload)
+        except zenoh.ZError as error:
+            raise TransportError(f"no answer on {_verb(key)}: {error}") from error
+        raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+
+    def declare_alive(self, key: str) -> None:
+        """Holds a liveliness token on `key` for as long as this link is open."""
+        self._held.append(self._session.liveliness().declare_token(key))
+
+    def close(self) -> None:
+        """Gives the session back. Questions that wait get no answer."""
+        self._held.clear()
+        self._sender.shutdown(wait=False, cancel_futures=True)
+        _close(self._session)
+
+    def _where(self) -> str:
+        return ", ".join(self.credentials.endpoints)
+
+
+@contextlib.asynccontextmanager
+async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -> AsyncIterator[Link]:
+    """A client session, open inside the `async with`.
+
+    Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
+    a wrong password looks like: the router does not say.
+    """
+    with told_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
+        session = await _open_client(credentials, timeout_s)
+    link = Link(session, credentials)
+    try:
+        yield link
+    finally:
+        await asyncio.to_thread(link.close)
+
+
+@contextlib.asynccontextmanager
+async def serve(
+    config: zenoh.Config, on_queries: Callable[[list[IncomingQuery]], None]
+) -> AsyncIterator[Server]:
+    """A listening session made from `server_config`, open inside the `async with`; `declare` what it answers."""
+    try:
+        session = await asyncio.to_thread(zenoh.open, config)
+    except zenoh.ZError as error:
+        raise TransportError(f"cannot listen: {error}") from error
+    server = Server(session, asyncio.get_running_loop(), on_queries)
+    try:
+        yield server
+    finally:
+        await asyncio.to_thread(server.close)
+
+
+def client_config(credentials: Credentials) -> zenoh.Config:
+    """The configuration of a worker's, gateway's or operator's session; ConfigError as `check_endpoints` says."""
+    check_endpoints(credentials)
+    return _config(
+        {
+            **_COMMON,
+            "mode": "client",
+            "connect/endpoints": list(credentials.endpoints),
+            # One attempt: opening a client blocks its thread until it is in, so the patience is `connect`'s.
+            "connect/timeout_ms": 0,
+            "transport/auth/usrpwd/user": credentials.user,
+            "transport/auth/usrpwd/password": credentials.password,
+            **_tls(credentials.tls, "connect"),
+        }
+    )
+
+
+def server_config(
+    cluster: str, listen: Iterable[str], passwords: Path, users: dict[Role, str]
+) -> zenoh.Config:
+    """The configuration of the coordinator's session for its own machine: a router that lets in who is in `passwords`.
+
+    `passwords` holds a line `user:password` each; `users` tells the user name of each role, and the role its rights.
+    """
+    return _router_config(listen, passwords, access_control(cluster, users))
+
+
+def tls_server_config(
+    cluster: str,
+    listen: Iterable[str],
+    passwords: Path,
+    machines: Iterable[tuple[MachineRole, str]],
+    tls: TlsFiles,
+) -> zenoh.Config:
+    """The configuration of the coordinator's session for other machines, over mutual TLS.
+
+    `machines` are roles and identities, as they stand in certificates and, as user names, in the file `passwords`.
+    """
+    settings = _router_config(listen, passwords, machine_access_control(cluster, machines))
+    for key, value in _tls(tls, "listen").items():
+        settings.insert_json5(key, json.dumps(value))
+    return settings
+
+
+def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
+    """Zenoh's access rules: each role asks on its own keys and hears the answers, and nothing else.
+
+    `declare_queryable` goes out to clients only: were it let in, one gateway could answer another's queries.
+    """
+    subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
+    return _access_control(cluster, subjects, [(role, role) for role in users])
+
+
+def machine_access_control(
+    cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
+) -> dict[str, Any]:
+    """`access_control` of a session over TLS: each machine with its own name, of certificate and user alike.
+
+    A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to hold them to these rules.
+    `uplink`: the common name of what such a router itself connects to, where questions go and answers come from.
+    """
+    listed = list(machines)
+    subjects = [
+        {"id": name, "usernames": [name], "cert_common_names": [name], "link_protocols": ["tls"]}
+        for _, name in listed
+    ]
+    rights = _access_control(cluster, subjects, [(name, role) for role, name in listed])
+    if uplink is not None:
+        opposite = {"ingress": "egress", "egress": "ingress"}
+        mirrored = [
+            {**rule, "id": f"{rule['id']}_above", "flows": [opposite[flow] for flow in rule["flows"]]}
+            for rule in rights["rules"]
+        ]
+        # Who is connected to names no user: it is known by its certificate alone.
+        above = {"id": "uplink", "cert_common_names": [uplink], "link_protocols": ["tls"]}
+        rights["subjects"].append(above)
+        rights["policies"].append({"subjects": ["uplink"], "rules": [rule["id"] for rule in mirrored]})
+        rights["rules"] += mirrored
+    return rights
+
+
+def site_router_settings(
+    cluster: str,
+    listen: Iterable[str],
+    passwords: Path,
+    machines: Iterable[tuple[MachineRole, str]],
+    tls: TlsFiles,
+    connect_to: Iterable[str],
+    uplink: str,
+    user: str,
+    password: str,
+) -> dict[str, Any]:
+    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, one way up to `uplink`.
+
+    `user` and `password` are its own; `passwords` and the files of `tls` are paths on its host.
+    """
+    return {
+        **_COMMON,
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect_to),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "transport/auth/usrpwd": {"user": user, "password": password, "dictionary_file": str(passwords)},
+        **_tls(tls, "listen"),
+        **_tls(tls, "connect"),
+        "access_control": machine_access_control(cluster, machines, uplink),
+    }
+
+
+def _access_control(
+    cluster: str, subjects: list[dict[str, Any]], roles: list[tuple[str, MachineRole]]
+) -> dict[str, Any]:
+    asks: dict[Role, str] = {
+        "worker": keys.worker_expr(cluster),
+        "gateway": keys.gateway_expr(cluster),
+        "operator": keys.operator_expr(cluster),
+    }
+    rules = []
+    for role, expression in asks.items():
+        rules.append(_rule(f"{role}_asks", ["query"], "ingress", expression))
+        rules.append(_rule(f"{role}_hears", ["reply", "declare_queryable"], "egress", expression))
+    rules.append(_rule("worker_lives", ["liveliness_token"], "ingress", keys.liveliness_expr(cluster)))
+    granted: dict[MachineRole, list[str]] = {role: [f"{role}_asks", f"{role}_hears"] for role in asks}
+    granted["worker"].append("worker_lives")
+    granted["router"] = [str(rule["id"]) for rule in rules]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": [{"subjects": [subject], "rules": granted[role]} for subject, role in roles],
+    }
+
+
+def _router_config(listen: Iterable[str], passwords: Path, rights: dict[str, Any]) -> zenoh.Config:
+    return _config(
+        {
+            **_COMMON,
+            "mode": "router",
+            "listen/endpoints": list(listen),
+            "transport/auth/usrpwd/dictionary_file": str(passwords),
+            "access_control": rights,
+        }
+    )
+
+
+_COMMON: dict[str, Any] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+    "adminspace": {"enabled": False},
+    # A router that went is looked for by Zenoh itself: so often that whoever it served is back within a second.
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+}
+
+
+def _rule(name: str, messages: list[str], flow: str, expression: str) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "messages": messages,
+        "flows": [flow],
+        "key_exprs": [expression],
+    }
+
+
+def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:
+    if tls is None:
+        return {}
+    prefix = "transport/link/tls"
+    return {
+        f"{prefix}/root_ca_certificate": tls.root_ca,
+        f"{prefix}/{side}_certificate": tls.certificate,
+        f"{prefix}/{side}_private_key": tls.private_key,
+        f"{prefix}/enable_mtls": True,
+        f"{prefix}/verify_name_on_connect": True,
+        # An open link ends with the certificate that it was opened with.
+        f"{prefix}/close_link_on_expiration": True,
+    }
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+async def _open_client(credentials: Credentials, timeout_s: float | None) -> zenoh.Session:
+    config = client_config(credentials)
+    loop = asyncio.get_running_loop()
+    deadline = None if timeout_s is None else loop.time() + timeout_s
+    pause = 0.02
+    while True:
+        try:
+            return await asyncio.to_thread(zenoh.open, config)
+        except zenoh.ZError as error:
+            if deadline is not None and loop.time() > deadline:
+                doubt = f"are these the {credentials.role} credentials of its state folder?"
+                if credentials.tls is not None:
+                    doubt = f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
+                raise TransportError(
+                    f"no connection to {', '.join(credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
+                    f" there, and {doubt}"
+                ) from error
+        await asyncio.sleep(pause)
+        pause = min(0.5, pause * 1.5)
+
+
+def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None], value: bytes | None) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        loop.call_soon_threadsafe(call, value)
+
+
+def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]) -> None:
+    while (item := lane.get()) is not None:
+        query, key, payload = item
+        try:
+            # The answer is sent as the question was: blocking, never dropped.
+            query.reply(key, payload)
+        except zenoh.ZError:
+            pass  # the asker may be gone: it asks again if not
+        except Exception:
+            # Whatever is wrong with one answer, those behind it are sent.
+            log.exception("an answer cannot be sent", key=key)
+        with contextlib.suppress(Exception):
+            query.drop()  # type: ignore[no-untyped-call]
+        del query, item
+
+
+def _close(session: zenoh.Session) -> None:
+    """Closes the session, but waits no longer than `_CLOSE_S`: with a frozen peer it can take many seconds."""
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]
+
+    closer = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    closer.start()
+    closer.join(_CLOSE_S)
+
+
+def _verb(key: str) -> str:
+    return key.split("/", 3)[-1]

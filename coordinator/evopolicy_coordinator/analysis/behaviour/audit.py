@@ -1,0 +1,144 @@
+"""Audit signals and token accounting of each run (paper, appendix: audit signals, token and cost accounting).
+
+Diagnostics only: none of them is part of a score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from statistics import fmean
+
+import msgspec
+
+from evopolicy_coordinator.analysis.behaviour.edits import classify
+from evopolicy_coordinator.analysis.reading.records import Run
+from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
+
+
+class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
+    """One run."""
+
+    run: str
+    entry: str
+    env: str
+    accepted: int
+    """Submits that were charged."""
+    rejected: int
+    """Requests refused before the snapshot, not charged."""
+    not_ok: int
+    """Accepted submits that are not ok."""
+    invalid_rate: float | None
+    """Invalid-transition rate: accepted submits that are not ok, of all accepted; None without any."""
+    budget: int
+    budget_used: int
+    """Episodes."""
+    episodes_per_submit: float | None
+    """Mean over accepted submits."""
+    failed_episodes: int
+    """Train episodes in which the policy failed."""
+    score_drops: int
+    """Score-bearing submits whose validation mean is below that of the one before."""
+    selected_index: int | None
+    complexity_growth: float | None
+    """AST nodes of the selected source bundle over those of the first score-bearing one."""
+    retries: int
+    turns: int
+    wall_s: float
+    agent_s: float
+    queue_s: float
+    rollout_s: float
+    feedback_s: float
+    finalise_s: float
+    secret_splits: bool
+    """False when the splits came from a small public seed."""
+    jail: str
+    hidden_isolation: str
+    """Whether hidden episodes and agents shared a kernel: `exclusive`, `shared`, `waived`, `unknown`."""
+    hidden_cases: str
+    """`shared`, or `per_run`."""
+
+
+class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean token use of one entry on one environment, in millions of tokens, over the runs that tell."""
+
+    entry: str
+    env: str
+    n_runs: int
+    """Runs whose agent tells its tokens; 0 for a dash in the table."""
+    input_noncached: float | None
+    cache: float | None
+    """Cache read plus cache creation."""
+    output: float | None
+    """Reasoning included."""
+    cost: float | None
+    """US dollars a run; None when any of the runs has no price."""
+
+
+def audit_signals(runs: Iterable[Run]) -> list[AuditSignals]:
+    """One record a run, in the order of `runs`."""
+    return [_signals(run) for run in runs]
+
+
+def _signals(run: Run) -> AuditSignals:
+    transitions = classify(run.submits)
+    scored = run.scored
+    selected = run.selected
+    accepted = len(run.submits)
+    not_ok = sum(submit.status != "ok" for submit in run.submits)
+    growth = None
+    if scored and selected is not None and selected.source is not None and scored[0].source is not None:
+        first = scored[0].source.features.nodes
+        growth = selected.source.features.nodes / first if first else None
+    timing = run.record.timing
+    return AuditSignals(
+        run=run.name,
+        entry=run.entry,
+        env=run.env,
+        accepted=accepted,
+        rejected=len(run.record.rejected_submits),
+        not_ok=not_ok,
+        invalid_rate=not_ok / accepted if accepted else None,
+        budget=run.budget,
+        budget_used=run.submits[-1].consumed if run.submits else 0,
+        episodes_per_submit=fmean(submit.n_episodes for submit in run.submits) if run.submits else None,
+        failed_episodes=sum(submit.n_failed_episodes for submit in run.submits),
+        score_drops=sum(t.val_drop for t in transitions),
+        selected_index=run.record.outcome.best_submit_index,
+        complexity_growth=growth,
+        retries=run.record.agent.retries,
+        turns=run.record.agent.turns,
+        wall_s=timing.wall_s,
+        agent_s=timing.agent_s,
+        queue_s=timing.queue_s,
+        rollout_s=timing.rollout_s,
+        feedback_s=timing.feedback_s,
+        finalise_s=timing.finalise_s,
+        secret_splits=run.record.versions.data_secret,
+        jail=run.record.jail,
+        hidden_isolation=run.record.hidden_isolation,
+        hidden_cases=run.record.experiment_dimensions.hidden_cases,
+    )
+
+
+def token_use(runs: Sequence[Run]) -> list[TokenUse]:
+    """Every (environment, entry) that was played, environments in catalogue order, entries by name."""
+    cells: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        cells.setdefault((run.env, run.entry), []).append(run)
+    place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}
+    keys = sorted(cells, key=lambda key: (place[key[0]], key[1].casefold(), key[1]))
+    return [_token_use(env, entry, cells[env, entry]) for env, entry in keys]
+
+
+def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
+    told = [run.record.agent.tokens for run in runs if run.record.agent.tokens is not None]
+    costs = [tokens.cost for tokens in told if tokens.cost is not None]
+    return TokenUse(
+        entry=entry,
+        env=env,
+        n_runs=len(told),
+        input_noncached=fmean(t.input_noncached for t in told) / 1e6 if told else None,
+        cache=fmean(t.cache_read + t.cache_creation for t in told) / 1e6 if told else None,
+        output=fmean(t.output for t in told) / 1e6 if told else None,
+        cost=fmean(costs) if told and len(costs) == len(told) else None,
+    )

@@ -1,0 +1,1 @@
+"""Run directories in, typed records out."""

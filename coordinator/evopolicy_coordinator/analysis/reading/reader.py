@@ -1,0 +1,292 @@
+"""Run directories in, typed runs out. A damaged or half-finished run is listed with its reason, never a crash.
+
+A run is complete when its `run.json` can be read and says `completed` or `no_ok_submit`. Everything else in the folder
+is read from what the agent saw (`summary.json`) and from the immutable checkpoints; `run.json` alone brings the hidden
+scores. Policies are parsed, never run.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records.run_record import RunRecord, decode_checkpoint_metrics, decode_run_record
+from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
+from evopolicy_coordinator.analysis.behaviour.topology import describe
+from evopolicy_coordinator.analysis.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
+from evopolicy_coordinator.analysis.reading.sources import reachable_modules, read_python_files, source_digest
+
+Files = Mapping[str, bytes]
+
+_SUBMIT = re.compile(r"submit_([0-9]{1,9})")
+_MAX_REASON_CHARS = 1000
+_PARALLEL_FROM = 40
+"""Runs from which reading in several processes pays for starting them."""
+_MAX_RUN_JSON_BYTES = 64 << 20
+_LARGEST = 1e100
+"""No number of a run is larger: sums of squares over many runs stay finite."""
+
+
+class Loaded(msgspec.Struct, frozen=True, kw_only=True):
+    """What `load_runs` found, both in order of path."""
+
+    runs: tuple[Run, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+class UnreadableRunError(Exception):
+    """Why a folder is not a complete run; the message is the reason shown."""
+
+
+def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
+    """Run directories at or under `paths`, sorted, without repeats, and paths under which there is none.
+
+    A folder with a `run.json`, or one that was begun (`workspace/` beside `logs/` or `checkpoints/`), is a run
+    directory, and is not searched further. Links below the given paths are not followed.
+    """
+    found: set[Path] = set()
+    missing: list[LeftOut] = []
+    for path in paths:
+        root = path.resolve()
+        if root.is_file() and root.name == "run.json":
+            found.add(root.parent)
+            continue
+        before = len(found)
+        is_repeat = False
+        for folder, names, files in os.walk(root):
+            begun = "workspace" in names and ("logs" in names or "checkpoints" in names)
+            if "run.json" in files or begun:
+                is_repeat = is_repeat or Path(folder) in found
+                found.add(Path(folder))
+                names.clear()
+            names[:] = [name for name in names if not name.startswith(".")]
+        if len(found) == before and not is_repeat:
+            reason = "no run directory here" if root.is_dir() else "no such folder"
+            missing.append(LeftOut(path=path, reason=reason))
+    return sorted(found), missing
+
+
+def load_runs(
+    paths: Iterable[Path], *, jobs: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Loaded:
+    """All complete runs at or under `paths`, and what is left out with the reason.
+
+    `jobs` processes read in parallel once there is enough to read; `progress` is told (done, total). A run that
+    repeats the entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
+    """
+    folders, left_out = find_run_dirs(paths)
+    runs: list[Run] = []
+    seen: dict[tuple[str, str, str, int], Path] = {}
+    for done, result in enumerate(_read_all(folders, jobs), start=1):
+        if progress is not None:
+            progress(done, len(folders))
+        if isinstance(result, LeftOut):
+            left_out.append(result)
+            continue
+        key = (result.entry, result.env, result.record.exp_id, result.record.repeat)
+        if key in seen:
+            left_out.append(LeftOut(path=result.path, reason=f"repeats the run in {seen[key]}"))
+            continue
+        seen[key] = result.path
+        runs.append(result)
+    return Loaded(runs=tuple(runs), left_out=tuple(left_out))
+
+
+def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
+    if jobs <= 1 or len(folders) < _PARALLEL_FROM:
+        return map(read_or_explain, folders)
+    return _read_parallel(folders, jobs)
+
+
+def _read_parallel(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(read_or_explain, folders, chunksize=8)
+
+
+def read_or_explain(folder: Path) -> Run | LeftOut:
+    """The run in `folder`, or why it is left out."""
+    try:
+        return read_run(folder)
+    except UnreadableRunError as error:
+        return LeftOut(path=folder, reason=str(error))
+    except Exception as error:
+        # Whatever an agent has left behind, the other runs are read.
+        return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}"[:_MAX_REASON_CHARS])
+
+
+def read_run(folder: Path) -> Run:
+    """The complete run in `folder`; UnreadableRunError with the reason when it is none."""
+    record = _read_record(folder)
+    outcome = record.outcome
+    if outcome.status == "error":
+        raise UnreadableRunError(f"the run ended in an error: {outcome.error or 'no reason given'}")
+    if outcome.status == "cancelled":
+        raise UnreadableRunError(f"the run was {outcome.error or 'cancelled'}")
+    if outcome.agent_never_played:
+        raise UnreadableRunError("its agent failed before it used any budget: this is no run of that agent")
+    if outcome.status == "completed":
+        if outcome.final_score is None or not math.isfinite(outcome.final_score):
+            raise UnreadableRunError("run.json says completed, and has no final_score")
+        if outcome.best_submit_index is None:
+            raise UnreadableRunError("run.json says completed, and has no best_submit_index")
+    submits = _read_submits(folder, record)
+    selected = next((submit for submit in submits if submit.index == outcome.best_submit_index), None)
+    if outcome.status == "completed" and selected is None:
+        raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has left nothing behind")
+    run = Run(path=folder, record=record, submits=submits)
+    _check_numbers({"run.json": run.record, "submits": run.submits})
+    return run
+
+
+def _check_numbers(told: Any) -> None:
+    """UnreadableRunError where a number is too large for means over runs: JSON has numbers of any size."""
+    queue: list[tuple[str, Any]] = [("", msgspec.to_builtins(told))]
+    while queue:
+        name, value = queue.pop()
+        if isinstance(value, dict):
+            queue += [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
+        elif isinstance(value, list | tuple):
+            queue += [(name, inner) for inner in value]
+        elif isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
+            raise UnreadableRunError(f"{name}: a number beyond {_LARGEST:g} is none of a run")
+
+
+def _read_record(folder: Path) -> RunRecord:
+    path = folder / "run.json"
+    if not path.is_file():
+        raise UnreadableRunError("half-finished: there is no run.json")
+    if path.stat().st_size > _MAX_RUN_JSON_BYTES:
+        raise UnreadableRunError(f"run.json is larger than {_MAX_RUN_JSON_BYTES >> 20} MiB")
+    try:
+        return decode_run_record(path.read_bytes())
+    except ProtocolError as error:
+        raise UnreadableRunError(f"run.json: {error}") from error
+
+
+def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
+    feedback = folder / (record.artifacts.workspace or "workspace") / "feedback"
+    checkpoints = folder / (record.artifacts.checkpoints or "checkpoints")
+    indices = sorted(_indices(feedback) | _indices(checkpoints))
+    budget = record.experiment_dimensions.episode_budget
+    submits: list[Submit] = []
+    previous: Files | None = None
+    consumed = 0
+    for index in indices:
+        summary = _read_summary(checkpoint_folder(feedback.parent, "feedback", index))
+        checkpoint = checkpoint_folder(folder, record.artifacts.checkpoints or "checkpoints", index)
+        metrics_path = checkpoint / "metrics.json"
+        try:
+            metrics = decode_checkpoint_metrics(metrics_path.read_bytes()) if metrics_path.is_file() else None
+        except ProtocolError as error:
+            raise UnreadableRunError(f"{metrics_path.relative_to(folder)}: {error}") from error
+        if summary is None and metrics is None:
+            raise UnreadableRunError(f"submit {index} has neither summary.json nor metrics.json")
+        status = summary.status if summary is not None else metrics.status if metrics is not None else ""
+        n_episodes = (
+            summary.n_episodes if summary is not None else metrics.n_episodes if metrics is not None else 0
+        )
+        before = consumed
+        if summary is not None:
+            consumed = budget - summary.remaining_budget
+        elif metrics is not None:
+            consumed = metrics.consumed_budget
+        files, source = _read_source(checkpoint) if status == "ok" else (None, None)
+        changed = None if files is None or previous is None else count_changed_lines(previous, files)
+        previous = files if files is not None else previous
+        mean = (
+            summary.mean_return
+            if summary is not None
+            else metrics.mean_return
+            if metrics is not None
+            else None
+        )
+        submits.append(
+            Submit(
+                index=index,
+                status=status,
+                n_episodes=n_episodes,
+                consumed_before=before,
+                consumed=consumed,
+                mean_return=mean,
+                std_return=summary.std_return if summary is not None else None,
+                val_mean=record.outcome.val_scores.get(str(index)),
+                n_failed_episodes=len(summary.errors or ()) if summary is not None else 0,
+                started_at=summary.submit_started_at if summary is not None else "",
+                completed_at=summary.submit_completed_at if summary is not None else "",
+                wall_s=summary.wall_time_seconds if summary is not None else 0.0,
+                bundle_digest=metrics.digest if metrics is not None else "",
+                source=source,
+                changed_lines=changed,
+            )
+        )
+    return tuple(submits)
+
+
+def _indices(folder: Path) -> set[int]:
+    if not folder.is_dir():
+        return set()
+    matches = (_SUBMIT.fullmatch(child.name) for child in folder.iterdir())
+    return {int(match[1]) for match in matches if match}
+
+
+def _read_summary(folder: Path) -> Summary | None:
+    path = folder / "summary.json"
+    if not path.is_file():
+        return None
+    try:
+        return decode_summary(path.read_bytes())
+    except ProtocolError as error:
+        raise UnreadableRunError(f"{folder.name}/summary.json: {error}") from error
+
+
+_described: OrderedDict[str, Source] = OrderedDict()
+_MAX_DESCRIBED = 4096
+
+
+def _read_source(checkpoint: Path) -> tuple[Files | None, Source | None]:
+    system = checkpoint / "system"
+    if not system.is_dir():
+        return None, None
+    return describe_files(read_python_files(system))
+
+
+def describe_files(files: Files) -> tuple[Files, Source | None]:
+    """The reachable source files of a bundle's Python files, and what is kept of them; None without a `policy.py`.
+
+    Remembers recent bundles: retests and policies that several runs share are parsed once.
+    """
+    modules = reachable_modules(files)
+    reached = {module.path: module.source for module in modules.values()}
+    if not modules:
+        return reached, None
+    digest = source_digest(modules)
+    known = _described.get(digest)
+    if known is None:
+        topology, features = describe(modules)
+        known = _described[digest] = Source(
+            digest=digest, topology=topology, features=features, files=tuple(sorted(reached))
+        )
+        if len(_described) > _MAX_DESCRIBED:
+            _described.popitem(last=False)
+    return reached, known
+
+
+def count_changed_lines(before: Files, after: Files) -> int:
+    """Lines removed plus lines added between two source bundles, file by file; a renamed file counts as both."""
+    changed = 0
+    for path in sorted({*before, *after}):
+        old, new = before.get(path, b""), after.get(path, b"")
+        if old != new:
+            changed += n_changed(old.splitlines(), new.splitlines())
+    return changed

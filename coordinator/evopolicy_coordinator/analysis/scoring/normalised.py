@@ -1,0 +1,73 @@
+"""Held-out performance on the random-to-best scale (paper, mechanism section, formula of `norm`).
+
+`norm = clip((R − R_random)/(R_best − R_random), 0, 1)`, where `R_best` is the best agent on that environment: the
+random reference itself is never the best. Where no agent beats random, or there is no reference, there is no scale and
+the value is None. A diagnostic scale, apart from the rank-based score.
+"""
+
+from __future__ import annotations
+
+from statistics import fmean
+
+import msgspec
+
+from evopolicy_coordinator.analysis.behaviour.edits import demand_of
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable
+
+DEMANDS = ("synthesis", "tuning")
+
+
+class NormalisedCell(msgspec.Struct, frozen=True, kw_only=True):
+    """One agent on one environment."""
+
+    entry: str
+    env: str
+    value: float | None
+    """In [0, 1]; None without a scale, or when the agent has no score."""
+
+
+class GroupMean(msgspec.Struct, frozen=True, kw_only=True):
+    """Macro mean of one agent over the environments of one demand group."""
+
+    entry: str
+    demand: str
+    value: float | None
+    n_environments: int
+    """Environments that have a value, and are averaged."""
+
+
+class Normalised(msgspec.Struct, frozen=True, kw_only=True):
+    """Normalised performance of a set of agents."""
+
+    cells: dict[tuple[str, str], NormalisedCell]
+    """By (entry, env), agents only."""
+    groups: tuple[GroupMean, ...]
+
+
+def normalise(score: float | None, random: float | None, best: float | None) -> float | None:
+    """The formula; None when a value is missing or `best ≤ random`."""
+    if score is None or random is None or best is None or best <= random:
+        return None
+    return min(1.0, max(0.0, (score - random) / (best - random)))
+
+
+def normalised(table: ScoreTable) -> Normalised:
+    """Every agent of `table` on every environment that it played, and the means of the two demand groups."""
+    cells: dict[tuple[str, str], NormalisedCell] = {}
+    for env in table.environments:
+        column = table.column(env)
+        anchor = column.pop(table.reference, None) if table.reference is not None else None
+        best = max((value for value in column.values() if value is not None), default=None)
+        for entry, value in column.items():
+            cells[entry, env] = NormalisedCell(entry=entry, env=env, value=normalise(value, anchor, best))
+    groups: list[GroupMean] = []
+    for demand in DEMANDS:
+        for entry in table.agents:
+            values = [
+                cell.value
+                for cell in cells.values()
+                if cell.entry == entry and demand_of(cell.env) == demand and cell.value is not None
+            ]
+            mean = fmean(values) if values else None
+            groups.append(GroupMean(entry=entry, demand=demand, value=mean, n_environments=len(values)))
+    return Normalised(cells=cells, groups=tuple(groups))

@@ -1,0 +1,32 @@
+"""The paper's own tables, as package data: what the scoring is tested against. `data/SOURCE.md` names each source."""
+
+from __future__ import annotations
+
+import csv
+import io
+from importlib.resources import files
+
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, read_score_csv
+
+TABLES = (
+    "table1_heldout_returns",
+    "table2_aggregate",
+    "normalised_performance",
+    "code_structure",
+    "edit_types",
+)
+
+
+def text(name: str) -> str:
+    """The CSV text of one of `TABLES`."""
+    return files("evopolicy_coordinator.analysis").joinpath("data", f"{name}.csv").read_text(encoding="utf-8")
+
+
+def heldout_returns() -> ScoreTable:
+    """The paper's table of held-out returns: four agents and the random reference on Core16, one run a cell."""
+    return read_score_csv(text("table1_heldout_returns"), source="table1_heldout_returns.csv")
+
+
+def rows(name: str) -> list[dict[str, str]]:
+    """One of `TABLES` as it is printed, a dict a row."""
+    return list(csv.DictReader(io.StringIO(text(name))))

@@ -1,0 +1,219 @@
+"""Held-out scores by entry and environment: the table that ranking and normalisation start from.
+
+A *cell* is one entry on one environment with the score of each of its runs. The uniform-random reference is an entry
+like the others, marked as such: it is ranked, and it is no agent (paper, appendix on scoring). A cell whose runs had no
+ok submit has the score None and ranks below every number; a cell that was never run is absent.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from statistics import fmean
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError
+from evopolicy_coordinator.analysis.reading.records import Run
+
+RANDOM_ENTRY = "Random policy"
+RANDOM_HARNESS = "Uniform"
+
+
+class Cell(msgspec.Struct, frozen=True, kw_only=True):
+    """One entry's runs on one environment."""
+
+    entry: str
+    env: str
+    scores: tuple[float | None, ...]
+    """Held-out mean return of each run; None for a run with no ok submit."""
+
+    @property
+    def mean(self) -> float | None:
+        """Mean over runs; None when any run of it had no ok submit (there is no number to average that with)."""
+        known = [score for score in self.scores if score is not None]
+        return fmean(known) if known and len(known) == len(self.scores) else None
+
+
+class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
+    """All cells. Entries in order of name, the reference last; environments in catalogue order, others by name."""
+
+    cells: dict[tuple[str, str], Cell]
+    """By (entry, env)."""
+    harness: dict[str, str]
+    """By entry."""
+    reference: str | None
+    """Entry that is the uniform-random reference; None when there is none."""
+
+    @property
+    def entries(self) -> list[str]:
+        """All entries by name, the reference last."""
+        return sorted(self.harness, key=lambda entry: (entry == self.reference, entry.casefold(), entry))
+
+    @property
+    def agents(self) -> list[str]:
+        """Entries without the reference."""
+        return [entry for entry in self.entries if entry != self.reference]
+
+    @property
+    def environments(self) -> list[str]:
+        """All that have a cell, in the catalogue's order."""
+        return ordered_environments(env for _, env in self.cells)
+
+    def column(self, env: str) -> dict[str, float | None]:
+        """Mean of every entry that has a cell for `env`."""
+        return {entry: self.cells[entry, env].mean for entry in self.entries if (entry, env) in self.cells}
+
+    def restricted(self, environments: Sequence[str]) -> ScoreTable:
+        """Only the cells of `environments`, and the entries that have any."""
+        wanted = set(environments)
+        cells = {key: cell for key, cell in self.cells.items() if key[1] in wanted}
+        left = {entry for entry, _ in cells}
+        return ScoreTable(
+            cells=cells,
+            harness={entry: harness for entry, harness in self.harness.items() if entry in left},
+            reference=self.reference if self.reference in left else None,
+        )
+
+
+def ordered_environments(envs: Iterable[str]) -> list[str]:
+    """Distinct suite ids in catalogue order, then unknown ones by name."""
+    order = {env: place for place, env in enumerate(catalogue.entries())}
+    return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
+
+
+def title_of(env: str) -> str:
+    """Short name for tables; the id itself where the catalogue has none."""
+    found = catalogue.entries().get(env)
+    return found.title if found is not None else env
+
+
+def family_of(env: str) -> str:
+    """Family key; `other` for an environment that the catalogue does not know."""
+    found = catalogue.entries().get(env)
+    return found.family if found is not None else "other"
+
+
+def family_title(family: str) -> str:
+    """As it is shown."""
+    return catalogue.families().get(family, family.replace("_", " ").capitalize())
+
+
+def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
+    """Suite name to those of `environments` that are in it (catalogue's first suite that has it); unknown in `other`."""
+    found: dict[str, list[str]] = {}
+    for env in ordered_environments(environments):
+        name = catalogue.suite_of(env).name if env in catalogue.entries() else "other"
+        found.setdefault(name, []).append(env)
+    return found
+
+
+def suite_title(suite: str) -> str:
+    """As it is shown."""
+    known = catalogue.suites().get(suite)
+    return known.title if known is not None else suite.capitalize()
+
+
+def suite_size(suite: str) -> int:
+    """Environments of the whole suite; 0 where it has no definition."""
+    known = catalogue.suites().get(suite)
+    return len(known.environments) if known is not None else 0
+
+
+def score_table(runs: Iterable[Run]) -> ScoreTable:
+    """Cells of the runs, and the random reference from what the runs themselves recorded on their held-out cases."""
+    runs = list(runs)
+    scores: dict[tuple[str, str], list[float | None]] = {}
+    harness: dict[str, set[str]] = {}
+    for run in runs:
+        scores.setdefault((run.entry, run.env), []).append(run.score)
+        harness.setdefault(run.entry, set()).add(run.harness)
+    reference = references(runs)
+    name = RANDOM_ENTRY
+    while name in harness:  # an operator may have called an agent that
+        name += " (reference)"
+    cells = {
+        key: Cell(entry=key[0], env=key[1], scores=tuple(sorted(found, key=_none_first)))
+        for key, found in scores.items()
+    }
+    for env, mean in reference.items():
+        cells[name, env] = Cell(entry=name, env=env, scores=(mean,))
+    named = {entry: ", ".join(sorted(found)) for entry, found in harness.items()}
+    if reference:
+        named[name] = RANDOM_HARNESS
+    return ScoreTable(cells=cells, harness=named, reference=name if reference else None)
+
+
+def references(runs: Iterable[Run]) -> dict[str, float]:
+    """Environment to the mean held-out return of uniform random actions: one number for each held-out split.
+
+    Its actions follow from split and case, so all runs on a split tell the same number. Runs of earlier versions each drew
+    their own: they count only for a split that no newer run has played, with the mean of their numbers. An environment
+    whose runs have several splits gets the mean over the splits.
+    """
+    told: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for run in runs:
+        found = run.record.outcome.random_reference
+        if found is not None and math.isfinite(found.mean_return):
+            by_seeding = told.setdefault(run.env, {}).setdefault(run.record.versions.data_heldout_hash, {})
+            by_seeding.setdefault(found.seeded_by, []).append(found.mean_return)
+    return {
+        env: _one_mean(
+            _one_mean(by_seeding.get("case") or by_seeding["run"]) for by_seeding in splits.values()
+        )
+        for env, splits in told.items()
+    }
+
+
+def _one_mean(values: Iterable[float]) -> float:
+    """Their mean; exactly their value where all are equal."""
+    found = list(values)
+    return found[0] if len(set(found)) == 1 else fmean(found)
+
+
+def _none_first(score: float | None) -> float:
+    return -math.inf if score is None else score
+
+
+def read_score_csv(text: str, *, source: str = "the CSV") -> ScoreTable:
+    """A table `entry,harness,<suite id>,…` with one row an entry, one score a cell, empty where there is none.
+
+    The row with harness `Uniform` is the reference. ConfigError for a file that is not such a table.
+    """
+    reader = csv.reader(io.StringIO(text))
+    header = next(reader, [])
+    if len(header) < 3 or header[:2] != ["entry", "harness"]:
+        raise ConfigError(
+            f"{source} does not start with the columns entry,harness,<environment>…: {header[:3]}"
+        )
+    environments = header[2:]
+    cells: dict[tuple[str, str], Cell] = {}
+    harness: dict[str, str] = {}
+    reference: str | None = None
+    for line, row in enumerate(reader, start=2):
+        if not row:
+            continue
+        if len(row) != len(header) or row[0] in harness:
+            raise ConfigError(
+                f"{source}, line {line}: {len(row)} columns of {len(header)}, or a repeated entry"
+            )
+        harness[row[0]] = row[1]
+        if row[1] == RANDOM_HARNESS:
+            reference = row[0]
+        for env, value in zip(environments, row[2:], strict=True):
+            if value.strip():
+                cells[row[0], env] = Cell(entry=row[0], env=env, scores=(_number(value, source, line),))
+    return ScoreTable(cells=cells, harness=harness, reference=reference)
+
+
+def _number(value: str, source: str, line: int) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigError(f"{source}, line {line}: {value!r} is no score")
+    return number

@@ -1,0 +1,1 @@
+"""The report's tables, as data and as CSV, Markdown and LaTeX."""

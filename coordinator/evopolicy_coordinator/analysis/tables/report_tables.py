@@ -1,0 +1,390 @@
+"""The report's tables, made from a `Study`: the paper's, and the diagnostics beyond them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evopolicy_coordinator.analysis.behaviour import structure
+from evopolicy_coordinator.analysis.behaviour.edits import demand_of
+from evopolicy_coordinator.analysis.scoring.normalised import DEMANDS
+from evopolicy_coordinator.analysis.scoring.ranking import Interval
+from evopolicy_coordinator.analysis.scoring.scores import (
+    family_of,
+    family_title,
+    suite_size,
+    suite_title,
+    title_of,
+)
+from evopolicy_coordinator.analysis.study import Study, Suite
+from evopolicy_coordinator.analysis.tables.run_tables import (
+    ENTRY,
+    ENV,
+    HARNESS,
+    RUN,
+    LinkOf,
+    no_link,
+    one_or_all,
+    tables_of_runs,
+)
+from evopolicy_coordinator.analysis.tables.table import Column, Table, best_marks
+
+_DEMAND = Column(key="demand", title="Demand")
+
+
+def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
+    """Every table of the report in its order; those without rows are left out, except what was left out."""
+    found: list[Table] = []
+    for suite in study.suites:
+        found += [_aggregate(suite, study), _heldout(suite), _cells(suite), _normalised(suite)]
+    found += [
+        _evolution(study, link_of),
+        _edit_types(study),
+        _structure(study),
+        _edit_sizes(study),
+        _tokens(study),
+        *tables_of_runs(study, link_of),
+    ]
+    return [table for table in found if table.rows or table.name == "left_out"]
+
+
+def _span(interval: Interval | None, digits: int) -> str | None:
+    return None if interval is None else f"{interval.low:.{digits}f} to {interval.high:.{digits}f}"
+
+
+def _aggregate(suite: Suite, study: Study) -> Table:
+    families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
+    families = families if len(families) > 1 else []
+    budgets = _budgets(suite, study)
+    whole = suite_size(suite.name) or len(suite.board.environments)
+    rows: list[dict[str, Any]] = [
+        {
+            "entry": row.entry,
+            "harness": row.harness,
+            **{family: row.families.get(family) for family in families},
+            "score": row.score,
+            "score_interval": _span(row.score_interval, 3),
+            "rank": row.rank,
+            "rank_interval": _span(row.rank_interval, 0),
+            "budget": None if row.is_reference else budgets.get(row.entry),
+            "wins": row.wins,
+            "top2": row.top2,
+            "environments": f"{row.n_environments} of {whole}",
+            "runs": None if row.is_reference else row.n_runs,
+        }
+        for row in suite.board.standings
+    ]
+    columns = [ENTRY, HARNESS]
+    columns += [Column(key=family, title=family_title(family), kind="number") for family in families]
+    columns.append(Column(key="score", title=suite_title(suite.name), kind="number"))
+    if any(row.score_interval is not None for row in suite.board.standings):
+        columns.append(Column(key="score_interval", title="95 % interval"))
+        columns.append(Column(key="rank_interval", title="Rank interval"))
+    if budgets:
+        columns.append(Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."))
+    columns += [
+        Column(key="wins", title="Wins", kind="integer", note="Environments on which it ranks first."),
+        Column(
+            key="top2", title="Top-2", kind="integer", note="Environments on which it ranks first or second."
+        ),
+        Column(key="environments", title="Environments"),
+        Column(key="runs", title="Runs", kind="integer"),
+    ]
+    budget = " Budget: train episodes of a run." if budgets else ""
+    caption = (
+        "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank, and "
+        "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
+    )
+    if any(row.score_interval is not None for row in suite.board.standings):
+        caption += " Intervals resample the runs of every cell (percentile bootstrap, 95 %); an entry with a cell of one run has none."
+    return Table(
+        name=f"leaderboard_{suite.name}",
+        title=f"{suite_title(suite.name)} leaderboard",
+        caption=caption,
+        columns=tuple(columns),
+        rows=tuple(rows),
+        marks=best_marks(rows, [*families, "score"]),
+    )
+
+
+def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
+    """Entry to the train episodes that its runs could spend."""
+    found: dict[str, set[int]] = {}
+    for run in study.runs:
+        if run.env in suite.board.environments:
+            found.setdefault(run.entry, set()).add(run.budget)
+    return {entry: one_or_all(sorted(budgets)) for entry, budgets in found.items()}
+
+
+def _heldout(suite: Suite) -> Table:
+    rows: list[dict[str, Any]] = []
+    marks: dict[tuple[int, str], int] = {}
+    for i, standing in enumerate(suite.board.standings):
+        row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
+        for env in suite.board.environments:
+            cell = suite.board.cells.get((standing.entry, env))
+            if cell is not None:
+                row[env] = cell.mean
+                if cell.mean is not None and cell.rank <= 2 and len(suite.board.standings) > 1:
+                    marks[i, env] = cell.rank
+        rows.append(row)
+    columns = [Column(key=env, title=title_of(env), kind="number") for env in suite.board.environments]
+    return Table(
+        name=f"heldout_{suite.name}",
+        title=f"{suite_title(suite.name)} held-out returns",
+        caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
+        "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
+        "that was not run, or a run with no ok submit.",
+        columns=(ENTRY, HARNESS, *columns),
+        rows=tuple(rows),
+        marks=marks,
+    )
+
+
+def _cells(suite: Suite) -> Table:
+    rows = [
+        {
+            "env": title_of(env),
+            "family": family_title(family_of(env)),
+            "entry": cell.entry,
+            "mean": cell.mean,
+            "interval": _span(cell.interval, 3),
+            "runs": cell.n_runs,
+            "rank": cell.rank,
+            "score": cell.score,
+        }
+        for env in suite.board.environments
+        for cell in sorted(
+            (c for (_, e), c in suite.board.cells.items() if e == env),
+            key=lambda c: (c.rank, c.entry.casefold()),
+        )
+    ]
+    return Table(
+        name=f"cells_{suite.name}",
+        title=f"{suite_title(suite.name)} cells",
+        caption="Every entry on every environment: mean over its runs, percentile bootstrap interval of the mean where there are "
+        "at least two, rank and rank score.",
+        columns=(
+            ENV,
+            Column(key="family", title="Family"),
+            ENTRY,
+            Column(key="mean", title="Held-out mean", kind="number"),
+            Column(key="interval", title="95 % interval"),
+            Column(key="runs", title="Runs", kind="integer"),
+            Column(key="rank", title="Rank", kind="integer"),
+            Column(key="score", title="Rank score", kind="number"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _normalised(suite: Suite) -> Table:
+    agents = suite.table.agents
+    cells = suite.normalised.cells
+    groups = {(group.entry, group.demand): group for group in suite.normalised.groups}
+    rows: list[dict[str, Any]] = []
+    bold: dict[tuple[int, str], int] = {}
+    for demand in (*DEMANDS, None):
+        envs = [env for env in suite.table.environments if demand_of(env) == demand]
+        for env in envs:
+            values = {a: cells[a, env].value for a in agents if (a, env) in cells}
+            rows.append({"demand": demand or "neither", "env": title_of(env), **values})
+        if envs and demand is not None:
+            means = {a: groups[a, demand].value for a in agents}
+            bold |= {(len(rows), a): 1 for a in agents}
+            rows.append({"demand": demand, "env": f"{demand.capitalize()} mean", **means})
+    return Table(
+        name=f"normalised_{suite.name}",
+        title=f"{suite_title(suite.name)} normalised performance",
+        caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
+        "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
+        "reference, or no score.",
+        columns=(
+            ENV,
+            _DEMAND,
+            *(Column(key=agent, title=agent, kind="number", digits=2) for agent in agents),
+        ),
+        rows=tuple(rows),
+        marks=bold,
+    )
+
+
+def _evolution(study: Study, link_of: LinkOf) -> Table:
+    rows = [
+        {
+            "env": title_of(found.env),
+            "entry": found.entry,
+            "run": found.run.rsplit(" / ", 1)[-1],
+            "submits": len(found.steps),
+            "best": found.steps[-1].best if found.steps else None,
+            "improvements": found.n_improvements,
+            "area": found.area,
+            "to_50": found.to_50,
+            "to_80": found.to_80,
+        }
+        for found in study.evolutions
+    ]
+    return Table(
+        name="evolution",
+        title="Score evolution",
+        caption="Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the best "
+        "validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train episodes consumed when the "
+        "curve first gets there. Validation is hidden from agents during the run.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column(key="submits", title="Scored submits", kind="integer"),
+            Column(key="best", title="Best validation mean", kind="number"),
+            Column(
+                key="improvements", title="Improvements", kind="integer", note="Rises after the first score."
+            ),
+            Column(key="area", title="Area", kind="number", digits=2),
+            Column(key="to_50", title="To 50 % (episodes)", kind="integer"),
+            Column(key="to_80", title="To 80 % (episodes)", kind="integer"),
+        ),
+        rows=tuple(rows),
+        links={i: link for i, found in enumerate(study.evolutions) if (link := link_of(found.run))},
+    )
+
+
+def _edit_types(study: Study) -> Table:
+    harness = {run.entry: run.harness for run in study.runs}
+    rows = [
+        {
+            "entry": row.entry,
+            "harness": harness[row.entry],
+            "demand": row.demand,
+            "n_synthesis": row.n_synthesis,
+            "hit_synthesis": row.rate_synthesis,
+            "n_parametric": row.n_parametric,
+            "hit_parametric": row.rate_parametric,
+            "n_rollback": row.n_rollback,
+            "n_retest": row.n_retest,
+            "n_data": row.n_data,
+            "n_first": row.n_first,
+            "n_not_ok": row.n_not_ok,
+            "n_unscored": row.n_unscored,
+        }
+        for row in study.edit_rates
+    ]
+
+    def count(key: str, title: str, note: str) -> Column:
+        return Column(key=key, title=title, kind="integer", note=note)
+
+    return Table(
+        name="edit_types",
+        title="Edit types",
+        caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
+        "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
+        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, the first score-bearing submit (it "
+        "follows none), submits that are not ok, and ok ones without a validation score.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            _DEMAND,
+            count("n_synthesis", "Synthesis n", "New topology."),
+            Column(key="hit_synthesis", title="Synthesis hit", kind="percent"),
+            count("n_parametric", "Parametric n", "Same topology, other bytes."),
+            Column(key="hit_parametric", title="Parametric hit", kind="percent"),
+            count("n_rollback", "Rollback", "Back to an earlier topology."),
+            count("n_retest", "Retest", "Byte-identical."),
+            count("n_data", "Data only", "Files outside the source bundle changed, such as weights."),
+            count("n_first", "First", "First score-bearing submit of a run."),
+            count("n_not_ok", "Not ok", "Accepted submits without a working policy."),
+            count("n_unscored", "Unscored", "Ok, without a validation mean."),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _structure(study: Study) -> Table:
+    keys = (*structure.FEATURES, "nodes", "lines")
+    titles = ("Funcs", "Branches", "Loops", "Depth", "State", "AST nodes", "Lines")
+    rows = [
+        {
+            "demand": row.demand,
+            "entry": row.entry,
+            "harness": row.harness,
+            **{key: getattr(row, key) for key in keys},
+            "runs": row.n_runs,
+        }
+        for row in study.structure
+    ]
+    return Table(
+        name="structure",
+        title="Realised structure",
+        caption="AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
+        "environments of a demand group. State counts attributes that methods assign on their instance.",
+        columns=(
+            _DEMAND,
+            ENTRY,
+            HARNESS,
+            *(Column(key=k, title=t, kind="number", digits=1) for k, t in zip(keys, titles, strict=True)),
+            Column(key="runs", title="Runs", kind="integer"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _edit_sizes(study: Study) -> Table:
+    rows = [
+        {
+            "entry": row.entry,
+            "lines": row.label,
+            "n": row.n,
+            "p_visible": row.p_visible,
+            "p_validation": row.p_validation,
+        }
+        for row in study.edit_sizes
+        if row.n
+    ]
+    return Table(
+        name="edit_sizes",
+        title="Edit size and improvement",
+        caption="Transitions between adjacent score-bearing submits by lines added and removed in the source bundle. Visible: the "
+        "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
+        "only: files outside the source bundle changed, such as weights.",
+        columns=(
+            ENTRY,
+            Column(key="lines", title="Changed lines"),
+            Column(key="n", title="Transitions", kind="integer"),
+            Column(key="p_visible", title="Visible mean improved", kind="percent"),
+            Column(key="p_validation", title="Validation best improved", kind="percent"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _tokens(study: Study) -> Table:
+    rows = [
+        {
+            "env": title_of(row.env),
+            "entry": row.entry,
+            "input": row.input_noncached,
+            "cache": row.cache,
+            "output": row.output,
+            "cost": row.cost,
+            "runs": row.n_runs,
+        }
+        for row in study.tokens
+    ]
+
+    def millions(key: str, title: str, note: str) -> Column:
+        return Column(key=key, title=title, kind="number", digits=2, below=True, note=note)
+
+    return Table(
+        name="tokens",
+        title="Tokens and cost",
+        caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
+        "reasoning. Diagnostic only, no part of a score. A dash: the agent does not tell.",
+        columns=(
+            ENV,
+            ENTRY,
+            millions("input", "In (M)", "Non-cached input."),
+            millions("cache", "Cache (M)", "Cache read plus cache creation."),
+            millions("output", "Out (M)", "Output, reasoning included."),
+            Column(key="cost", title="Cost (US$)", kind="number", digits=2),
+            Column(key="runs", title="Runs that tell", kind="integer"),
+        ),
+        rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
+    )

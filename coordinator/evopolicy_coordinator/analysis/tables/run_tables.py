@@ -1,0 +1,314 @@
+"""The report's tables about runs themselves: how agents and environments were set up, the runs, their audit signals, their
+submits with the feedback that went before, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from evopolicy_common import catalogue
+from evopolicy_coordinator.analysis.behaviour.edits import demand_of
+from evopolicy_coordinator.analysis.behaviour.trace import Trace, TraceRow
+from evopolicy_coordinator.analysis.reading.records import Run, path_text
+from evopolicy_coordinator.analysis.scoring.scores import (
+    family_of,
+    family_title,
+    ordered_environments,
+    title_of,
+)
+from evopolicy_coordinator.analysis.study import Study
+from evopolicy_coordinator.analysis.tables.table import Column, Table
+
+ENTRY = Column(key="entry", title="Agent")
+HARNESS = Column(key="harness", title="Harness")
+ENV = Column(key="env", title="Environment")
+RUN = Column(key="run", title="Run")
+
+_COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
+"""What a harness notes among its settings of how a run went: no setting."""
+_MAX_QUOTE = 240
+
+LinkOf = Callable[[str], str]
+"""Run name to the page about it, or the empty string."""
+
+
+def no_link(run: str) -> str:
+    return ""
+
+
+def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
+    return [
+        _runs(study, link_of),
+        _audit(study, link_of),
+        _agents(study),
+        _environments(study),
+        _left_out(study),
+    ]
+
+
+def one_or_all(values: Iterable[Any]) -> Any:
+    """The value that they all are, or `A or B` where unlike runs were mixed."""
+    found = list(dict.fromkeys(values))
+    return found[0] if len(found) == 1 else " or ".join(str(value) for value in found)
+
+
+def _short(run: str) -> str:
+    """The experiment in a run's name: agent and environment have columns of their own."""
+    return run.rsplit(" / ", 1)[-1]
+
+
+def _runs(study: Study, link_of: LinkOf) -> Table:
+    rows = tuple(
+        {
+            "env": title_of(run.env),
+            "entry": run.entry,
+            "run": _short(run.name),
+            "submits": len(run.submits),
+            "score": run.score,
+        }
+        for run in study.runs
+    )
+    return Table(
+        name="runs",
+        title="Runs",
+        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column(key="submits", title="Submits", kind="integer"),
+            Column(key="score", title="Held-out mean", kind="number"),
+        ),
+        rows=rows,
+        links={i: link for i, run in enumerate(study.runs) if (link := link_of(run.name))},
+    )
+
+
+def _agents(study: Study) -> Table:
+    """A row for each way in which an entry was set up: more than one shows that its runs are not alike."""
+    counts: dict[tuple[str, ...], int] = {}
+    for run in study.runs:
+        agent = run.record.agent
+        told = (
+            run.entry,
+            run.harness,
+            agent.cli_version or "",
+            agent.model_string or "",
+            _settings(run),
+            run.record.jail,
+            run.record.hidden_isolation,
+        )
+        counts[told] = counts.get(told, 0) + 1
+    keys = ("entry", "harness", "cli_version", "model", "settings", "jail", "hidden_isolation")
+    rows = [
+        {**{key: value or None for key, value in zip(keys, told, strict=True)}, "runs": n}
+        for told, n in sorted(counts.items(), key=lambda item: (item[0][0].casefold(), item[0]))
+    ]
+    return Table(
+        name="agents",
+        title="Agents",
+        caption="How each agent was set up, as its run directories tell; an agent with several rows was not the same in all of its runs.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            Column(key="cli_version", title="Version", note="Of the harness's program."),
+            Column(key="model", title="Model string"),
+            Column(key="settings", title="Settings"),
+            Column(key="jail", title="Jail"),
+            Column(
+                key="hidden_isolation",
+                title="Hidden isolation",
+                note="exclusive: hidden episodes and agents never shared a kernel.",
+            ),
+            Column(key="runs", title="Runs", kind="integer"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _settings(run: Run) -> str:
+    """The plain ones in a line; lists, and paths of the machine that it ran on, are in run.json."""
+    settings = run.record.agent.settings
+    plain = {
+        key: value
+        for key, value in settings.items()
+        if isinstance(value, str | int | float)
+        and key not in _COUNTERS
+        and not str(value).startswith(("/", "~"))
+    }
+    words = {True: "yes", False: "no"}
+    return ", ".join(
+        f"{key} {words[value] if isinstance(value, bool) else f'{value:g}' if isinstance(value, float) else value}"
+        for key, value in plain.items()
+    )
+
+
+def _environments(study: Study) -> Table:
+    by_env: dict[str, list[Run]] = {}
+    for run in study.runs:
+        by_env.setdefault(run.env, []).append(run)
+
+    def told(runs: list[Run], value_of: Callable[[Run], Any]) -> Any:
+        return one_or_all(value_of(run) for run in runs)
+
+    rows: list[dict[str, Any]] = []
+    for env in ordered_environments(by_env):
+        runs, known = by_env[env], catalogue.entries().get(env)
+        rows.append(
+            {
+                "env": title_of(env),
+                "family": family_title(family_of(env)),
+                "id": env,
+                "version": told(runs, lambda run: run.record.versions.env),
+                "spaces": f"{known.observation}/{known.action}" if known is not None else None,
+                "demand": demand_of(env),
+                "steps": known.max_episode_steps if known is not None else None,
+                "budget": told(runs, lambda run: run.budget),
+                "submit": told(runs, lambda run: run.submit_size),
+                "validation": told(runs, lambda run: run.record.experiment_dimensions.n_validation),
+                "heldout": told(runs, lambda run: run.record.experiment_dimensions.n_heldout),
+                "scope": told(runs, lambda run: run.record.experiment_dimensions.policy_scope),
+            }
+        )
+    return Table(
+        name="environments",
+        title="Environments",
+        caption="What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
+        columns=(
+            ENV,
+            Column(key="family", title="Family"),
+            Column(key="id", title="Suite id"),
+            Column(key="spaces", title="Obs./action"),
+            Column(key="demand", title="Demand"),
+            Column(key="steps", title="Longest episode (steps)", kind="integer"),
+            Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."),
+            Column(key="submit", title="Episodes a submit", note="Fewest to most."),
+            Column(key="validation", title="Validation cases", kind="integer"),
+            Column(key="heldout", title="Held-out cases", kind="integer"),
+            Column(key="scope", title="Policy scope", note="How long one policy object lives."),
+            Column(key="version", title="Version"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def submits_of(trace: Trace) -> list[dict[str, Any]]:
+    """A run's rows of the table of feedback use."""
+    run = trace.run
+    return [
+        {
+            "env": title_of(run.env),
+            "entry": run.entry,
+            "run": _short(run.name),
+            **_submit(row),
+            "selected": "yes" if row.submit.index == run.record.outcome.best_submit_index else None,
+        }
+        for row in trace.rows
+    ]
+
+
+def _submit(row: TraceRow) -> dict[str, Any]:
+    submit, transition, evidence = row.submit, row.transition, row.evidence
+    said = " ".join(evidence.attribution.split()) if evidence is not None else ""
+    return {
+        "submit": submit.label,
+        "before": submit.consumed_before,
+        "after": submit.consumed,
+        "read": ", ".join(evidence.read) or None if evidence is not None else None,
+        "said": said if len(said) <= _MAX_QUOTE else said[: _MAX_QUOTE - 1] + "…",
+        "status": submit.status,
+        "edit": transition.edit if transition is not None else None,
+        "changed_lines": submit.changed_lines,
+        "visible": submit.mean_return,
+        "validation": submit.val_mean,
+        "best": ("yes" if transition.hit else "no") if transition is not None else None,
+    }
+
+
+def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
+    """Every submit of every run (`submits_of`): too long for a page, where each run has its own."""
+    return Table(
+        name="feedback_use",
+        title="Feedback use",
+        caption="One row a submit: what the agent had read and said since the submit before, how the policy changed, and what came of "
+        "it. Budget: train episodes consumed before and after. Validation is hidden from agents.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column(key="submit", title="Submit"),
+            Column(key="before", title="Budget before", kind="integer"),
+            Column(key="after", title="Budget after", kind="integer"),
+            Column(key="read", title="Evidence read"),
+            Column(key="said", title="The agent's own words"),
+            Column(key="status", title="Status"),
+            Column(key="edit", title="Edit"),
+            Column(key="changed_lines", title="Changed lines", kind="integer"),
+            Column(key="visible", title="Visible mean", kind="number"),
+            Column(key="validation", title="Validation mean", kind="number"),
+            Column(key="best", title="New validation best"),
+            Column(key="selected", title="Selected"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _audit(study: Study, link_of: LinkOf) -> Table:
+    rows: list[dict[str, Any]] = []
+    for found in study.audit:
+        row = {key: getattr(found, key) for key in found.__struct_fields__}
+        selected = found.selected_index
+        row |= {
+            "env": title_of(found.env),
+            "run": _short(found.run),
+            "selected": None if selected is None else f"s{selected:03d}",
+        }
+        rows.append(row)
+
+    def integer(key: str, title: str) -> Column:
+        return Column(key=key, title=title, kind="integer")
+
+    def seconds(key: str, title: str) -> Column:
+        return Column(key=key, title=f"{title} (s)", kind="number", digits=0)
+
+    return Table(
+        name="audit",
+        title="Audit signals",
+        caption="One row a run. Invalid rate: accepted submits that are not ok, of all accepted. Score drops: score-bearing submits "
+        "whose validation mean is below the one before. Growth: AST nodes of the selected policy over those of the first. "
+        "Wall time by phase, in seconds; phases may overlap.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            integer("accepted", "Accepted"),
+            integer("rejected", "Rejected"),
+            Column(key="invalid_rate", title="Invalid rate", kind="percent"),
+            integer("budget_used", "Budget used"),
+            Column(key="episodes_per_submit", title="Episodes / submit", kind="number", digits=1),
+            integer("failed_episodes", "Failed episodes"),
+            integer("score_drops", "Score drops"),
+            Column(key="selected", title="Selected"),
+            Column(key="complexity_growth", title="Growth (×)", kind="number", digits=2),
+            integer("turns", "Turns"),
+            integer("retries", "Retries"),
+            seconds("wall_s", "Wall"),
+            seconds("agent_s", "Agent"),
+            seconds("queue_s", "Queue"),
+            seconds("rollout_s", "Rollout"),
+            seconds("feedback_s", "Feedback"),
+            seconds("finalise_s", "Finalise"),
+        ),
+        rows=tuple(rows),
+        links={i: link for i, found in enumerate(study.audit) if (link := link_of(found.run))},
+    )
+
+
+def _left_out(study: Study) -> Table:
+    return Table(
+        name="left_out",
+        title="Left out",
+        caption="Folders that are no complete run, and why. They are in no table and no figure.",
+        columns=(Column(key="path", title="Folder"), Column(key="reason", title="Reason")),
+        rows=tuple({"path": path_text(item.path), "reason": item.reason} for item in study.left_out),
+    )

@@ -1,0 +1,1 @@
+"""The coordinator's commands: `evopolicy-coordinator …`, and those that it adds to `evopolicy`."""

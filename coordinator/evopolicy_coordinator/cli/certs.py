@@ -1,0 +1,248 @@
+"""`evopolicy-coordinator certs`: certificates for the coordinator and for every machine that joins it."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import socket
+from pathlib import Path
+from typing import Annotated, get_args
+
+import msgspec
+import typer
+from rich.table import Table
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.wire.credentials import MachineRole, default_state_dir
+from evopolicy_coordinator.pki import certs, machines
+from evopolicy_coordinator.pki.machines import Machine, Machines
+from evopolicy_coordinator.storage.state_folder import cluster_of
+
+app = typer.Typer(
+    help="Certificates for the machines of a cluster.", no_args_is_help=True, rich_markup_mode=None
+)
+
+PORT = 7447
+"""Where a coordinator is taken to listen, unless told otherwise."""
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+State = Annotated[
+    Path | None, typer.Option(help="The state folder [$EVOPOLICY_STATE or the user's state home].")
+]
+Days = Annotated[int, typer.Option(min=1, max=3650, help="How long the certificate is valid.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@app.command(epilog="Example: evopolicy-coordinator certs init --host coordinator.lab --host 10.0.0.5")
+def init(
+    state: State = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Name or address that other machines dial the coordinator at; may be repeated. "
+            "Default: this machine's address and name. Loopback names are always added."
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(help="Name of the cluster, where the folder is new [local].")
+    ] = None,
+    days: Days = 730,
+    renew: Annotated[
+        bool,
+        typer.Option("--renew", help="Make the coordinator's certificate anew; every machine's stays good."),
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Make a new authority too, which voids every machine's folder.")
+    ] = False,
+) -> None:
+    """Makes the cluster's certificate authority, and the coordinator's own certificate, in the state folder.
+
+    The authority's key never leaves that folder: keep it, and its backups, as private as the hidden cases.
+    """
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        name = cluster_of(root, cluster)
+        old = machines.coordinators_certificate(root)
+        if old is not None and not (renew or force):
+            raise ConfigError(
+                f"{root}/certs holds the coordinator's certificate already (for {', '.join(old.hosts)}, until"
+                f" {old.expires:%Y-%m-%d}); --renew makes that anew, --force a new authority, which voids every"
+                " machine's folder"
+            )
+        hosts = tuple(host or (old.hosts if old is not None else _own_hosts()))
+        machines.init(root, name, _with_loopback(hosts), _now(), days, anew=force)
+        made = machines.coordinators_certificate(root)
+        assert made is not None
+        say(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
+        say(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
+        say(f"next: evopolicy-coordinator --listen tls/0.0.0.0:{PORT}{_state_option(state)}")
+        say(f"and for each machine: evopolicy-coordinator certs issue worker NAME{_state_option(state)}")
+
+
+@app.command(epilog="Example: evopolicy-coordinator certs issue worker gpu-7 --out ./gpu-7")
+def issue(
+    role: Annotated[str, typer.Argument(help="worker, gateway, operator or router.", show_default=False)],
+    name: Annotated[str, typer.Argument(help="The machine's name.", show_default=False)],
+    state: State = None,
+    out: Annotated[Path | None, typer.Option(help="New folder for it [./ROLE-NAME].")] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="Name or address that this machine is dialled at: for a router. May be repeated."),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            help=f"Endpoint that it connects to; default: the coordinator's first --host, port {PORT}."
+        ),
+    ] = None,
+    days: Days = 398,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="The name was issued before: void that folder, make a new one.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Writes one folder with all that a machine needs to join: certificates, key, user and password.
+
+    Copy the folder to that machine (scp -rp keeps its modes) and name it with --credentials there. A running coordinator
+    admits the machine within seconds. An operator's folder also starts gateways.
+    """
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        kind = _role(role)
+        folder = out or Path(f"{role}-{name}")
+        made = machines.issue(
+            root,
+            cluster_of(root, None),
+            kind,
+            name,
+            tuple(connect or ()) or (first_endpoint(root),),
+            folder,
+            _now(),
+            days,
+            hosts=tuple(host or ()),
+            again=renew,
+        )
+        if as_json:
+            say(
+                msgspec.json.encode(
+                    {"folder": str(folder), "machines": [_told(one) for one in made]}
+                ).decode()
+            )
+            return
+        say(
+            f"{folder}: {' and '.join(one.identity for one in made)}, until {made[0].expires:%Y-%m-%d}"
+            f" (a secret: scp -rp {folder} MACHINE:)"
+        )
+        start = {
+            "worker": "evopolicy-worker --env core16",
+            "gateway": "evopolicy-gateway RUN_DIRECTORY",
+            "operator": "evopolicy run --env gym/acrobot --agent evolve",
+        }.get(role)
+        if start is not None and kind != "gateway":
+            say(f"there: {start} --credentials {folder.name}")
+        if kind == "router":
+            say(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
+
+
+@app.command(epilog="Example: evopolicy-coordinator certs revoke gpu-7")
+def revoke(
+    name: Annotated[str, typer.Argument(help="NAME, in all its roles, or ROLE/NAME.", show_default=False)],
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Shuts a machine out: its links are cut within seconds, and it is not let in again.
+
+    What its worker holds is played by others. Revoke at your routers as well, where there are any.
+    """
+    with fail_on_our_errors():
+        gone = machines.revoke(state or default_state_dir(), name, _now())
+        if as_json:
+            say_json([_told(one) for one in gone], indent=False)
+        else:
+            say(f"revoked: {', '.join(one.identity for one in gone)}")
+
+
+@app.command("list", epilog="Example: evopolicy-coordinator certs list --json")
+def list_(state: State = None, as_json: Json = False) -> None:
+    """Shows every machine that was issued a certificate, until when it is valid, and whether it is revoked."""
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        own = machines.coordinators_certificate(root)
+        if own is None:
+            raise ConfigError(f"{root} has no certificates yet: evopolicy-coordinator certs init")
+        now = _now()
+        rows = [_told(machine) for machine in Machines(root).all()]
+        if as_json:
+            told = {"hosts": own.hosts, "expires": own.expires}
+            say_json({"coordinator": told, "machines": rows})
+            return
+        table = Table(box=None, pad_edge=False)
+        for heading in ("name", "role", "expires", "state"):
+            table.add_column(heading, overflow="fold")
+        table.add_row(", ".join(own.hosts), "coordinator", *_validity(own.expires, None, now))
+        for machine in Machines(root).all():
+            table.add_row(machine.name, machine.role, *_validity(machine.expires, machine.revoked, now))
+        terminal().print(table)
+
+
+def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetime) -> tuple[str, str]:
+    if revoked is not None:
+        return f"{expires:%Y-%m-%d}", f"revoked {revoked:%Y-%m-%d}"
+    left = (expires - now).days
+    return f"{expires:%Y-%m-%d}", "expired" if expires <= now else f"{left} days left"
+
+
+def _told(machine: Machine) -> dict[str, object]:
+    """What may be shown of a machine: neither its password nor its token."""
+    return {
+        "name": machine.name,
+        "role": machine.role,
+        "identity": machine.identity,
+        "serial": machine.serial,
+        "issued": machine.issued,
+        "expires": machine.expires,
+        "revoked": machine.revoked,
+    }
+
+
+def _role(text: str) -> MachineRole:
+    for role in get_args(MachineRole):
+        if text == role:
+            return role  # type: ignore[no-any-return]
+    raise ConfigError(f"ROLE {text!r}: there are {', '.join(get_args(MachineRole))}")
+
+
+def first_endpoint(root: Path) -> str:
+    """Where the coordinator is taken to listen; ConfigError before `certs init`."""
+    own = machines.coordinators_certificate(root)
+    if own is None:
+        raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")
+    host = own.hosts[0]
+    return f"tls/[{host}]:{PORT}" if ":" in host else f"tls/{host}:{PORT}"
+
+
+def _with_loopback(hosts: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys((*hosts, *_LOOPBACK)))
+
+
+def _own_hosts() -> tuple[str, ...]:
+    """This machine's address on the way out, if it has one, and its names."""
+    found = []
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing: only the route is asked for
+        found.append(str(probe.getsockname()[0]))
+    for name in (socket.getfqdn(), socket.gethostname()):
+        with contextlib.suppress(ConfigError):
+            certs.check_hosts([name])
+            found.append(name)
+    return tuple(dict.fromkeys(found))
+
+
+def _state_option(state: Path | None) -> str:
+    return "" if state is None else f" --state {state}"
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC).replace(microsecond=0)

@@ -1,0 +1,188 @@
+"""`evopolicy-coordinator`: the process that owns budgets, hidden cases, queue, checkpoints and results."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.terminal import say, say_json
+from evopolicy_common.wire.credentials import default_state_dir
+from evopolicy_common.wire.ready import Ready
+from evopolicy_coordinator.cli import certs as certs_cli
+from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.server import process, router_config
+from evopolicy_coordinator.server.process import Options
+from evopolicy_coordinator.storage.backup import back_up
+
+
+class Isolation(StrEnum):
+    """`CoreSettings.hidden_isolation`, as an option."""
+
+    RELATED = "related"
+    STRICT = "strict"
+    OFF = "off"
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app.add_typer(certs_cli.app, name="certs")
+app.command(
+    "router-config",
+    epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"
+    " --installed-at /etc/evopolicy/router",
+)(router_config.router_config)
+
+
+@app.callback(
+    invoke_without_command=True,
+    epilog="Example: evopolicy-coordinator --listen tls/0.0.0.0:7447 --state /var/lib/evopolicy",
+)
+def serve(
+    context: typer.Context,
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may be "
+            "repeated. "
+            "A unix socket in the state folder is always listened on."
+        ),
+    ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of everything that must survive [$EVOPOLICY_STATE or the user's state home]."
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of split files (see `evopolicy data`); default: splits from a secret in the state."
+        ),
+    ] = None,
+    insecure_tcp: Annotated[
+        bool,
+        typer.Option(
+            "--insecure-tcp",
+            help="Allow tcp/ beyond this machine, where tokens and results can be read on the wire.",
+        ),
+    ] = False,
+    cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
+    allow_package: Annotated[
+        list[str] | None,
+        typer.Option(help="Package that the workers let policies import beside numpy; may be repeated."),
+    ] = None,
+    audit: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            metavar="SHARE",
+            help="Share of the episodes of new runs whose recorded actions are played again on a second worker and compared "
+            "bit for bit. A third decides where two disagree; a forger gets no more work.",
+        ),
+    ] = 0.0,
+    hidden_isolation: Annotated[
+        Isolation,
+        typer.Option(
+            help="On kernels with which agents, and beside which train episodes, no hidden episode is played: those of"
+            " `related` runs, which share a hidden case; `strict`: all; `off`: none, and runs are stamped `shared`.",
+        ),
+    ] = Isolation.RELATED,
+    hidden_wait: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="When hidden episodes of closed runs have been kept waiting for so long, no related agent starts on one"
+            " of the machines until they are played.",
+        ),
+    ] = CoreSettings().hidden_wait_s,
+    ready_file: Annotated[
+        Path | None,
+        typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
+    ] = None,
+    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+) -> None:
+    """Coordinates a cluster: workers and gateways connect to it, with the credentials that it writes.
+
+    SIGTERM or Ctrl-C: makes everything durable and exits; started again on the same folder, it goes on where it was.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    with fail_on_our_errors():
+        if log_level not in ("debug", "info", "warning", "error"):
+            raise ConfigError(f"--log-level {log_level!r}: say debug, info, warning or error")
+        setup_logging(log_level)
+        options = Options(
+            state=state or default_state_dir(),
+            data=data,
+            listen=tuple(listen or ()),
+            insecure_tcp=insecure_tcp,
+            cluster=cluster,
+            allowed_packages=tuple(allow_package or ()),
+            core=CoreSettings(
+                audit_share=audit, hidden_isolation=hidden_isolation.value, hidden_wait_s=hidden_wait
+            ),
+        )
+        try:
+            asyncio.run(_run(options, ready_file))
+        finally:
+            if ready_file is not None:
+                ready_file.unlink(missing_ok=True)
+
+
+@app.command(epilog="Example: evopolicy-coordinator backup /backup/monday --state /var/lib/evopolicy")
+def backup(
+    target: Annotated[Path, typer.Argument(help="New folder for the copy.", show_default=False)],
+    state: Annotated[
+        Path | None, typer.Option(help="The state folder [$EVOPOLICY_STATE or the user's state home].")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was copied as JSON.")] = False,
+) -> None:
+    """Copies the state folder, also while its coordinator runs: database as of one instant, blobs, keys.
+
+    To restore: stop the coordinator, copy the backup to where its state was, start it again. Workers and gateways
+    reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the state:
+    they hold the hidden cases.
+    """
+    with fail_on_our_errors():
+        copied = back_up(state or default_state_dir(), target)
+    if as_json:
+        say_json(copied, indent=False)
+    else:
+        say(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
+
+
+async def _run(options: Options, ready_file: Path | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+    def on_ready(ready: Ready) -> None:
+        say(_ready_line(ready))
+        if ready_file is not None:
+            write_atomically(ready_file, msgspec.json.format(msgspec.json.encode(ready)) + b"\n", mode=0o600)
+
+    await process.run(options, stop, on_ready)
+
+
+def _ready_line(ready: Ready) -> str:
+    said = f"ready: cluster {ready.cluster}, state {ready.state}; workers join with:"
+    endpoint = ready.endpoints[-1]
+    if endpoint.startswith("tls/"):
+        return f"{said} evopolicy-coordinator certs issue worker NAME --state {ready.state}"
+    return f"{said} evopolicy-worker --env core16 --connect {endpoint} --credentials {ready.credentials['worker']}"
+
+
+def main() -> None:
+    """The console script."""
+    run_app(app)

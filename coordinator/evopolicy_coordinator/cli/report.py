@@ -1,0 +1,169 @@
+"""`evopolicy report`: run directories in, a folder with the report out.
+
+It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes: 0
+written, 1 no complete run among what was given, 2 wrong usage, 3 the runs are no fair comparison.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.terminal import say, say_json, say_lines, terminal
+from evopolicy_coordinator.analysis.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError
+from evopolicy_coordinator.analysis.reading.reader import load_runs
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, read_score_csv
+from evopolicy_coordinator.analysis.study import Study, study_of
+
+if TYPE_CHECKING:
+    from evopolicy_coordinator.analysis.write import Progress as Tell
+
+NOTHING, USAGE, MIXED = 1, 2, 3
+
+app = typer.Typer(name="report", add_completion=False, rich_markup_mode=None)
+
+
+@app.command(
+    name="report",
+    epilog="Example: evopolicy report runs --out report && xdg-open report/index.html",
+)
+def report(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run directories, or folders with any number of them below; a CSV of held-out returns "
+            "(entry,harness,<environment>,…) adds entries without runs.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write; a new one, or an earlier report's.", show_default=False)
+    ],
+    title: Annotated[str | None, typer.Option(help="Heading of the report.", show_default=False)] = None,
+    allow_mixed: Annotated[
+        bool,
+        typer.Option(
+            "--allow-mixed",
+            help="Compare runs although their budgets, policy scopes, splits, fingerprints, jails or hidden isolation "
+            "differ; the report says so.",
+        ),
+    ] = False,
+    allow_unknown: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unknown",
+            help="Compare runs from before hidden isolation was recorded with later ones; the report says so.",
+        ),
+    ] = False,
+    pages: Annotated[
+        bool,
+        typer.Option(
+            "--pages/--no-pages", help="Write a page for each run: feedback use, checkpoints, differences."
+        ),
+    ] = True,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Processes that read runs; 0 for one a core.", show_default=True)
+    ] = 0,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what was written, and what was left out, as JSON.")
+    ] = False,
+) -> None:
+    """Turn run directories into a leaderboard, figures and diagnostics."""
+    # Here, not above: it needs jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    from evopolicy_coordinator.analysis.write import write_report
+
+    try:
+        check_writable(out, "--out")
+        with _progress() as tell:
+            study = _study(runs, allow_mixed, allow_unknown, jobs or os.cpu_count() or 1, tell)
+            if not study.suites:
+                index = None
+            else:
+                index = write_report(study, out, title=title, traces=pages, progress=tell)
+    except MixedRunsError as error:
+        options = sorted(
+            {
+                "--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed"
+                for one in error.mixtures
+            }
+        )
+        _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
+    except ConfigError as error:
+        _fail(str(error), USAGE)
+    if unknown := sum(run.record.hidden_isolation == "unknown" for run in study.runs):
+        say(
+            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
+            " they are from before it was recorded",
+            err=True,
+        )
+    if as_json:
+        left_out = [{"path": str(item.path), "reason": item.reason} for item in study.left_out]
+        found = {
+            "index": str(index) if index is not None else None,
+            "runs": len(study.runs),
+            "left_out": left_out,
+        }
+        say_json(found, indent=False)
+    else:
+        say_lines((f"left out: {item.path}: {item.reason}" for item in study.left_out), err=True)
+        if index is not None:
+            say(
+                f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
+            )
+    if index is None:
+        _fail("no complete run among what was given; nothing written", NOTHING)
+
+
+def _study(paths: list[Path], allow_mixed: bool, allow_unknown: bool, jobs: int, tell: Tell) -> Study:
+    tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
+    if len(tables) > 1:
+        raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
+    loaded = load_runs(
+        [path for path in paths if path not in tables],
+        jobs=jobs,
+        progress=lambda done, total: tell("runs read", done, total),
+    )
+    scores = _read_table(tables[0]) if tables else None
+    return study_of(
+        loaded.runs,
+        left_out=loaded.left_out,
+        allow_mixed=allow_mixed,
+        allow_unknown=allow_unknown,
+        scores=scores,
+    )
+
+
+def _read_table(path: Path) -> ScoreTable:
+    try:
+        return read_score_csv(path.read_text(encoding="utf-8"), source=str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+
+
+@contextmanager
+def _progress() -> Iterator[Tell]:
+    """A bar for each stage on standard error, when that is a terminal."""
+    console = terminal(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        tasks = {}
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(what, total=total)
+            progress.update(tasks[what], completed=done, total=total)
+
+        yield tell
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    say(f"evopolicy report: {message}", err=True)
+    raise typer.Exit(code)

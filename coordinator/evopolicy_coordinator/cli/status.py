@@ -1,0 +1,321 @@
+"""`evopolicy status`, `evopolicy workers …`, `evopolicy runs …`: an operator's look at a cluster, and his word on it.
+
+Exit codes: 0 all well, 1 the coordinator refused or cannot be reached, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import typer
+from rich import box
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.messages.operator import (
+    AgentGone,
+    CancelRun,
+    Done,
+    RepinRun,
+    SetWorker,
+    StatusReply,
+    StatusRequest,
+)
+from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.requests import operator_requests
+
+T = TypeVar("T")
+
+status_app = typer.Typer(
+    name="status", help="What a cluster is doing.", add_completion=False, rich_markup_mode=None
+)
+workers_app = typer.Typer(
+    name="workers",
+    help="Take workers out of service and back.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+runs_app = typer.Typer(
+    name="runs",
+    help="An operator's word on runs.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+
+class Operator:
+    """Asks an operator's requests."""
+
+    def __init__(self, link: transport.Link) -> None:
+        self.token = link.credentials.token
+        self._ask = operator_requests(link)
+
+    async def status(self) -> StatusReply:
+        """What the cluster is doing."""
+        return await self._ask.until_answered(
+            "status", StatusRequest(token=self.token), StatusReply, patience_s=10.0
+        )
+
+    async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
+        message = SetWorker(token=self.token, worker=worker, state=state)
+        await self._ask.until_answered("worker", message, Done, patience_s=10.0)
+
+    async def cancel_run(self, run: str) -> None:
+        """End a run without a score."""
+        message = CancelRun(token=self.token, run=run)
+        await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
+
+    async def agent_gone(self, run: str) -> None:
+        """Vouch that a run's agent is not alive any more."""
+        message = AgentGone(token=self.token, run=run)
+        await self._ask.until_answered("agent-gone", message, Done, patience_s=10.0)
+
+    async def repin_run(self, run: str, fingerprint_class: str, reason: str) -> None:
+        """Let a run go on with workers of another fingerprint class."""
+        message = RepinRun(token=self.token, run=run, fingerprint_class=fingerprint_class, reason=reason)
+        await self._ask.until_answered("repin", message, Done, patience_s=10.0)
+
+
+def _asking(connect: list[str] | None, file: Path | None, work: Callable[[Operator], Awaitable[T]]) -> T:
+    """`work` with a link to the coordinator; our errors as one line."""
+
+    async def ask() -> T:
+        async with transport.connect(credentials.find("operator", tuple(connect or ()), file)) as link:
+            return await work(Operator(link))
+
+    with fail_on_our_errors():
+        return asyncio.run(ask())
+    raise AssertionError("fail_on_our_errors never swallows")
+
+
+@status_app.callback(
+    invoke_without_command=True, epilog="Example: evopolicy status --watch --credentials operator-me"
+)
+def status(
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Show it anew every second until Ctrl-C.")] = False,
+) -> None:
+    """Workers, runs, and what waits longer than it should, and for what.
+
+    --watch --json prints a JSON object a line, every second.
+    """
+    if watch:
+        _asking(connect, file, _watch_lines if as_json else _watch)
+        return
+    reply = _asking(connect, file, Operator.status)
+    if as_json:
+        say_json(reply)
+    else:
+        terminal().print(render(reply))
+
+
+async def _watch(operator: Operator) -> None:
+    with Live(console=terminal(), auto_refresh=False) as live:
+        while True:
+            started = time.monotonic()
+            live.update(render(await operator.status()), refresh=True)
+            await asyncio.sleep(max(0.0, 1.0 - (time.monotonic() - started)))
+
+
+async def _watch_lines(operator: Operator) -> None:
+    while True:
+        say_json(await operator.status(), indent=False)
+        await asyncio.sleep(1.0)
+
+
+@workers_app.command(epilog="Example: evopolicy workers drain lab-3f2a")
+def drain(
+    worker: Annotated[str, typer.Argument(help="The worker's name, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Give a worker no more work: it finishes what runs, then ends."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "draining"))
+    say(f"{worker} is draining")
+
+
+@workers_app.command(epilog="Example: evopolicy workers pause lab-3f2a")
+def pause(
+    worker: Annotated[str, typer.Argument(help="The worker's name.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Give a worker no more work until it is resumed: it finishes what it holds, and stays."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "paused"))
+    say(f"{worker} is paused")
+
+
+@workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
+def resume(
+    worker: Annotated[str, typer.Argument(help="The worker's name.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Take a worker back that was paused or drained, or quarantined by an audit."""
+    _asking(connect, file, lambda operator: operator.set_worker(worker, "active"))
+    say(f"{worker} is active")
+
+
+@runs_app.callback()
+def runs() -> None:
+    """An operator's word on runs."""
+
+
+@runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
+def cancel(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """End a run without a score; what of it is played stops."""
+    _asking(connect, file, lambda operator: operator.cancel_run(run))
+    say(f"{run} is cancelled")
+
+
+@runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")
+def agent_gone(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Vouch that a run's agent is not alive any more, when its machine is lost for good.
+
+    Hidden cases may be played on that machine from now on. If the agent is alive after all, it can learn them: when in
+    doubt resume the run, or start the machine anew.
+    """
+    _asking(connect, file, lambda operator: operator.agent_gone(run))
+    say(f"{run} has no agent any more")
+
+
+@runs_app.command(
+    epilog="Example: evopolicy runs repin r-0f2e9a7c11d04b35 b23d564d30c1 --reason 'the old workers are gone'"
+)
+def repin(
+    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    fingerprint_class: Annotated[
+        str, typer.Argument(metavar="CLASS", help="The workers' class, as `evopolicy status` shows it.")
+    ],
+    reason: Annotated[str, typer.Option(help="Why; recorded in the run.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+) -> None:
+    """Let a run go on with workers of other library versions, when those it began with are gone."""
+    _asking(connect, file, lambda operator: operator.repin_run(run, fingerprint_class, reason))
+    say(f"{run} goes on with workers of class {fingerprint_class}")
+
+
+def render(reply: StatusReply) -> RenderableType:
+    """The status as tables."""
+    slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
+    head = (
+        f"cluster {reply.cluster} · evopolicy {reply.version} · up {_age(reply.uptime_s)} · {slots} slots ·"
+        f" {sum(run.queued for run in reply.runs)} queued, {sum(run.running for run in reply.runs)} running,"
+        f" {reply.episodes_done} episodes done, {reply.episodes_per_s:.1f}/s over the last minute"
+    )
+    parts: list[RenderableType] = [Text(head), _workers(reply), *_classes(reply), _runs(reply)]
+    if reply.audit_share or reply.audits:
+        stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
+        parts.append(
+            Text(f"audits: {reply.audit_share:g} of the episodes of new runs; now {stand or 'none'}")
+        )
+    parts += [Text(line, style="yellow") for line in _remarks(reply)]
+    return Group(*parts)
+
+
+def _workers(reply: StatusReply) -> Table:
+    table = _table(
+        "worker", "host", "state", "slots", "running", "held", "environments", "tiers", "class", "seen"
+    )
+    for worker in reply.workers:
+        table.add_row(
+            worker.worker,
+            worker.host,
+            worker.state,
+            str(worker.slots),
+            str(worker.running),
+            str(worker.held),
+            str(len(worker.environments)),
+            " ".join(worker.tiers),
+            worker.fingerprint,
+            f"{_age(worker.last_seen_s)} ago",
+        )
+    return table
+
+
+def _classes(reply: StatusReply) -> Iterator[Text]:
+    """What the workers' classes stand for: only workers of one class share a run."""
+    for name, versions in sorted({worker.fingerprint: worker.versions for worker in reply.workers}.items()):
+        yield Text(f"class {name}: " + ", ".join(f"{what} {version}" for what, version in versions.items()))
+
+
+def _runs(reply: StatusReply) -> Table:
+    table = _table(
+        "run",
+        "entry",
+        "environment",
+        "phase",
+        "budget left",
+        "submits",
+        "queued",
+        "running",
+        "done",
+        "agent on",
+    )
+    for run in reply.runs:
+        table.add_row(
+            run.run,
+            run.entry,
+            run.env,
+            run.phase,
+            f"{run.remaining_budget}/{run.budget}",
+            str(run.n_submits),
+            str(run.queued),
+            str(run.running),
+            str(run.done),
+            run.agent_host,
+        )
+    return table
+
+
+def _remarks(reply: StatusReply) -> Iterator[str]:
+    for name, why in reply.quarantined.items():
+        yield f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
+    for one in reply.turned_away:
+        where = f" of {one.host}" if one.host else ""
+        yield f"{one.worker}{where} was turned away {_age(one.ago_s)} ago: {one.why}"
+    yield from reply.disputes
+    for run in reply.runs:
+        if run.waits_for:
+            yield f"{run.run} waits for {run.waits_for}"
+    for worker in reply.workers:
+        for run_id, why in worker.refused.items():
+            yield f"{worker.worker} gets no work of {run_id}: {why}"
+        if worker.hidden_bar:
+            yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
+    yield from reply.stalls
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in headings:
+        table.add_column(heading, no_wrap=True)
+    return table
+
+
+def _age(seconds: float) -> str:
+    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

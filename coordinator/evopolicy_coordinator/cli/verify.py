@@ -1,0 +1,229 @@
+"""`evopolicy verify RUN_DIR`: a finished run's episodes played again, and what differs.
+
+Exit codes: 0 all that was played again is identical, 1 something differs, 2 wrong usage (also: other cases than the
+run's), 3 it could not be checked (the cluster cannot be reached, or refused).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import msgspec
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster, unless_failed
+from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
+from evopolicy_common.wire import credentials, transport
+from evopolicy_coordinator.verify.run import Report, Verifier
+from evopolicy_coordinator.verify.source import read_run, sample
+
+DIFFERS, USAGE, UNCHECKED = 1, 2, 3
+_SHOWN = 20
+
+app = typer.Typer(name="verify", add_completion=False, rich_markup_mode=None)
+
+
+class _Options(msgspec.Struct, frozen=True, kw_only=True):
+    """What was asked for."""
+
+    run: Path
+    sample: int | None
+    seed: int
+    connect: tuple[str, ...]
+    file: Path | None
+    local: bool
+    state: Path | None
+    data: Path | None
+    slots: int
+    tier: Tier | None
+    policy: bool
+
+
+@app.command(
+    name="verify",
+    epilog="Example: evopolicy verify runs/evolve/gym_acrobot/20260131-120000 --sample 16 --local --state STATE",
+)
+def verify(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN_DIR", help="A finished run's directory.", show_default=False)
+    ],
+    sample_: Annotated[
+        int | None,
+        typer.Option(
+            "--sample", min=1, help="Episodes, drawn from all of the run; default: all.", show_default=False
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Of the draw; default: another one each time.", show_default=False)
+    ] = None,
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Bring up a coordinator and a worker for this command.")
+    ] = False,
+    state: Annotated[
+        Path | None, typer.Option(help="With --local: the state folder that the run was made with.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="With --local: the folder of split files that the run was made with.")
+    ] = None,
+    slots: Annotated[int, typer.Option(min=1, max=1024, help="With --local: episodes at once.")] = 2,
+    tier: Annotated[
+        str | None,
+        typer.Option(help="Sandbox tier of the workers' slots: bwrap, landlock, none; default: the run's."),
+    ] = None,
+    policy: Annotated[
+        bool,
+        typer.Option("--policy/--no-policy", help="Also play the checkpoints' policies again (advisory)."),
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Play a run's recorded actions again and compare rewards, observations and returns bit for bit.
+
+    Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked.
+    """
+    if not local and (state is not None or data is not None):
+        fail("--state and --data go with --local")
+    if local and (connect or file is not None):
+        fail("--local brings up its own cluster: it does not go with --connect or --credentials")
+    if tier is not None and tier not in get_args(Tier):
+        fail(f"--tier {tier!r}: there are {', '.join(get_args(Tier))}")
+    options = _Options(
+        run=run,
+        sample=sample_,
+        seed=random.SystemRandom().randrange(2**32) if seed is None else seed,
+        connect=tuple(connect or ()),
+        file=file,
+        local=local,
+        state=state,
+        data=data,
+        slots=slots,
+        tier=cast(Tier | None, tier),
+        policy=policy,
+    )
+    console = terminal(stderr=as_json)
+    with fail_on_our_errors():
+        try:
+            report = asyncio.run(_verify(options, console))
+        except ConfigError:
+            raise
+        except EvopolicyError as error:
+            fail(str(error), UNCHECKED)
+    if as_json:
+        say_json(report)
+    else:
+        _print(report, console)
+    raise typer.Exit(0 if report.identical else DIFFERS)
+
+
+async def _verify(options: _Options, console: Terminal) -> Report:
+    end_on_sigterm()
+    run = read_run(options.run)
+    async with _link(options) as (link, cluster):
+        with Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        ) as progress:
+            task = progress.add_task("verify")
+            waited: set[str] = set()
+
+            def tell(came: int, waits_for: str) -> None:
+                progress.update(task, completed=came)
+                if waits_for and waits_for not in waited:
+                    waited.add(waits_for)
+                    console.print(f"waits for {waits_for}")
+
+            verifier = Verifier(link, run, tell, options.tier)
+            knows_run = await verifier.check_cases()
+            chosen = sample([*run.train, *(run.hidden if knows_run else ())], options.sample, options.seed)
+            if not chosen:
+                raise ConfigError(f"{options.run} has no episode that can be played again: no submit was ok")
+            notes = verifier.report.notes
+            if options.sample is not None:
+                notes.append(f"the sample was drawn with --seed {options.seed}")
+            if not knows_run:
+                notes.append(
+                    "this coordinator has no record of the run: actions are those of the feedback files, hidden episodes"
+                    " are not checked, and policies get other seeds than they had"
+                )
+            progress.update(
+                task,
+                total=sum(
+                    len(indexes) * (1 + (options.policy and one.split == "train")) for one, indexes in chosen
+                ),
+            )
+
+            async def work() -> None:
+                for played, indexes in chosen:
+                    await verifier.replay(played, indexes)
+                    if options.policy and played.split == "train":
+                        await verifier.play_policy(played, indexes)
+                await verifier.check_fingerprint()
+
+            if cluster is not None:
+                tiers = {options.tier or run.record.sandbox_tier}
+                await cluster.start_workers([run.record.env], slots=options.slots, tiers=tiers)
+            failed = None if cluster is None else cluster.failed
+            await unless_failed(asyncio.create_task(work()), failed)
+    return verifier.report
+
+
+@contextlib.asynccontextmanager
+async def _link(options: _Options) -> AsyncIterator[tuple[transport.Link, LocalCluster | None]]:
+    """A link to the cluster; with `--local` the cluster too, which has no workers yet."""
+    async with contextlib.AsyncExitStack() as stack:
+        file, cluster = options.file, None
+        if options.local:
+            if options.state is not None and not options.state.is_dir():
+                raise ConfigError(f"--state {options.state}: there is no such state folder")
+            cluster = await stack.enter_async_context(
+                local_cluster("verify", state=options.state, data=options.data)
+            )
+            file = cluster.operator_file
+        found = credentials.find("operator", options.connect, file)
+        yield await stack.enter_async_context(transport.connect(found)), cluster
+
+
+def _print(report: Report, console: Terminal) -> None:
+    def say(text: str) -> None:
+        console.print(one_line(text), soft_wrap=True)
+
+    def listed(heading: str, lines: list[str]) -> None:
+        if lines:
+            say(heading)
+            for line in lines[:_SHOWN]:
+                say(f"  {line}")
+            if len(lines) > _SHOWN:
+                say(f"  … and {len(lines) - _SHOWN} more (--json tells all)")
+
+    for note in report.notes:
+        say(f"note: {note}")
+    listed("library versions differ:", report.fingerprint_differences)
+    listed("not checked:", [f"{one.episode}: {one.difference}" for one in report.not_checked])
+    listed("differs:", [f"{one.episode}: {one.difference}" for one in report.differences])
+    source = f", {report.from_files} of them from feedback files" if report.from_files else ""
+    verdict = "identical" if report.identical else "NOT identical"
+    say(f"{report.env}: recorded actions of {report.episodes} episodes{source}: {verdict}")
+    if report.policy_episodes:
+        others = len(report.policy_differences)
+        listed(
+            "policy again, advisory:",
+            [f"{one.episode}: {one.difference}" for one in report.policy_differences],
+        )
+        say(
+            f"policy again (advisory): {report.policy_episodes - others} of {report.policy_episodes} episodes the same"
+        )

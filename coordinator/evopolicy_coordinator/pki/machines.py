@@ -1,0 +1,330 @@
+"""Which machines belong to a cluster: `STATE/certs`, and the folders that are handed out from it.
+
+    STATE/certs/
+      ca.pem, ca-key.pem                  the cluster's authority
+      coordinator.pem, coordinator-key.pem
+      machines.json                       every machine issued: its user name's password, its token, its certificate's serial
+      passwords                           the passwords of those that may come in, for Zenoh's router
+
+Rules:
+- A machine is `ROLE/NAME`: its certificate's common name and its user name. Its password and token are its own, so that
+  any one machine can be shut out alone.
+- Who is revoked is in no list that the coordinator listens with: not in the passwords, not in the access rules; and its
+  token, and sessions got with it, are refused (which also holds where a router stands between).
+- Issuing a name again voids what was issued before it.
+- `machines.json` is read anew whenever it changes, so that `certs issue` and `certs revoke` need no restart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import fcntl
+import hmac
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.wire import credentials, keys
+from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles
+from evopolicy_coordinator.pki import certs
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+BESIDE: dict[MachineRole, tuple[Role, ...]] = {"operator": ("gateway",)}
+"""Roles that are issued in one folder: an operator's machine starts gateways, which get rights of their own."""
+
+
+class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One role of one machine."""
+
+    role: MachineRole
+    name: str
+    password: str
+    token: str
+    """What its worker joins with, or its operator asks with; a gateway has its run's capability instead."""
+    serial: str
+    """Of its certificate; no two are alike, so it also tells one issue of a name from the next."""
+    issued: dt.datetime
+    expires: dt.datetime
+    revoked: dt.datetime | None = None
+
+    @property
+    def identity(self) -> str:
+        """As it stands in the machine's certificate, and as its user name."""
+        return f"{self.role}/{self.name}"
+
+
+class Machines:
+    """The machines of a state folder, as they are now. Cheap to ask: reads the file only when it has changed."""
+
+    def __init__(self, state: Path) -> None:
+        self.folder = state / "certs"
+        self._stamp: tuple[int, ...] = ()
+        self._all: dict[str, Machine] = {}
+        self._serials: dict[str, Machine] = {}
+
+    @property
+    def tls(self) -> TlsFiles | None:
+        """The coordinator's own certificate; None before `certs init`."""
+        found = TlsFiles(
+            root_ca=str(self.folder / "ca.pem"),
+            certificate=str(self.folder / "coordinator.pem"),
+            private_key=str(self.folder / "coordinator-key.pem"),
+        )
+        return found if Path(found.private_key).exists() else None
+
+    @property
+    def passwords(self) -> Path:
+        """The file that Zenoh's session for other machines reads."""
+        return self.folder / "passwords"
+
+    def all(self) -> tuple[Machine, ...]:
+        """Every machine, revoked ones too, by identity."""
+        self._refresh()
+        return tuple(self._all[identity] for identity in sorted(self._all))
+
+    def admitted(self) -> tuple[Machine, ...]:
+        """Those that may come in. Expiry is not looked at: TLS does."""
+        return tuple(machine for machine in self.all() if machine.revoked is None)
+
+    def stamp(self) -> tuple[int, ...]:
+        """Changes whenever a machine is issued or revoked, or the coordinator's certificate is renewed."""
+        return (*_stat(self.folder / "machines.json"), *_stat(self.folder / "coordinator.pem"))
+
+    def write_passwords(self) -> None:
+        """Writes the file that Zenoh's router reads. Never an empty one: that would let in whoever names no user."""
+        lines = [f"{machine.identity}:{machine.password}\n" for machine in self.admitted()]
+        lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
+        write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
+
+    def holder(self, role: Role, token: str) -> Machine | None:
+        """The admitted machine of this role whose token it is; compared in constant time."""
+        found = None
+        for machine in self.admitted():
+            if (
+                machine.role == role
+                and machine.token
+                and hmac.compare_digest(machine.token.encode(), token.encode())
+            ):
+                found = machine
+        return found
+
+    def session_for(self, token: str) -> str:
+        """A new session for a worker that registers; it tells which machine it is of, if its token is one's."""
+        machine = self.holder("worker", token)
+        made = secrets.token_urlsafe(16)
+        return made if machine is None else f"{machine.serial}:{made}"
+
+    def is_shut_out(self, session: str) -> bool:
+        """Whether the session is of a machine that has been revoked, or issued again, since."""
+        serial, colon, _ = session.partition(":")
+        if not colon:
+            return False
+        self._refresh()
+        machine = self._serials.get(serial)
+        return machine is None or machine.revoked is not None
+
+    def _refresh(self) -> None:
+        path = self.folder / "machines.json"
+        stamp = _stat(path)
+        if stamp == self._stamp:
+            return
+        try:
+            self._all = {machine.identity: machine for machine in _read(path)}
+        except ConfigError as error:
+            if not self._stamp:
+                raise
+            # A coordinator that runs goes on with whom it knew.
+            log.error("the list of machines cannot be read", why=str(error))
+        self._serials = {machine.serial: machine for machine in self._all.values()}
+        self._stamp = stamp
+
+
+def init(
+    state: Path, cluster: str, hosts: tuple[str, ...], now: dt.datetime, days: int, *, anew: bool
+) -> None:
+    """Makes the authority, unless there is one and not `anew`, and the coordinator's certificate.
+
+    A new authority voids every machine of the old one, which are forgotten.
+    """
+    with _changing(state) as folder:
+        kept = not anew and (folder / "ca-key.pem").exists()
+        authority = _authority(folder) if kept else certs.make_authority(cluster, now)
+        own = certs.issue(authority, certs.COORDINATOR, now, days, hosts=hosts, serves=True)
+        if not kept:
+            _write(folder / "machines.json", b"[]")
+            _write(folder / "ca-key.pem", authority.private_key)
+            _write(folder / "ca.pem", authority.certificate)
+        _write(folder / "coordinator-key.pem", own.private_key)
+        # Last: it is what a running coordinator looks at.
+        _write(folder / "coordinator.pem", own.certificate)
+
+
+def issue(
+    state: Path,
+    cluster: str,
+    role: MachineRole,
+    name: str,
+    endpoints: tuple[str, ...],
+    out: Path,
+    now: dt.datetime,
+    days: int,
+    *,
+    hosts: tuple[str, ...] = (),
+    again: bool = False,
+) -> tuple[Machine, ...]:
+    """Writes the folder `out` for a machine and lists it as admitted; whatever else was issued to it is void.
+
+    Raises ConfigError for a wrong name, a name that was issued already unless `again`, a folder that is not empty, or
+    before `init`.
+    """
+    if not keys.valid_name(name):
+        raise ConfigError(f"NAME {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
+    roles: tuple[MachineRole, ...] = (role, *BESIDE.get(role, ()))
+    with _changing(state) as folder:
+        authority = _authority(folder)
+        listed = {machine.identity: machine for machine in _read(folder / "machines.json")}
+        for old in (listed.get(f"{one}/{name}") for one in roles):
+            if old is not None and not again:
+                how = f"until {old.expires:%Y-%m-%d}" if old.revoked is None else "and revoked"
+                raise ConfigError(
+                    f"{old.identity} was issued already ({how}); --renew makes it a new folder and voids the old one"
+                )
+        made = [_make(authority, one, name, hosts, now, days) for one in roles]
+        _make_folder(out, again)
+        for machine, pair in made:
+            listed[machine.identity] = machine
+            prefix = "" if machine.role == role else f"{machine.role}-"
+            _write_folder(out, machine, pair, prefix, cluster, endpoints)
+        _write(out / "ca.pem", authority.certificate)
+        _write_machines(folder, listed)
+    return tuple(machine for machine, _ in made)
+
+
+def revoke(state: Path, name: str, now: dt.datetime) -> tuple[Machine, ...]:
+    """Shuts out the machine `ROLE/NAME`, or all roles of `NAME`. ConfigError when there is no such machine."""
+    with _changing(state) as folder:
+        listed = {machine.identity: machine for machine in _read(folder / "machines.json")}
+        meant = [machine for machine in listed.values() if name in (machine.name, machine.identity)]
+        if not meant:
+            known = ", ".join(sorted(listed)) or "none"
+            raise ConfigError(f"no machine {name!r} was issued; there are: {known}")
+        for machine in meant:
+            if machine.revoked is None:
+                listed[machine.identity] = msgspec.structs.replace(machine, revoked=now)
+        _write_machines(folder, listed)
+    return tuple(listed[machine.identity] for machine in meant)
+
+
+def coordinators_certificate(state: Path) -> certs.Described | None:
+    """What the coordinator's own certificate says; None before `init`."""
+    try:
+        return certs.describe((state / "certs" / "coordinator.pem").read_bytes())
+    except FileNotFoundError:
+        return None
+
+
+def _make(
+    authority: certs.Pair, role: MachineRole, name: str, hosts: tuple[str, ...], now: dt.datetime, days: int
+) -> tuple[Machine, certs.Pair]:
+    common_name = f"{role}/{name}"
+    if len(common_name) > 64:
+        raise ConfigError(f"NAME {name!r} is too long: {common_name!r} has over 64 characters")
+    pair = certs.issue(authority, common_name, now, days, hosts=hosts, serves=role == "router")
+    told = certs.describe(pair.certificate)
+    machine = Machine(
+        role=role,
+        name=name,
+        password=secrets.token_urlsafe(24),
+        token=secrets.token_urlsafe(32) if role in ("worker", "operator") else "",
+        serial=told.serial,
+        issued=now,
+        expires=told.expires,
+    )
+    return machine, pair
+
+
+def _write_folder(
+    out: Path, machine: Machine, pair: certs.Pair, prefix: str, cluster: str, endpoints: tuple[str, ...]
+) -> None:
+    _write(out / f"{prefix}cert.pem", pair.certificate)
+    _write(out / f"{prefix}key.pem", pair.private_key)
+    if machine.role == "router":  # its password goes into its zenohd's configuration: `router_config.py`
+        return
+    credentials.write(
+        Credentials(
+            cluster=cluster,
+            role=machine.role,
+            endpoints=endpoints,
+            user=machine.identity,
+            password=machine.password,
+            token=machine.token,
+            tls=TlsFiles(root_ca="ca.pem", certificate=f"{prefix}cert.pem", private_key=f"{prefix}key.pem"),
+        ),
+        out / f"{machine.role}.json",
+    )
+
+
+def _make_folder(out: Path, again: bool) -> None:
+    try:
+        out.mkdir(parents=True, mode=0o700, exist_ok=True)
+        if any(out.iterdir()) and not (again and (out / "ca.pem").exists()):
+            raise ConfigError(f"{out} holds files already; name another folder with --out")
+        out.chmod(0o700)
+    except OSError as error:
+        raise ConfigError(f"cannot make folder {out}: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def _changing(state: Path) -> Iterator[Path]:
+    """The folder of certificates, for one command at a time."""
+    folder = state / "certs"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield folder
+    finally:
+        os.close(fd)
+
+
+def _authority(folder: Path) -> certs.Pair:
+    try:
+        return certs.Pair((folder / "ca.pem").read_bytes(), (folder / "ca-key.pem").read_bytes())
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{folder.parent} has no certificate authority yet: evopolicy-coordinator certs init"
+        ) from error
+
+
+def _read(path: Path) -> list[Machine]:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=list[Machine])
+    except FileNotFoundError:
+        return []
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"{path} is damaged: {error}; restore it from a backup") from error
+
+
+def _write_machines(folder: Path, listed: dict[str, Machine]) -> None:
+    told = [listed[identity] for identity in sorted(listed)]
+    _write(folder / "machines.json", msgspec.json.format(msgspec.json.encode(told)))
+
+
+def _write(path: Path, data: bytes) -> None:
+    write_atomically(path, data, mode=0o600)
+
+
+def _stat(path: Path) -> tuple[int, ...]:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return (0, 0, 0)
+    return (found.st_mtime_ns, found.st_ino, found.st_size)

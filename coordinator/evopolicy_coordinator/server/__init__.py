@@ -1,0 +1,1 @@
+"""The running coordinator around its core: requests in, effects out."""

@@ -1,0 +1,119 @@
+"""What an audit needs of the stored recordings: the actions by themselves, and whether two records are the same.
+
+Rules that this module owns:
+- A worker that plays an episode again is given its actions and nothing that came of them.
+- What a player handed in is never trusted to be a recording; what cannot be read is its fault, what the store has lost is
+  not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from evopolicy_common.errors import ProtocolError, StorageError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.trajectory import Recorder, Trajectory, decode
+from evopolicy_coordinator.core.effects import AuditEffect, CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.events import AuditCompared, AuditEvent, AuditPrepared
+from evopolicy_coordinator.storage.store import Reader
+from evopolicy_coordinator.verify import compare as verify_compare
+
+_LOST = "its record is not in the store any more"
+
+
+def carry_out(effect: AuditEffect, reader: Reader, blobs: BlobStore) -> AuditEvent:
+    """Carries out an audit's effect: reads, stores, compares. Never raises for what a worker handed in, or the store."""
+    return (
+        _prepare(effect, reader, blobs)
+        if isinstance(effect, PrepareAudit)
+        else _compare(effect, reader, blobs)
+    )
+
+
+def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPrepared:
+    actions: BlobRef | None = None
+    error, at_fault = "", False
+    try:
+        recorded = _recording(_outcome(reader, effect.group, effect.index), blobs)
+        arrays = isinstance(recorded.actions, np.ndarray)
+        packed = action_log([np.asarray(action) if arrays else action for action in recorded.actions])
+        actions = BlobRef(digest=blobs.put(packed), size=len(packed))
+    except ProtocolError as caught:
+        error, at_fault = f"its recording cannot be read: {caught}", True
+    except StorageError as caught:
+        error = f"{_LOST}: {caught}"
+    return AuditPrepared(
+        stimulus_id=effect.stimulus_id,
+        run=effect.run,
+        audit=effect.audit,
+        actions=actions,
+        error=error,
+        at_fault=at_fault,
+    )
+
+
+def _compare(effect: CompareAudit, reader: Reader, blobs: BlobStore) -> AuditCompared:
+    with_player: str | None = None
+    with_first: str | None = None
+    error = ""
+    try:
+        player = _outcome(reader, effect.group, effect.index)
+        replays = [_outcome(reader, group, 0) for group in effect.replays]
+        with_player = outcome_difference(player, replays[-1], blobs)
+        if len(replays) > 1:
+            with_first = outcome_difference(replays[0], replays[-1], blobs)
+    except StorageError as caught:
+        error = f"{_LOST}: {caught}"
+    return AuditCompared(
+        stimulus_id=effect.stimulus_id,
+        run=effect.run,
+        audit=effect.audit,
+        replay=len(effect.replays),
+        with_player=with_player,
+        with_first=with_first,
+        error=error,
+    )
+
+
+def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: BlobStore) -> str | None:
+    """Where two outcomes of the same actions part, in words; None when they are the same bit for bit.
+
+    The policy's side of them (failure, output, times) is left out. StorageError when the store has lost a recording.
+    """
+    recordings = []
+    for outcome in (ours, theirs):
+        try:
+            recordings.append(_recording(outcome, blobs))
+        except ProtocolError as error:
+            return f"a recording cannot be read: {error}"
+    left, right = recordings
+    if (left.record, left.observations) != (right.record, right.observations):
+        return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
+    return verify_compare.first_difference(left, right) or verify_compare.outcome_difference(ours, theirs)
+
+
+def action_log(actions: list[Any]) -> bytes:
+    """A trajectory's bytes with these actions and nothing else."""
+    recorder = Recorder("actions")
+    for action in actions:
+        kept = np.asarray(action) if isinstance(action, np.generic) else action
+        recorder.append(None, kept, 0.0, False, False, {})
+    return recorder.finish()
+
+
+def _outcome(reader: Reader, group: str, index: int) -> EpisodeOutcome:
+    row = reader.outcome(group, index)
+    if row is None:
+        raise StorageError(f"there is no outcome {index} of {group}")
+    return row.outcome
+
+
+def _recording(outcome: EpisodeOutcome, blobs: BlobStore) -> Trajectory:
+    """The outcome's recording; ProtocolError when it is none."""
+    ref = outcome.trajectory
+    if ref is None:
+        raise ProtocolError("there is none")
+    return decode(blobs.read(ref.digest) if ref.inline is None else ref.inline)

@@ -1,0 +1,109 @@
+"""Which host plays which run of a sweep.
+
+Rules:
+- A claim is held by one holder until its time is up, it is given back, or it is settled. A settled one is settled for good.
+- Who holds it and what it came to are on disk before they are answered. The time is not: after a restart every holder has
+  its full time again, so nothing is taken from a host for the coordinator's being away.
+- A holder that asks again, also after its own restart, keeps what it has.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, DamagedStoreError, RefusedError
+from evopolicy_common.messages.operator import Claim, ClaimState
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.storage.store import Store, unreadable
+from evopolicy_coordinator.storage.writer import Writer
+
+MAX_TTL_S = 3600.0
+_MAX_NAME = 300
+_MAX_RESULT_BYTES = 1 << 16
+
+
+class ClaimRow(msgspec.Struct, frozen=True, kw_only=True):
+    """What is on disk of a claim."""
+
+    holder: str
+    run: str = ""
+    ttl_s: float = 0.0
+    result: dict[str, Any] | None = None
+
+
+_rows = msgspec.msgpack.Decoder(ClaimRow)
+
+
+class Claims:
+    """All claims; read from the store when the first is asked for."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._rows: dict[tuple[str, str], ClaimRow] | None = None
+        self._until: dict[tuple[str, str], float] = {}
+        """When a held claim's time is up, Unix seconds."""
+        self._one_at_a_time = asyncio.Lock()
+
+    async def ask(self, message: Claim, now: float) -> ClaimState:
+        """Takes, renews, gives back or settles. RefusedError for what cannot be asked, StorageError when the disk refuses."""
+        _check(message)
+        async with self._one_at_a_time:
+            rows = await self._loaded(now)
+            key = (message.suite, message.name)
+            row = rows.get(key)
+            if row is not None and row.result is not None:
+                return ClaimState(granted=False, holder=row.holder, run=row.run, result=row.result)
+            free = row is None or not row.holder or self._until.get(key, 0.0) <= now
+            if row is not None and row.holder != message.holder and not free:
+                return ClaimState(granted=False, holder=row.holder, run=row.run)
+            previous = row.holder if row is not None and row.holder != message.holder else ""
+            given_back = message.ttl_s <= 0.0 and message.result is None
+            last_run = "" if row is None else row.run
+            new = ClaimRow(
+                holder="" if given_back else message.holder,
+                run=message.run or last_run,
+                ttl_s=message.ttl_s,
+                result=message.result,
+            )
+            if new != row:
+                data = msgspec.msgpack.encode(new)
+                await self._writer.call(lambda store: store.write_claim(*key, data))
+                rows[key] = new
+            self._until[key] = now + message.ttl_s
+            return ClaimState(
+                granted=not given_back,
+                holder=new.holder,
+                run=last_run,
+                previous=previous,
+                result=message.result,
+            )
+
+    async def _loaded(self, now: float) -> dict[tuple[str, str], ClaimRow]:
+        if self._rows is None:
+            found = await self._writer.call(Store.claims)
+            self._rows = {(suite, name): _decoded(suite, name, data) for suite, name, data in found}
+            self._until = {key: now + row.ttl_s for key, row in self._rows.items()}
+        return self._rows
+
+
+def _decoded(suite: str, name: str, data: bytes) -> ClaimRow:
+    try:
+        return _rows.decode(data)
+    except DECODE_ERRORS as error:
+        raise DamagedStoreError(
+            f"table claims, row (suite, name) = {suite, name}: {unreadable(error)}"
+        ) from error
+
+
+def _check(message: Claim) -> None:
+    for what in ("suite", "name", "holder"):
+        if not 1 <= len(getattr(message, what)) <= _MAX_NAME:
+            raise RefusedError(Refusal.BAD_MESSAGE, f"a claim's {what} has 1 to {_MAX_NAME} characters")
+    if not (math.isfinite(message.ttl_s) and 0.0 <= message.ttl_s <= MAX_TTL_S):
+        raise RefusedError(Refusal.BAD_MESSAGE, f"ttl_s {message.ttl_s}: 0 to {MAX_TTL_S:g} seconds")
+    if message.result is not None and len(msgspec.msgpack.encode(message.result)) > _MAX_RESULT_BYTES:
+        raise RefusedError(Refusal.BAD_MESSAGE, "a claim's result is larger than 64 KiB")

@@ -1,0 +1,171 @@
+"""One coordinator process: everything opened in order, and closed in reverse.
+
+The state folder is locked first and released last; workers are told nothing before the core is loaded.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.simulators import SIMULATORS
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.ready import Ready
+from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.answers import Answers
+from evopolicy_coordinator.server.intake import Intake
+from evopolicy_coordinator.server.remote_door import declare_all, remote_door
+from evopolicy_coordinator.server.service import Service
+from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.splits import SplitSource, load_or_create_secret
+from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
+from evopolicy_coordinator.storage.store import Store
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True):
+    """What a coordinator is started with."""
+
+    state: Path
+    data: Path | None = None
+    """Folder of split files; None derives the splits from the state folder's secret."""
+    listen: tuple[str, ...] = ()
+    """Endpoints beside the unix socket in the state folder; port 0 takes a free one."""
+    insecure_tcp: bool = False
+    """Whether `tcp/` may be listened on beyond this machine, where tokens and results can be read on the wire."""
+    cluster: str | None = None
+    allowed_packages: tuple[str, ...] = ()
+    """What workers let policies import beside numpy; told in `/info`."""
+    core: CoreSettings = CoreSettings()
+
+
+async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:
+    """Serves until `stop` is set, then makes all durable and returns.
+
+    Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
+    TransportError when an endpoint cannot be listened on, PartFailedError when a part of it cannot go on.
+    """
+    with contextlib.ExitStack() as opened:
+        state = StateFolder.open(options.state, options.cluster)
+        opened.callback(state.close)
+        source = SplitSource(data=options.data, secret=load_or_create_secret(state.root))
+        machines = Machines(state.root)
+        listen, remote = _listen(state, options, machines)
+        store = Store(state.database)
+        opened.callback(store.close)
+        blobs = BlobStore(state.root / "blobs")
+        blobs.drop_unfinished()
+        uploads = Uploads()
+        intake = Intake(
+            state.identity,
+            blobs,
+            source,
+            uploads,
+            allowed_imports=("numpy", *options.allowed_packages),
+            denied_imports=SIMULATORS,
+            machines=machines,
+        )
+        answers = Answers(state.database, blobs, uploads)
+        service = Service(state.identity.cluster, store, answers, intake, options.core)
+        try:
+            await service.start()
+            door = remote_door(
+                state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
+            )
+            async with door:
+                await _serve(state, options, listen, reachable(remote), service, stop, on_ready)
+        finally:
+            await service.stop()
+        log.info("stopped; everything is on disk", state=str(state.root))
+
+
+async def _serve(
+    state: StateFolder,
+    options: Options,
+    listen: tuple[str, ...],
+    remote: tuple[str, ...],
+    service: Service,
+    stop: asyncio.Event,
+    on_ready: Callable[[Ready], None],
+) -> None:
+    """Serves this machine on `listen` until `stop`; other machines are served on `remote` meanwhile."""
+    cluster = state.identity.cluster
+    state.write_passwords()
+    endpoints = reachable(listen)
+    files = state.write_credentials(endpoints, insecure_tcp=options.insecure_tcp)
+    config = transport.server_config(cluster, listen, state.passwords, {role: role for role in ROLES})
+    async with transport.serve(config, service.on_queries) as server:
+        declare_all(server, cluster, service.on_liveliness)
+        credentials.publish(endpoints, state.credentials)
+        try:
+            on_ready(
+                Ready(
+                    cluster=cluster,
+                    endpoints=(*endpoints, *remote),
+                    credentials={role: str(path) for role, path in files.items()},
+                    state=str(state.root),
+                )
+            )
+            await _until(stop, service)
+            log.info("stopping")
+        finally:
+            credentials.withdraw(endpoints)
+            # While the sessions are still open: what was handled is answered, everyone else is let go.
+            await service.stop()
+
+
+async def _until(stop: asyncio.Event, service: Service) -> None:
+    """Waits for `stop`; PartFailedError as soon as the service cannot go on."""
+    waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.failure())]
+    try:
+        done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+
+def _listen(
+    state: StateFolder, options: Options, machines: Machines
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Where to listen for this machine (the state folder's socket, always, and what was asked for), and for others."""
+    for endpoint in options.listen:
+        _check_listen(endpoint, options.insecure_tcp, machines)
+    wanted = resolve_listen(list(options.listen))
+    remote = tuple(endpoint for endpoint in wanted if endpoint.startswith("tls/"))
+    listen = tuple(endpoint for endpoint in wanted if endpoint not in remote)
+    try:
+        return (state.socket_endpoint, *listen), remote
+    except ConfigError as error:
+        if not listen:
+            raise
+        log.warning("not listening on a unix socket", why=str(error))
+        return listen, remote
+
+
+def _check_listen(endpoint: str, insecure_tcp: bool, machines: Machines) -> None:
+    if endpoint.startswith("tls/"):
+        if machines.tls is None:
+            raise ConfigError(
+                f"--listen {endpoint}: there are no certificates in {machines.folder}; make them first with"
+                f" evopolicy-coordinator certs init --state {machines.folder.parent}"
+            )
+    elif endpoint.startswith("tcp/") and not credentials.stays_on_machine(endpoint):
+        if not insecure_tcp:
+            raise ConfigError(
+                f"--listen {endpoint} would send tokens and results in the clear; run `evopolicy-coordinator certs init`"
+                f" once and listen on {endpoint.replace('tcp/', 'tls/', 1)} (or, on a network that you trust, add"
+                " --insecure-tcp)"
+            )
+        log.warning("tokens and results travel in the clear; keep to a trusted network", endpoint=endpoint)

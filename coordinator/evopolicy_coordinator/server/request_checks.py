@@ -1,0 +1,143 @@
+"""What is checked of a request on its own, without asking the store or the core: RefusedError where it does not hold."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import RefusedError
+from evopolicy_common.messages import worker
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.refusals import Refusal
+
+MAX_COUNT = 2**31 - 1
+MAX_BUDGET = 20_000
+MAX_EPISODES_PER_SUBMIT = 10_000
+MAX_HIDDEN = 10_000
+"""Validation or held-out cases of a run. What is told of a run once it is finished has to fit into one message."""
+MAX_JOB_BYTES = 8 << 20
+MAX_AGENT_BYTES = 256 << 10
+_MAX_WAIT_S = 60.0
+_MAX_NAME = 200
+
+
+def finite_wait(seconds: float) -> float:
+    """A long poll's wait, made finite: NaN decodes."""
+    return min(seconds, _MAX_WAIT_S) if seconds > 0 else 0.0
+
+
+def finite_cursor(cursor: int) -> int:
+    """A cursor within what can be stored."""
+    return min(max(0, cursor), MAX_COUNT)
+
+
+def check_limits(limits: ResourceLimits) -> None:
+    """Every limit is a finite number above zero, and no larger than can be kept."""
+    for name in limits.__struct_fields__:
+        value = getattr(limits, name)
+        most = LARGEST_LIMITS.get(name, LARGEST_LIMIT)
+        if value is not None and not 0 < value <= most:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and at most {most:,}"
+            )
+
+
+def check_counts(budget: int, least: int, most: int, n_validation: int | None, n_heldout: int | None) -> None:
+    """How many episodes a run may have."""
+    if not 1 <= least <= most:
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS,
+            f"budget {budget} and {least} to {most} episodes a submit do not go together; all are at least 1",
+        )
+    for what, n, limit in (
+        ("a budget", budget, MAX_BUDGET),
+        ("submits", most, MAX_EPISODES_PER_SUBMIT),
+        ("validation", n_validation or 0, MAX_HIDDEN),
+        ("held-out", n_heldout or 0, MAX_HIDDEN),
+    ):
+        if n > limit:
+            raise RefusedError(Refusal.INVALID_SETTINGS, f"{what} of {n:,} episodes; {limit:,} are the limit")
+
+
+def check_job(cases: Sequence[Case], n: int) -> None:
+    """`n` episodes on these cases fit into one lease, as they have to with policy scope `submit`."""
+    longest = max((len(msgspec.msgpack.encode(case)) for case in cases), default=0)
+    if n * (longest + 200) > MAX_JOB_BYTES:
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS,
+            f"with policy scope submit {n} episodes go to a worker at once, here {n * (longest + 200):,} bytes;"
+            f" {MAX_JOB_BYTES:,} are the limit: allow fewer episodes a submit, or shorten the cases' options",
+        )
+
+
+def bounded_agent(agent: dict[str, Any]) -> dict[str, Any]:
+    """What a gateway says of its agent; no more than can be told of a finished run. A run is closed in any case."""
+    size = len(msgspec.msgpack.encode(agent))
+    if size <= MAX_AGENT_BYTES:
+        return agent
+    return {"left_out": f"{size:,} bytes; {MAX_AGENT_BYTES:,} are the limit"}
+
+
+def check_token(expected: str, given: str) -> None:
+    """The token is the one expected, compared in constant time."""
+    if not hmac.compare_digest(expected.encode(), given.encode()):
+        raise RefusedError(
+            Refusal.BAD_TOKEN, "wrong token, or one of something that is not here; see the credentials file"
+        )
+
+
+def check_key(tail: str, expected: str) -> None:
+    """The message came on the key that its kind belongs on."""
+    if tail != expected:
+        raise RefusedError(Refusal.WRONG_KEY, f"this message belongs on {expected!r}, not on {tail!r}")
+
+
+def check_idempotency_key(key: str) -> None:
+    """A key has a bounded length."""
+    if not 1 <= len(key) <= _MAX_NAME:
+        raise RefusedError(
+            Refusal.BAD_MESSAGE, f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
+        )
+
+
+def check_registration(message: worker.Register) -> None:
+    """The worker speaks this protocol, under a name that can stand in a key."""
+    if message.protocol != codec.WIRE_VERSION:
+        raise RefusedError(
+            Refusal.WRONG_PROTOCOL,
+            f"worker speaks wire version {message.protocol}, the coordinator {codec.WIRE_VERSION}: install the same"
+            " version of evopolicy on both",
+        )
+    if not keys.valid_name(message.worker):
+        raise RefusedError(
+            Refusal.BAD_NAME,
+            f"worker name {message.worker[:80]!r}: letters, digits, '.', '_', '-', at most 63",
+        )
+    if not 1 <= message.slots <= 4096:
+        raise RefusedError(Refusal.BAD_MESSAGE, f"{message.slots} slots: a worker has 1 to 4096")
+    check_place(message.boot_id, message.machine_id, message.host)
+
+
+def check_place(boot_id: str, machine_id: str, host: str) -> None:
+    """Names of a kernel, a machine and a host have a bounded length."""
+    for name, value in (("boot id", boot_id), ("machine id", machine_id), ("host name", host)):
+        if len(value) > _MAX_NAME or not value.isprintable():
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, f"{name} {value[:64]!r}: at most {_MAX_NAME} printable characters"
+            )
+
+
+def check_inline(ref: BlobRef | None) -> None:
+    """Bytes that came inside a message are the blob they are said to be."""
+    if ref is None or ref.inline is None:
+        return
+    if len(ref.inline) != ref.size or digest_of(ref.inline) != ref.digest:
+        raise RefusedError(
+            Refusal.BAD_BLOB, f"inline bytes are not blob {ref.digest[:64]!r} of {ref.size} bytes"
+        )

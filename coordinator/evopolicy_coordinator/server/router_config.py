@@ -1,0 +1,158 @@
+"""The configuration of a site's own Zenoh router, `zenohd`: written from the rules that the coordinator itself keeps.
+
+A site's machines connect to its router, which connects to the coordinator (or to another router on the way there). Each
+router holds the machines behind it to their roles, as the coordinator does: access rules see only the next neighbour.
+
+    FOLDER/                      the router's folder, from `evopolicy-coordinator certs issue router NAME --out FOLDER`
+      ca.pem, cert.pem, key.pem
+      zenohd.json                what `zenohd --config` is given; holds the router's own password
+      passwords                  of the machines that may connect to it, and of nobody else
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.terminal import say
+from evopolicy_common.wire import transport
+from evopolicy_common.wire.credentials import TlsFiles, default_state_dir
+from evopolicy_coordinator.cli.certs import PORT, first_endpoint
+from evopolicy_coordinator.pki import certs
+from evopolicy_coordinator.pki.machines import Machine, Machines
+from evopolicy_coordinator.storage.state_folder import cluster_of
+
+
+def write_router_config(
+    state: Path,
+    name: str,
+    folder: Path,
+    *,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    uplink: str = certs.COORDINATOR,
+    admit: tuple[str, ...] = (),
+    installed_at: Path | None = None,
+) -> tuple[Machine, ...]:
+    """Writes `zenohd.json` and `passwords` into the folder of `router/NAME`, and returns whom it lets in.
+
+    `uplink` is what stands in the certificate of what it connects to. `admit` are identities, such as `worker/gpu-7`; none
+    named: every worker, gateway and operator that the coordinator admits now. `installed_at` is the folder's path on the
+    router's host, where it is not the same. ConfigError for a name that was not issued, or is revoked.
+    """
+    known = {machine.identity: machine for machine in Machines(state).admitted()}
+    own = known.get(f"router/{name}")
+    if own is None:
+        raise ConfigError(
+            f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name} --host ITS_ADDRESS"
+            f" --out {folder}"
+        )
+    for identity in (*admit, *(() if uplink == certs.COORDINATOR else (uplink,))):
+        if identity not in known:
+            raise ConfigError(f"{identity!r} is not admitted; there are: {', '.join(known)}")
+    if not (folder / "key.pem").exists():
+        raise ConfigError(f"{folder} is not the folder of router/{name}: it has no key.pem")
+    admitted = tuple(
+        machine
+        for machine in known.values()
+        if (machine.identity in admit if admit else machine.role != "router")
+    )
+    there = (installed_at or folder).absolute()
+    settings = transport.site_router_settings(
+        cluster_of(state, None),
+        listen,
+        there / "passwords",
+        [(machine.role, machine.identity) for machine in admitted],
+        TlsFiles(
+            root_ca=str(there / "ca.pem"),
+            certificate=str(there / "cert.pem"),
+            private_key=str(there / "key.pem"),
+        ),
+        connect,
+        uplink,
+        own.identity,
+        own.password,
+    )
+    lines = [f"{machine.identity}:{machine.password}\n" for machine in admitted]
+    # Never an empty file: that would let in whoever names no user.
+    lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
+    write_atomically(folder / "passwords", "".join(lines).encode(), mode=0o600)
+    write_atomically(
+        folder / "zenohd.json", json.dumps(nested(settings), indent=2).encode() + b"\n", mode=0o600
+    )
+    return admitted
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by key, such as `listen/endpoints`, as the tree that a configuration file holds."""
+    tree: dict[str, Any] = {}
+    for key, value in settings.items():
+        *above, last = key.split("/")
+        branch = tree
+        for part in above:
+            branch = branch.setdefault(part, {})
+        branch[last] = value
+    return tree
+
+
+def router_config(
+    name: Annotated[
+        str, typer.Argument(help="The router's name, as in `certs issue router NAME`.", show_default=False)
+    ],
+    folder: Annotated[Path, typer.Option(help="Its folder, which that command made.")],
+    state: Annotated[
+        Path | None, typer.Option(help="The state folder [$EVOPOLICY_STATE or the user's state home].")
+    ] = None,
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Where the site's machines reach it [tls/0.0.0.0:{PORT}]; may be repeated."),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            help=f"What it connects to; default: the coordinator's first --host, port {PORT}; may be repeated."
+        ),
+    ] = None,
+    uplink: Annotated[
+        str,
+        typer.Option(
+            help="What stands in the certificate of what it connects to: coordinator, or router/NAME."
+        ),
+    ] = certs.COORDINATOR,
+    admit: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Machine of the site, such as worker/gpu-7; may be repeated. Default: all but routers."
+        ),
+    ] = None,
+    installed_at: Annotated[
+        Path | None, typer.Option(help="The folder's path on the router's host, if another.")
+    ] = None,
+) -> None:
+    """Writes zenohd.json and the passwords it needs into a site router's folder, from the coordinator's own rules.
+
+    Write it again, and restart zenohd, whenever a machine of the site is issued or revoked.
+    """
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        admitted = write_router_config(
+            root,
+            name,
+            folder,
+            listen=tuple(listen or ()) or (f"tls/0.0.0.0:{PORT}",),
+            connect=tuple(connect or ()) or (first_endpoint(root),),
+            uplink=uplink,
+            admit=tuple(admit or ()),
+            installed_at=installed_at,
+        )
+        there = (installed_at or folder).absolute()
+        say(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
+        say(f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none")

@@ -1,0 +1,569 @@
+"""The coordinator's shell: queries in, effects out, around the pure core.
+
+Rules that this module owns:
+- The event loop never waits for a disk, a socket or a lock: the database has the writer's thread, pages and blobs have
+  theirs, answers are sent by the transport's.
+- Every batch of queries is one tick: all its events are handled, then its effects go to the outbox, so that one fsync
+  serves them all.
+- When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
+  the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
+  are asked again. The same follows a bug of the core, or a row that the store does not take, but only a few times in a row.
+- What the service does not know how to go on from (a store that cannot be loaded for another reason, a failure that comes back
+  after each load, a failure in its own machinery) ends the process with the reason: whoever keeps it up starts it again, on what
+  is on disk. See `failure`.
+- `now` is Unix time at the start, and not before what is on disk, advanced by the monotonic clock: a wall clock that is
+  set changes nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import time
+from collections.abc import Callable, Coroutine
+from importlib import metadata
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import (
+    DamagedStoreError,
+    PartFailedError,
+    ProtocolError,
+    RefusedError,
+    StorageError,
+)
+from evopolicy_common.messages import operator
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, LeaseRequest, Message, Refused
+from evopolicy_common.records import bundles
+from evopolicy_common.wire import codec
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.wire.transport import IncomingQuery
+from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
+from evopolicy_coordinator.core.events import (
+    AnyEvent,
+    AuditEvent,
+    EvaluationRequested,
+    LivenessLost,
+)
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.records import latest_time
+from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.workers import Worker
+from evopolicy_coordinator.server.answers import Answers, answer_bytes, answer_to, damaged, lane_of
+from evopolicy_coordinator.server.claims import Claims
+from evopolicy_coordinator.server.intake import Intake, Parsed
+from evopolicy_coordinator.server.pending import PendingQueries
+from evopolicy_coordinator.server.turned_away import TurnedAwayWorkers
+from evopolicy_coordinator.server.watchdog import LoopWatchdog
+from evopolicy_coordinator.storage.store import Store
+from evopolicy_coordinator.storage.writer import Outbox, Writer
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
+_FIRST_PAUSE_S = 0.2
+_LONGEST_PAUSE_S = 5.0
+_LOADS_MAX = 5
+"""How often a core is loaded anew after a failure that is not the disk's, each soon after the one before."""
+_SOON_S = 60.0
+_FORGET_S = 120.0
+"""Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
+_STALLS_TOLD = 5
+
+
+class Service:
+    """One coordinator's life on an event loop: `start`, then `on_queries` for each batch, at last `stop`."""
+
+    def __init__(
+        self,
+        cluster: str,
+        store: Store,
+        answers: Answers,
+        intake: Intake,
+        settings: CoreSettings,
+    ) -> None:
+        """To be made on the event loop. The store is the service's from now on; `stop` does not close it."""
+        self._cluster = cluster
+        self._answers = answers
+        self._intake = intake
+        self._settings = settings
+        self._loop = asyncio.get_running_loop()
+        self._writer = Writer(store)
+        self._claims = Claims(self._writer)
+        self._turned_away = TurnedAwayWorkers()
+        self._outbox: Outbox | None = None
+        self._core: Core | None = None
+        self._pending = PendingQueries()
+        self._incarnation = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._reload_pause_s = _FIRST_PAUSE_S
+        self._n_failures = 0
+        """Of the core, each within `_SOON_S` of the one before."""
+        self._failed_at = 0.0
+        self._storage_error = ""
+        self._stopping = False
+        self._failed: asyncio.Future[None] = self._loop.create_future()
+        self._unix_offset = time.time() - self._loop.time()
+        self._started_at = self.now()
+        self._watchdog: LoopWatchdog | None = None
+        self._sweeper: asyncio.TimerHandle | None = None
+        self.n_events = 0
+
+    async def start(self) -> None:
+        """Loads the core from the store. StorageError when that cannot be read or counted up; PartFailedError when it can be
+        read and no core comes of it."""
+        try:
+            await self._load()
+        except StorageError:
+            raise
+        except Exception as error:
+            raise self._fail("loading the state", error) from error
+        self._watchdog = LoopWatchdog()
+        self._sweep()
+
+    async def stop(self) -> None:
+        """Takes nothing more, makes durable what was handled, answers it, and ends every other query.
+
+        Stopping again does nothing.
+        """
+        if self._stopping:
+            return
+        self._stopping = True
+        self._cancel_timer()
+        if self._sweeper is not None:
+            self._sweeper.cancel()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        while self._outbox is not None and not self._outbox.idle:
+            # Comes back after everything that was submitted before it, and what that set going is next.
+            await self._writer.call(lambda store: None)
+        self._pending.let_go()
+        await self._writer.close()
+        await asyncio.to_thread(self._answers.close)
+        if self._watchdog is not None:
+            self._watchdog.close()
+
+    async def failure(self) -> None:
+        """Waits for ever, but for a part of the service that cannot go on: PartFailedError with the reason then."""
+        await asyncio.shield(self._failed)
+
+    def _fail(self, part: str, error: BaseException) -> PartFailedError:
+        """Serves nothing more: the process is to end. What is on disk stays, and is where the next one begins."""
+        log.error("a part of the coordinator cannot go on", part=part, exc_info=error)
+        failed = PartFailedError(f"{part} failed: {type(error).__name__}: {error}")
+        if not self._failed.done():
+            self._failed.set_exception(failed)
+            self._failed.exception()  # seen: nobody may wait for it, as at the start
+        self._forget_core()
+        return failed
+
+    def now(self) -> float:
+        """Unix time that never goes back, seconds."""
+        return self._unix_offset + self._loop.time()
+
+    # Queries in.
+
+    def on_queries(self, batch: list[IncomingQuery]) -> None:
+        """Handles one tick's queries."""
+        for query in batch:
+            try:
+                self._receive(query)
+            except Exception:
+                log.exception("request failed", key=query.key)
+                query.drop()
+        self._flush()
+
+    def on_liveliness(self, key: str, alive: bool) -> None:
+        """A worker's token came or went."""
+        worker = key.rsplit("/", 2)[-2]
+        log.debug("liveliness", worker=worker, alive=alive)
+        if not alive and self._core is not None and not self._stopping:
+            self._handle(LivenessLost(stimulus_id=self._stimulus("liveness"), worker=worker))
+            self._flush()
+
+    def _receive(self, query: IncomingQuery) -> None:
+        core = self._core
+        if core is None or self._stopping:
+            self._turn_away(query)
+            return
+        try:
+            parsed = self._intake.parse(query.key, query.payload, core)
+            self._serve(core, query, parsed)
+        except RefusedError as error:
+            self._refuse(query, error)
+        except ProtocolError as error:
+            self._refuse(query, RefusedError(Refusal.BAD_MESSAGE, str(error)))
+        except Exception:
+            # A bug of ours must not take the service down with it; the asker hears at once and may ask again.
+            log.exception("request failed", key=query.key)
+            query.drop()
+
+    def _serve(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        message = parsed.message
+        if isinstance(message, BlobPut):
+            self._serve_put(core, query, parsed, message)
+        elif isinstance(message, BlobGet):
+            self._serve_get(core, query, parsed, message)
+        elif isinstance(message, operator.Claim):
+            self._spawn(self._serve_claim(query, message))
+        elif isinstance(message, operator.StatusRequest):
+            query.reply(answer_bytes(self._status(core)), lane_of(parsed.asker))
+        elif isinstance(message, operator.RecordedRequest):
+            self._answers.recorded(message, answer_to(query, parsed.asker))
+        elif isinstance(message, operator.DescribeEnvironment):
+            offering = [
+                each for each in core.fleet.workers.values() if message.env in each.profile.descriptions
+            ]
+            fingerprints = tuple(
+                {repr(each.profile.fingerprint): each.profile.fingerprint for each in offering}.values()
+            )
+            self._spawn(self._serve_description(query, message, fingerprints))
+        elif self._intake.reads_files(message):
+            self._spawn(self._serve_from_thread(query, parsed))
+        else:
+            request = self._pending.admit(query, parsed.asker)
+            try:
+                event = self._intake.event(parsed, request, self._stimulus_of(message))
+            except BaseException:
+                self._pending.take(request)
+                raise
+            if isinstance(message, LeaseRequest):
+                event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
+            self._handle(event)
+
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            log.error("request failed", exc_info=error)
+
+    async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
+        """For requests whose event is made from files."""
+        request = self._pending.admit(query, parsed.asker)
+        stimulus = self._stimulus_of(parsed.message)
+        try:
+            event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
+        except RefusedError as error:
+            self._pending.take(request)
+            self._refuse(query, error)
+            return
+        except Exception:
+            log.exception("request failed", key=query.key)
+            self._pending.take(request)
+            query.drop()
+            return
+        if request in self._pending:  # else the core was dropped meanwhile, and the query with it
+            self._handle(event)
+            self._flush()
+
+    def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
+        event = self._intake.event(parsed, request, stimulus)
+        as_in = event.message.as_in if isinstance(event, EvaluationRequested) else None
+        if as_in is not None and as_in.run:
+            # The policy seeds of the run itself; the secret they come from does not leave.
+            secret = self._answers.finished_secret(as_in.run)
+            return event if secret is None else msgspec.structs.replace(event, secret=secret)
+        return event
+
+    async def _serve_description(
+        self,
+        query: IncomingQuery,
+        message: operator.DescribeEnvironment,
+        fingerprints: tuple[Fingerprint, ...],
+    ) -> None:
+        """What is here for playing a run's episodes again."""
+        try:
+            hashes = await asyncio.to_thread(self._intake.split_hashes, message)
+            secret = await asyncio.to_thread(self._answers.finished_secret, message.run)
+        except RefusedError as error:
+            self._refuse(query, error)
+        except Exception:
+            log.exception("request failed", key=query.key)
+            query.drop()
+        else:
+            known = operator.EnvironmentState(
+                split_hashes=hashes, knows_run=secret is not None, fingerprints=fingerprints
+            )
+            query.reply(answer_bytes(known))
+
+    async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
+        """Claims are beside the core: what they decide changes no run."""
+        try:
+            answer: Message = await self._claims.ask(message, self.now())
+        except RefusedError as error:
+            self._refuse(query, error)
+            return
+        except DamagedStoreError as error:
+            self._refuse(query, damaged(error))
+            return
+        except StorageError as error:
+            answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
+        except Exception:
+            log.exception("request failed", key=query.key)
+            query.drop()
+            return
+        query.reply(answer_bytes(answer))
+
+    def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
+        most = MAX_BUNDLE_BYTES
+        if parsed.room == "work":
+            _check_session(core, parsed.asker, message.token)
+            most = codec.MAX_BLOB_BYTES
+        elif parsed.room == "gw":
+            run = core.runs.get(parsed.asker)
+            if run is None or run.state.phase != "open":
+                raise RefusedError(*core.over(parsed.asker))
+        run_id = parsed.asker if parsed.room == "gw" else None
+        answer = answer_to(query, parsed.asker)
+        self._answers.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
+
+    def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
+        if parsed.room == "work":
+            worker = _check_session(core, parsed.asker, message.token)
+            if not any(lease.job.names_blob(message.digest) for lease in worker.leases.values()):
+                raise RefusedError(
+                    Refusal.UNKNOWN_BLOB,
+                    f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
+                )
+        run = parsed.asker if parsed.room == "gw" else None
+        self._answers.get(run, message, answer_to(query, parsed.asker))
+
+    def _status(self, core: Core) -> operator.StatusReply:
+        part = core.status(self.now())._asdict()
+        part["stalls"] = self._stalls(part["stalls"])
+        return operator.StatusReply(
+            cluster=self._cluster,
+            version=metadata.version("evopolicy"),
+            uptime_s=self.now() - self._started_at,
+            turned_away=self._turned_away.told(self.now()),
+            **part,
+        )
+
+    def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
+        log.info("refused", key=query.key, status=error.status, why=error.message)
+        answer = Refused(status=error.status, message=error.message)
+        self._turned_away.answered(query.key, query.payload, answer, self.now())
+        query.reply(answer_bytes(answer))
+
+    def _turn_away(self, query: IncomingQuery) -> None:
+        """Without a core nothing can be served; who would change something is told why."""
+        if self._storage_error and self._intake.asks_for_change(query.key, query.payload):
+            why = "the coordinator cannot write its store and takes nothing new until it can"
+            if not self._intake.is_gateways(
+                query.key
+            ):  # the reason names paths, which no agent needs to know
+                why += f": {self._storage_error}"
+            query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
+        else:
+            query.drop()
+
+    def _stimulus_of(self, message: Message) -> str:
+        return self._stimulus(type(message).__name__.lower())
+
+    def _stimulus(self, what: str) -> str:
+        self.n_events += 1
+        return f"{what}-{self._incarnation}.{self.n_events}"
+
+    # The core.
+
+    def _handle(self, event: AnyEvent) -> None:
+        self._advance(lambda core: core.handle(event, self.now()))
+
+    def _advance(self, step: Callable[[Core], list[Effect]]) -> None:
+        core, outbox = self._core, self._outbox
+        if core is None or outbox is None:
+            return
+        try:
+            effects = step(core)
+        except Exception as error:
+            # A bug. What the core holds may be half changed, what is on disk is not.
+            self._core_failed(error)
+            return
+        outbox.put(effects)
+
+    def _core_failed(self, error: Exception) -> None:
+        """Loads the core anew, unless that has not helped the last times."""
+        now = self._loop.time()
+        self._n_failures = self._n_failures + 1 if now - self._failed_at < _SOON_S else 1
+        self._failed_at = now
+        if self._n_failures > _LOADS_MAX:
+            self._fail(f"the core, {self._n_failures} times in a row,", error)
+            return
+        log.error("the core failed; loading it anew from the store", n=self._n_failures, exc_info=error)
+        self._drop_core()
+
+    def _flush(self) -> None:
+        try:
+            if self._outbox is not None:
+                self._outbox.flush()
+            self._set_timer()
+        except Exception as error:
+            self._fail("the outbox", error)
+
+    def _set_timer(self) -> None:
+        deadline = None if self._core is None or self._stopping else self._core.next_deadline()
+        if deadline is None:
+            self._cancel_timer()
+            return
+        at = deadline - self._unix_offset
+        if self._timer is not None:
+            if self._timer_at <= at:
+                # It fires early, finds nothing due, and is set anew: cheaper than setting it for each event.
+                return
+            self._timer.cancel()
+        self._timer_at = at
+        self._timer = self._loop.call_at(at, self._on_timer)
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        # Too early it does nothing, and is set anew.
+        self._advance(lambda core: core.handle_deadline(self.now()) if _is_due(core, self.now()) else [])
+        self._flush()
+
+    async def _load(self) -> None:
+        snapshot = await self._writer.call(Store.load)
+        self._incarnation = snapshot.incarnation
+        # A clock that was set back while no coordinator ran must not make anything end before it began.
+        self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
+        self._core, effects = Core.load(self._settings, snapshot, self.now())
+        self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
+        self._outbox.put(effects)
+        self._storage_error = ""
+        log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))
+        self._flush()
+
+    def _on_write_failure(self, error: BaseException) -> None:
+        if isinstance(error, DamagedStoreError):
+            self._core_failed(error)
+            return
+        if not isinstance(error, StorageError):
+            self._fail("writing the store", error)
+            return
+        self._storage_error = str(error)
+        self._drop_core()
+        log.error("the store refused to write; nothing is taken until it does", error=str(error))
+
+    def _drop_core(self) -> None:
+        """Forgets all that is not on disk, and begins to load what is."""
+        if self._outbox is not None and self._outbox.commits:
+            self._reload_pause_s = _FIRST_PAUSE_S
+        self._forget_core()
+        if not self._stopping:
+            self._spawn(self._reload())
+
+    def _forget_core(self) -> None:
+        if self._outbox is not None:
+            self._outbox.discard()
+        self._core = None
+        self._outbox = None
+        self._cancel_timer()
+        self._pending.let_go()
+
+    async def _reload(self) -> None:
+        while True:
+            await asyncio.sleep(self._reload_pause_s)
+            self._reload_pause_s = min(_LONGEST_PAUSE_S, 2 * self._reload_pause_s)
+            try:
+                await self._load()
+            except DamagedStoreError as error:
+                self._fail("loading the state", error)
+                return
+            except StorageError as error:
+                log.error("the store still refuses", error=str(error))
+                self._storage_error = str(error)
+            except Exception as error:
+                self._fail("loading the state", error)
+                return
+            else:
+                log.info("the store writes again")
+                return
+
+    # Effects out.
+
+    def _carry_out(self, effect: Effect) -> None:
+        try:
+            self._carried_out(effect)
+        except Exception:
+            # Of one asker, who asks again; those behind it are answered.
+            log.exception("cannot carry out", effect=type(effect).__name__)
+
+    def _carried_out(self, effect: Effect) -> None:
+        if isinstance(effect, Reply):
+            pending = self._pending.take(effect.request)
+            if pending is not None:
+                query = pending.query
+                self._turned_away.answered(query.key, query.payload, effect.message, self.now())
+                query.reply(answer_bytes(effect.message), lane_of(pending.asker))
+        elif isinstance(effect, ReadEffect):
+            pending = self._pending.take(effect.request)
+            if pending is not None:
+                self._answers.page(effect, answer_to(pending.query, pending.asker))
+        elif isinstance(effect, AuditEffect):
+            self._answers.audit(effect, self._told_of_audit(self._incarnation))
+        elif isinstance(effect, Log):
+            getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
+
+    def _told_of_audit(self, incarnation: int) -> Callable[[AuditEvent], None]:
+        """Hands what an audit came to to the core that asked; a later one asks anew for what it needs."""
+
+        def arrived(event: AuditEvent) -> None:
+            if incarnation == self._incarnation and not self._stopping:
+                self._handle(event)
+                self._flush()
+
+        def tell(event: AuditEvent) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+                self._loop.call_soon_threadsafe(arrived, event)
+
+        return tell
+
+    def _sweep(self) -> None:
+        """Lets go of queries that nobody waits for any more: those of lost workers are never answered."""
+        self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
+        self._pending.let_go(_FORGET_S)
+        self._tell_stalls()
+
+    def _tell_stalls(self) -> None:
+        """Names in the log what waits longer than it should, as `evopolicy status` does."""
+        stalls = () if self._core is None else self._stalls(self._core.status(self.now()).stalls)
+        if stalls:
+            log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_TOLD])
+
+    def _stalls(self, of_core: tuple[str, ...]) -> tuple[str, ...]:
+        """What waits longer than it should, and for what: for the disk, and in the core."""
+        writing_s = 0.0 if self._outbox is None else self._outbox.writing_s
+        if writing_s <= self._settings.stall_s:
+            return of_core
+        return (
+            f"{len(self._pending)} requests wait for the disk: it has been writing for {writing_s:.0f} s",
+            *of_core,
+        )
+
+
+def _is_due(core: Core, now: float) -> bool:
+    deadline = core.next_deadline()
+    return deadline is not None and now >= deadline
+
+
+def _check_session(core: Core, name: str, session: str) -> Worker:
+    worker = core.fleet.workers.get(name)
+    if worker is None or not hmac.compare_digest(worker.session.encode(), session.encode()):
+        raise RefusedError(
+            Refusal.UNKNOWN_WORKER, f"worker {name[:64]!r} has no such session; register again"
+        )
+    return worker

@@ -1,0 +1,108 @@
+"""Backups of a state folder, also of one whose coordinator is running.
+
+Rules:
+- The database is copied first, as of one instant (SQLite's online backup), the blobs after it: a blob is durable before
+  any row names it, so none that the copy names can be missing.
+- A backup is built beside its place and renamed at the end: one that is there is whole, durable and checked.
+- A backup is a state folder. Restoring is copying it to where the state was and starting a coordinator on it: workers and
+  gateways find the same passwords and tokens, and go on; what came after the backup is played again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
+
+KEPT_FILES = (
+    "secret",
+    "identity.json",
+    *(
+        f"certs/{name}"
+        for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
+    ),
+)
+"""What makes the cluster itself, beside its database and blobs; everything else is made again at a start."""
+DATABASE = "coordinator.sqlite"
+
+
+class Backup(msgspec.Struct, frozen=True, kw_only=True):
+    """What was copied."""
+
+    path: str
+    blobs: int
+    bytes: int
+    """Of the database and the blobs."""
+
+
+def back_up(state: Path, target: Path) -> Backup:
+    """Copies the state folder to `target`, which must not exist yet or be empty.
+
+    ConfigError when there is no state or no place for the copy, StorageError when the disk refuses or the copy is damaged;
+    then nothing is left at `target`.
+    """
+    if not (state / DATABASE).is_file():
+        raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ConfigError(f"{target} is there already; name a new folder for the backup")
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True, mode=0o700)
+        copied = _copy(state, partial)
+        os.replace(partial, target)
+        fsync_directory(target.parent)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise StorageError(f"cannot back up to {target}: {error.strerror or error}") from error
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return msgspec.structs.replace(copied, path=str(target))
+
+
+def _copy(state: Path, folder: Path) -> Backup:
+    for name in KEPT_FILES:
+        with contextlib.suppress(
+            FileNotFoundError
+        ):  # splits from files need no secret, one machine no certificates
+            data = (state / name).read_bytes()
+            (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
+            write_atomically(folder / name, data, mode=0o600)
+    database = folder / DATABASE
+    _copy_database(state / DATABASE, database)
+    source, blobs = BlobStore(state / "blobs"), BlobStore(folder / "blobs")
+    count, total = 0, database.stat().st_size
+    for digest in source.digests():
+        data = source.read(digest)
+        blobs.put(data)
+        count, total = count + 1, total + len(data)
+    return Backup(path=str(folder), blobs=count, bytes=total)
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    """A consistent copy while others write; readable by its owner alone, durable, checked."""
+    try:
+        with (
+            contextlib.closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reader,
+            contextlib.closing(sqlite3.connect(target, isolation_level=None)) as writer,
+        ):
+            target.chmod(0o600)
+            # In one step: a copy in several would start anew at every write of the coordinator's.
+            reader.backup(writer)
+            writer.execute("PRAGMA journal_mode=DELETE")
+            (said,) = writer.execute("PRAGMA integrity_check").fetchone()
+    except sqlite3.Error as error:
+        raise StorageError(f"cannot copy {source}: {error}") from error
+    if said != "ok":
+        raise StorageError(f"{source} is damaged: {said}")
+    with target.open("rb") as file:
+        os.fsync(file.fileno())

@@ -1,0 +1,263 @@
+"""The coordinator's state folder: who may open it, what is in it, and the credentials it hands out.
+
+    STATE/                        mode 0700, one coordinator at a time (`lock`)
+      secret                      the 256 bits that hidden splits are derived from
+      identity.json               the cluster's name, and each role's password and token
+      certs/                      the certificates of other machines: see machines.py
+      passwords                   the same passwords, for Zenoh's router
+      credentials/<role>.json     what workers, gateways and operators of this machine connect with
+      coordinator.sqlite          everything that must be true
+      blobs/                      trajectories, videos and policy bundles
+      coordinator.sock            where processes of this machine connect
+
+All that grants anything is made once, has mode 0600, and survives restarts, so that workers reconnect by themselves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import secrets
+import socket
+import stat
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.wire import credentials, keys
+from evopolicy_common.wire.credentials import Credentials, Role
+
+ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
+_SOCKET = "coordinator.sock"
+_SOCKET_PATH_LIMIT = 100
+"""Linux allows 107 bytes for a unix socket's path; Zenoh puts a `.lock` beside it."""
+
+
+class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What makes this cluster itself, kept through restarts."""
+
+    cluster: str
+    passwords: dict[Role, str]
+    worker_token: str
+    """Join token: who has it may offer slots."""
+    operator_token: str
+
+
+class StateFolder:
+    """An opened state folder, locked until `close`."""
+
+    def __init__(self, root: Path, lock_fd: int, identity: Identity) -> None:
+        self.root = root
+        self.identity = identity
+        self._lock_fd = lock_fd
+        self._link: Path | None = None
+
+    @classmethod
+    def open(cls, root: Path, cluster: str | None = None) -> StateFolder:
+        """Makes the folder if need be, locks it and reads its identity.
+
+        `cluster` None: the folder's own, `local` for a new one. ConfigError when another coordinator has it, others
+        may enter it, or it belongs to another cluster.
+        """
+        if cluster is not None and not keys.valid_name(cluster):
+            raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
+        root = Path(os.path.abspath(root))
+        _make_private(root)
+        lock_fd = _lock(root)
+        try:
+            return cls(root, lock_fd, _identity(root, cluster))
+        except BaseException:
+            os.close(lock_fd)
+            raise
+
+    @property
+    def database(self) -> Path:
+        """See `store.py`."""
+        return self.root / "coordinator.sqlite"
+
+    @property
+    def passwords(self) -> Path:
+        """The file that Zenoh's router reads: a line `user:password` for each role."""
+        return self.root / "passwords"
+
+    @property
+    def credentials(self) -> Path:
+        """Folder of this machine's credentials, a file a role."""
+        return self.root / "credentials"
+
+    @property
+    def socket_endpoint(self) -> str:
+        """The Zenoh endpoint inside the folder, by a link to it where its own path is too long for a unix socket.
+
+        The same after every restart. ConfigError when there is no place for a link.
+        """
+        folder = self.root
+        if not _fits(folder):
+            folder = self._link = _linked(folder)
+        return f"unixsock-stream/{folder / _SOCKET}"
+
+    def write_credentials(
+        self, endpoints: tuple[str, ...], *, insecure_tcp: bool = False
+    ) -> dict[Role, Path]:
+        """Writes the three roles' files for `endpoints` and returns their paths.
+
+        `insecure_tcp`: whether who holds them may speak plain `tcp/` beyond this machine.
+        """
+        tokens = {"worker": self.identity.worker_token, "operator": self.identity.operator_token}
+        paths: dict[Role, Path] = {}
+        for role in ROLES:
+            paths[role] = self.credentials / f"{role}.json"
+            credentials.write(
+                Credentials(
+                    cluster=self.identity.cluster,
+                    role=role,
+                    endpoints=endpoints,
+                    user=role,
+                    password=self.identity.passwords[role],
+                    token=tokens.get(role, ""),
+                    insecure_tcp=insecure_tcp,
+                ),
+                paths[role],
+            )
+        return paths
+
+    def write_passwords(self) -> None:
+        """Write the file that Zenoh's router reads."""
+        lines = [f"{role}:{self.identity.passwords[role]}\n" for role in ROLES]
+        write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
+
+    def close(self) -> None:
+        """Lets another coordinator have the folder."""
+        if self._link is not None:
+            with contextlib.suppress(OSError):
+                self._link.unlink()
+        os.close(self._lock_fd)
+
+
+def cluster_of(root: Path, cluster: str | None) -> str:
+    """The name of a state folder's cluster, also while its coordinator runs; a new folder is made, and named `cluster`.
+
+    ConfigError as `StateFolder.open` says.
+    """
+    if cluster is not None and not keys.valid_name(cluster):
+        raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
+    _make_private(root)
+    return _identity(root, cluster).cluster
+
+
+def _make_private(root: Path) -> None:
+    # A coordinator that comes back to a full disk waits for room.
+    check_writable(root, "--state", may_be_full=(root / "identity.json").exists())
+    try:
+        root.mkdir(parents=True, mode=0o700, exist_ok=True)
+        mode = stat.S_IMODE(root.stat().st_mode)
+    except OSError as error:
+        raise ConfigError(f"cannot make state folder {root}: {error.strerror}") from error
+    if mode & 0o077:
+        raise ConfigError(
+            f"state folder {root} may be entered by others (mode {mode:04o}); it holds hidden cases: chmod 700 {root}"
+        )
+
+
+def _lock(root: Path) -> int:
+    fd = os.open(root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        holder = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
+        os.close(fd)
+        raise ConfigError(
+            f"state folder {root} is in use by another coordinator (process {holder or 'unknown'});"
+            " stop that one, or choose another folder with --state"
+        ) from error
+    os.ftruncate(fd, 0)
+    os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+    return fd
+
+
+def _identity(root: Path, cluster: str | None) -> Identity:
+    path = root / "identity.json"
+    try:
+        identity = msgspec.json.decode(path.read_bytes(), type=Identity)
+    except FileNotFoundError:
+        identity = Identity(
+            cluster=cluster or "local",
+            passwords={role: secrets.token_urlsafe(24) for role in ROLES},
+            worker_token=secrets.token_urlsafe(32),
+            operator_token=secrets.token_urlsafe(32),
+        )
+        write_atomically(path, msgspec.json.encode(identity), mode=0o600)
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"{path} is damaged: {error}; restore it from a backup") from error
+    if cluster is not None and identity.cluster != cluster:
+        raise ConfigError(f"state folder {root} is of cluster {identity.cluster!r}, not {cluster!r}")
+    return identity
+
+
+def _fits(folder: Path) -> bool:
+    return len(os.fsencode(folder / _SOCKET)) <= _SOCKET_PATH_LIMIT
+
+
+def _linked(root: Path) -> Path:
+    """A short link to `root`, always the same one, in a folder that nobody but this user can change."""
+    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    for folder in (credentials.state_home() / "sockets", Path("/tmp") / f"evopolicy-{os.getuid()}"):
+        link = folder / name
+        with contextlib.suppress(OSError):
+            if _fits(link):
+                folder.mkdir(parents=True, mode=0o700, exist_ok=True)
+                found = folder.lstat()
+                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+                    new = folder / f"{name}.{os.getpid()}"
+                    new.symlink_to(root)
+                    new.replace(link)
+                    return link
+    raise ConfigError(
+        f"state folder {root} has too long a path for a unix socket; choose a shorter one with --state"
+    )
+
+
+def resolve_listen(endpoints: list[str]) -> tuple[str, ...]:
+    """The endpoints with a free port in place of port 0, which Zenoh could not be asked for afterwards."""
+    resolved = []
+    for endpoint in endpoints:
+        protocol, slash, address = endpoint.partition("/")
+        if not slash or protocol not in ("tcp", "tls", "unixsock-stream"):
+            raise ConfigError(f"--listen {endpoint!r}: say it as tls/HOST:PORT, or tcp/HOST:PORT")
+        if protocol == "unixsock-stream":
+            resolved.append(endpoint)
+            continue
+        host, colon, port = address.rpartition(":")
+        if not colon or not host or not port.isdecimal() or int(port) > 65535:
+            raise ConfigError(
+                f"--listen {endpoint!r}: say it as {protocol}/HOST:PORT, such as {protocol}/0.0.0.0:7447"
+            )
+        resolved.append(f"{protocol}/{host}:{port if int(port) else _free_port(endpoint, host)}")
+    return tuple(resolved)
+
+
+def _free_port(endpoint: str, host: str) -> int:
+    bare = host.strip("[]")
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(bare, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+            return int(probe.getsockname()[1])
+    except OSError as error:
+        raise ConfigError(f"--listen {endpoint!r}: {error.strerror or error}") from error
+
+
+def reachable(endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """What processes of this machine connect to: a wildcard address is not one that can be dialled."""
+    wildcards = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+    dialled = []
+    for endpoint in endpoints:
+        for wildcard, loopback in wildcards.items():
+            endpoint = endpoint.replace(f"/{wildcard}:", f"/{loopback}:")
+        dialled.append(endpoint)
+    return tuple(dialled)

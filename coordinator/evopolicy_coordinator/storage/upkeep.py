@@ -1,0 +1,257 @@
+"""What a state folder's disk space goes to, what of it may go, and what a sweep will need.
+
+Rules:
+- Of a finished run everything an operator needs is in its run directory. The coordinator keeps its outcome for good, and
+  its episodes and bundles until they are collected.
+- A blob goes when no row names it any more and it is older than `UNNAMED_S`: it may just have been uploaded for a row that
+  is about to be written. Uploading it again makes it young.
+- All this is safe beside a running coordinator; only the database file's own shrinking waits until none runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import sqlite3
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_coordinator.core.records import (
+    AuditRow,
+    EvaluationRow,
+    FinishedRow,
+    OutcomeRow,
+    RunRow,
+    SubmitRow,
+    evaluation_group,
+)
+from evopolicy_coordinator.storage.store import rows, stored_blobs, told
+
+Bounds = tuple[str, str]
+"""Group ids from the first on, before the second."""
+
+DATABASE = "coordinator.sqlite"
+UNNAMED_S = 24 * 3600.0
+BUSY_TIMEOUT_S = 30.0
+GUESS_BYTES = 1 << 20
+"""Taken for an episode of an environment of which nothing is stored, when nothing at all is."""
+
+
+class Collected(msgspec.Struct, frozen=True, kw_only=True):
+    """What was removed, or would be."""
+
+    runs: int
+    evaluations: int
+    episodes: int
+    blobs: int
+    bytes: int
+    """Of the episodes' rows and the blobs."""
+    shrunk: bool
+    """Whether the database file gave its space back; else later rows use it."""
+    free_bytes: int
+    """On the disk, afterwards."""
+
+
+class EnvironmentUse(msgspec.Struct, frozen=True, kw_only=True):
+    """What the stored runs of one environment take."""
+
+    env: str
+    runs: int
+    train_episodes: int
+    bytes: int
+    """Rows and blobs, hidden episodes too."""
+
+    @property
+    def bytes_per_episode(self) -> float:
+        """Bytes for each train episode, with its part of the hidden ones."""
+        return self.bytes / self.train_episodes
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """What a sweep will take of the coordinator's disk."""
+
+    bytes: int
+    free_bytes: int
+    guessed: tuple[str, ...]
+    """Environments of which nothing is stored: taken to be like the largest that is known."""
+
+    @property
+    def fits(self) -> bool:
+        return self.bytes <= self.free_bytes
+
+
+def collect(
+    state: Path, older_than_s: float, *, dry_run: bool = False, now: float | None = None
+) -> Collected:
+    """Removes episodes and bundles of what finished over `older_than_s` seconds ago, then blobs that nothing names.
+
+    `now`: Unix time. ConfigError when `state` is no state folder, StorageError when the database refuses.
+    """
+    now = time.time() if now is None else now
+    blobs = BlobStore(state / "blobs")
+    with _database(state) as db:
+        old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
+        old_evaluations = [
+            row.evaluation
+            for row in rows(db, EvaluationRow, "WHERE finished")
+            if row.created_at < now - older_than_s
+        ]
+        gone = [_of_run(run) for run in old_runs]
+        gone += [_of_evaluation(evaluation) for evaluation in old_evaluations]
+        named = _named(db, frozenset(old_runs), frozenset(old_evaluations))
+        sizes = [_size(db, bounds) for bounds in gone]
+        unnamed = [
+            digest
+            for digest in blobs.digests()
+            if digest not in named and _age_s(blobs, digest, now) > UNNAMED_S
+        ]
+        bytes_ = sum(size for _, size in sizes) + sum(map(blobs.size, unnamed))
+        shrunk = False
+        if not dry_run:
+            for bounds in gone:
+                _delete(db, bounds)
+            for run in old_runs:
+                db.execute("DELETE FROM train_blobs WHERE run = ?", (run,))
+                db.execute("DELETE FROM audits WHERE run = ?", (run,))
+            for digest in unnamed:
+                blobs.delete(digest)
+            shrunk = _shrink(state, db)
+    return Collected(
+        runs=sum(n > 0 for n, _ in sizes[: len(old_runs)]),
+        evaluations=sum(n > 0 for n, _ in sizes[len(old_runs) :]),
+        episodes=sum(n for n, _ in sizes),
+        blobs=len(unnamed),
+        bytes=bytes_,
+        shrunk=shrunk,
+        free_bytes=shutil.disk_usage(state).free,
+    )
+
+
+def use(state: Path) -> list[EnvironmentUse]:
+    """What the stored runs take, by environment, largest first; runs whose episodes were collected are left out."""
+    blobs = BlobStore(state / "blobs")
+    found: dict[str, EnvironmentUse] = {}
+    with _database(state) as db:
+        for run in rows(db, RunRow):
+            train = db.execute(
+                "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE '%/train'",
+                _of_run(run.run),
+            ).fetchone()[0]
+            if not train:
+                continue
+            _, size = _size(db, _of_run(run.run))
+            digests = db.execute("SELECT digest FROM train_blobs WHERE run = ?", (run.run,)).fetchall()
+            size += sum(blobs.size(digest) for (digest,) in digests if blobs.has(digest))
+            env = run.settings.env
+            before = found.get(env) or EnvironmentUse(env=env, runs=0, train_episodes=0, bytes=0)
+            found[env] = EnvironmentUse(
+                env=env,
+                runs=before.runs + 1,
+                train_episodes=before.train_episodes + train,
+                bytes=before.bytes + size,
+            )
+    return sorted(found.values(), key=lambda each: -each.bytes)
+
+
+def estimate(state: Path, planned: dict[str, int]) -> Estimate:
+    """What `planned` train episodes by environment will take, going by what is stored of each."""
+    known = {each.env: each.bytes_per_episode for each in use(state)}
+    guess = max(known.values(), default=float(GUESS_BYTES))
+    return Estimate(
+        bytes=round(sum(n * known.get(env, guess) for env, n in planned.items())),
+        free_bytes=shutil.disk_usage(state).free,
+        guessed=tuple(env for env in planned if env not in known),
+    )
+
+
+@contextlib.contextmanager
+def _database(state: Path) -> Iterator[sqlite3.Connection]:
+    path = state / DATABASE
+    if not path.is_file():
+        raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
+    uri = f"{path.absolute().as_uri()}?mode=rw"
+    with (
+        told(path),
+        contextlib.closing(
+            sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+        ) as db,
+    ):
+        yield db
+
+
+def _of_run(run: str) -> Bounds:
+    return f"{run}/", f"{run}0"  # "0" follows "/"
+
+
+def _of_evaluation(evaluation: str) -> Bounds:
+    group = evaluation_group(evaluation)
+    return group, f"{group}\0"
+
+
+def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
+    """Number and bytes of the outcomes of these groups."""
+    query = "SELECT COUNT(*), IFNULL(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
+    n, size = db.execute(query, bounds).fetchone()
+    return n, size
+
+
+def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
+    """One short transaction for each run, so that a running coordinator waits for none for long."""
+    db.execute("BEGIN IMMEDIATE")
+    for table in ("outcomes", "strikes"):
+        db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
+    db.execute("COMMIT")
+
+
+def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
+    """Digests of all blobs that rows name which stay."""
+    named = {row.bundle for row in rows(db, SubmitRow) if row.bundle is not None and row.run not in old_runs}
+    named |= {
+        row.bundle
+        for row in rows(db, EvaluationRow)
+        if row.bundle is not None and row.evaluation not in old_evaluations
+    }
+    named |= {
+        ref.digest
+        for row in rows(db, EvaluationRow)
+        if row.evaluation not in old_evaluations
+        for ref in row.replays
+    }
+    named |= {
+        digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
+    }
+    named |= {row.actions.digest for row in rows(db, AuditRow) if row.actions is not None}
+    hidden = "WHERE grp NOT LIKE '%/train'"
+    for row in rows(db, OutcomeRow, hidden):
+        head, _, tail = row.group.partition("/")
+        if head not in old_runs and not (head == "evaluation" and tail in old_evaluations):
+            named |= {ref.digest for ref in stored_blobs(row.outcome)}
+    return named
+
+
+def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
+    with contextlib.suppress(OSError):
+        return now - blobs.path(digest).stat().st_mtime
+    return 0.0
+
+
+def _shrink(state: Path, db: sqlite3.Connection) -> bool:
+    """Gives the file's free pages back to the disk, if no coordinator has the folder: it would wait meanwhile."""
+    lock = os.open(state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    else:
+        db.execute("VACUUM")
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        return True
+    finally:
+        os.close(lock)

@@ -1,0 +1,185 @@
+"""The thread that writes the database, so that no fsync ever stands in the event loop's way.
+
+Rules that this module owns:
+- Work is done in the order in which it was given; its outcome is told on the event loop, in that order too.
+- Group commit: `Outbox` hands over everything that waits as one transaction, and meanwhile collects the next.
+- Effects leave the outbox in the order in which they came in, none before every `Persist` ahead of it is durable.
+- Any exception of the work is told like its outcome: the thread never ends before it is closed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from evopolicy_coordinator.core.effects import Effect, Persist
+from evopolicy_coordinator.core.records import Row
+from evopolicy_coordinator.storage.store import Store
+
+T = TypeVar("T")
+
+
+class _Work(Generic[T]):
+    """One thing to do with the store, and whom to tell."""
+
+    __slots__ = ("do", "failed", "succeeded")
+
+    def __init__(
+        self,
+        do: Callable[[Store], T],
+        succeeded: Callable[[T], None],
+        failed: Callable[[BaseException], None],
+    ) -> None:
+        self.do = do
+        self.succeeded = succeeded
+        self.failed = failed
+
+    def run(self, store: Store) -> Callable[[], None]:
+        """Does it; returns what is to be called on the event loop."""
+        try:
+            value = self.do(store)
+        except BaseException as error:
+            caught = error
+            return lambda: self.failed(caught)
+        return lambda: self.succeeded(value)
+
+
+class Writer:
+    """Runs work on a store in a thread of its own. To be made on the event loop that is told of its ends."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._loop = asyncio.get_running_loop()
+        self._work: queue.SimpleQueue[_Work[object] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="store-writer", daemon=True)
+        self._thread.start()
+
+    def submit(
+        self,
+        do: Callable[[Store], T],
+        succeeded: Callable[[T], None],
+        failed: Callable[[BaseException], None],
+    ) -> None:
+        """Does `do(store)` after all that was submitted before, then calls back on the event loop."""
+        self._work.put(_Work(do, succeeded, failed))  # type: ignore[arg-type]
+
+    async def call(self, do: Callable[[Store], T]) -> T:
+        """`do(store)` after all that was submitted before; raises what it raises."""
+        future: asyncio.Future[T] = self._loop.create_future()
+
+        def settle(value: T) -> None:
+            if not future.done():
+                future.set_result(value)
+
+        def fail(error: BaseException) -> None:
+            if not future.done():
+                future.set_exception(error)
+
+        self.submit(do, settle, fail)
+        return await future
+
+    async def close(self) -> None:
+        """Ends the thread once all submitted work is done."""
+        self._work.put(None)
+        await asyncio.to_thread(self._thread.join)
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None:
+            tell = work.run(self._store)
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+                self._loop.call_soon_threadsafe(tell)
+            del work, tell
+
+
+class Outbox:
+    """Effects on their way out, in order, with one transaction in flight at a time."""
+
+    def __init__(
+        self,
+        writer: Writer,
+        carry_out: Callable[[Effect], None],
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
+        """`carry_out` is given every effect but `Persist`; `on_failure` is called once, and then the outbox is dead.
+
+        It is told a StorageError when the store refuses, anything else for a bug.
+        """
+        self._writer = writer
+        self._carry_out = carry_out
+        self._on_failure = on_failure
+        self._effects: deque[Effect] = deque()
+        self._rows: list[Row] = []
+        self._n_waiting = 0
+        """Persists whose rows are in `_rows`."""
+        self._n_in_flight = 0
+        self._n_durable = 0
+        """Persists that are durable and still stand in `_effects`."""
+        self._dead = False
+        self._writing_since = 0.0
+        self.commits = 0
+
+    def put(self, effects: list[Effect]) -> None:
+        """Takes effects; `flush` sets them going."""
+        for effect in effects:
+            if isinstance(effect, Persist):
+                self._rows.extend(effect.rows)
+                self._n_waiting += 1
+            self._effects.append(effect)
+
+    def flush(self) -> None:
+        """Carries out what may be, and writes what waits if nothing is being written."""
+        if self._dead:
+            return
+        self._drain()
+        if self._n_in_flight or not self._n_waiting:
+            return
+        rows, self._rows = self._rows, []
+        self._n_in_flight, self._n_waiting = self._n_waiting, 0
+        self._writing_since = time.monotonic()
+        self._writer.submit(lambda store: store.write(rows), self._written, self._failed)
+
+    def discard(self) -> None:
+        """Nothing that waits is carried out any more."""
+        self._dead = True
+        self._effects.clear()
+        self._rows.clear()
+
+    @property
+    def writing_s(self) -> float:
+        """For how long the transaction in flight has been, seconds; 0.0 when there is none."""
+        return time.monotonic() - self._writing_since if self._n_in_flight else 0.0
+
+    @property
+    def idle(self) -> bool:
+        """Whether everything is carried out and durable."""
+        return not self._effects and not self._n_in_flight
+
+    def _written(self, _: None) -> None:
+        if self._dead:
+            return
+        self.commits += 1
+        self._n_durable += self._n_in_flight
+        self._n_in_flight = 0
+        self.flush()
+
+    def _failed(self, error: BaseException) -> None:
+        if not self._dead:
+            self.discard()
+            self._on_failure(error)
+
+    def _drain(self) -> None:
+        effects = self._effects
+        while effects:
+            if isinstance(effects[0], Persist):
+                if not self._n_durable:
+                    return
+                self._n_durable -= 1
+                effects.popleft()
+            else:
+                self._carry_out(effects.popleft())

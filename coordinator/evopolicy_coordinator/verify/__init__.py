@@ -1,0 +1,1 @@
+"""`evopolicy verify`: finished episodes played again and compared."""

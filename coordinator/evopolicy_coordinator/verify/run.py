@@ -1,0 +1,422 @@
+"""Plays a finished run's episodes again and tells where anything differs.
+
+Rules that this module owns:
+- The exact check: recorded actions are played in the environment, with no policy. They are the coordinator's stored ones
+  where it still has them, else those of the feedback files. What comes of them must equal, bit for bit, the stored record,
+  the feedback files, and the returns that `summary.json` and `run.json` tell.
+- The advisory check: the checkpoint's policy plays the same cases again. It may read clocks, so it proves nothing.
+- The cases must be the run's: split hashes are compared before anything is played.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.operator import (
+    CancelRun,
+    DescribeEnvironment,
+    Done,
+    EnvironmentState,
+    Evaluate,
+    EvaluationPage,
+    EvaluationPoll,
+    EvaluationStarted,
+    PlayedAs,
+    RecordedRequest,
+)
+from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.records import bundles
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.trajectory import Trajectory, decode
+from evopolicy_common.wire.requests import operator_requests
+from evopolicy_common.wire.transport import Link
+from evopolicy_coordinator.server.auditing import action_log
+from evopolicy_coordinator.verify import compare as verify_compare
+from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
+
+_SENDER = "operator"
+_WAIT_S = 5.0
+_PATIENCE_S = 10.0
+_HASHES: dict[Split, str] = {
+    "train": "data_train_hash",
+    "validation": "data_valid_hash",
+    "heldout": "data_heldout_hash",
+}
+
+Tell = Callable[[int, str], None]
+"""Is told each time how many episodes have come, and what the cluster waits for (empty: nothing)."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode, or one list of them, that is not what the run says."""
+
+    episode: str
+    difference: str
+
+
+class Report(msgspec.Struct, kw_only=True):
+    """What a verification came to; grows while it goes on."""
+
+    run_directory: str
+    env: str
+    identical: bool = True
+    episodes: int = 0
+    """Played again from their recorded actions."""
+    from_files: int = 0
+    """Those of them whose actions came from feedback files, as the coordinator no longer has them."""
+    differences: list[Finding] = []
+    not_checked: list[Finding] = []
+    policy_episodes: int = 0
+    """Played again by the checkpoint's policy."""
+    policy_differences: list[Finding] = []
+    """Advisory."""
+    fingerprint_differences: list[str] = []
+    notes: list[str] = []
+
+    def differs(self, episode: str, difference: str) -> None:
+        self.identical = False
+        self.differences.append(Finding(episode=episode, difference=difference))
+
+
+class _Recording(msgspec.Struct, kw_only=True):
+    """What is known of one episode before it is played again."""
+
+    index: int
+    actions: bytes
+    """Trajectory bytes with the actions that are played."""
+    outcome: EpisodeOutcome | None
+    """As the coordinator stored it."""
+    stored: bytes | None
+    """Its trajectory, packed: unpacked only while it is compared, as a submit's together may be gigabytes."""
+    files: bool
+    """Whether there are feedback files to compare with."""
+
+
+class Verifier:
+    """One verification on one cluster."""
+
+    def __init__(self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None) -> None:
+        self._token = link.credentials.token
+        self._ask = operator_requests(link)
+        self._run = run
+        self._tell = tell
+        self._tier: Tier = tier or run.record.sandbox_tier
+        self._limits = run.record.experiment_dimensions.limits or ResourceLimits()
+        self._knows_run = False
+        self._came = 0
+        self._kept: dict[int, _Recording] = {}
+        """Of the list that was played again last, by index."""
+        self.report = Report(run_directory=str(run.root), env=run.record.env)
+
+    async def check_cases(self) -> bool:
+        """Whether the coordinator still knows the run. ConfigError when its cases are not the run's."""
+        state = await self._describe()
+        versions = self._run.record.versions
+        for split, field in _HASHES.items():
+            ours, theirs = getattr(versions, field), state.split_hashes.get(split, "")
+            if ours and ours != theirs:
+                raise ConfigError(
+                    f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
+                    f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its --data"
+                )
+        self._knows_run = state.knows_run
+        if not versions.env_deterministic:
+            self.report.notes.append(
+                "this environment is marked as not deterministic: differences are to be expected"
+            )
+        return self._knows_run
+
+    async def replay(self, played: Played, indexes: Sequence[int]) -> None:
+        """The exact check of these episodes of a list."""
+        recordings = await self._recordings(played, indexes)
+        if not recordings:
+            return
+        refs = []
+        for recording in recordings:
+            digest = digest_of(recording.actions)
+            await self._ask.upload(_SENDER, self._token, digest, recording.actions)
+            refs.append(BlobRef(digest=digest, size=len(recording.actions)))
+        record: Record = "full" if played.split == "train" else "actions"
+        by_index = dict(enumerate(recordings))
+        returns: dict[int, float] = {}
+        message = self._evaluate(played, [one.index for one in recordings], record, replays=tuple(refs))
+        async for outcome in self._outcomes(message):
+            recording = by_index.pop(outcome.index)
+            returns[recording.index] = outcome.episode_return
+            await self._compare(played, recording, outcome)
+        for recording in by_index.values():
+            self.report.differs(played.name(recording.index), "could not be played again")
+        if played.mean_differs(returns):
+            self.report.differs(
+                f"submit {played.submit_index}, {played.split}", f"run.json tells a mean of {played.mean!r}"
+            )
+
+    async def play_policy(self, played: Played, indexes: Sequence[int]) -> None:
+        """The advisory check: these train episodes of a submit, by its checkpoint's policy; right after their `replay`."""
+        dimensions = self._run.record.experiment_dimensions
+        name = f"submit {played.submit_index}"
+        if dimensions.policy_scope == "submit" and len(indexes) < len(played.env_instances):
+            self.report.not_checked.append(
+                Finding(
+                    episode=name,
+                    difference="its one policy plays whole submits, of which this sample is a part",
+                )
+            )
+            return
+        assert played.checkpoint is not None
+        try:
+            bundle = bundles.snapshot(played.checkpoint / "system")
+        except BundleError as error:
+            self.report.differs(name, f"its checkpoint cannot be read: {error}")
+            return
+        if bundle.digest != played.digest:
+            self.report.differs(name, "its checkpoint does not hold the policy that metrics.json names")
+            return
+        await self._ask.upload(_SENDER, self._token, bundle.digest, bundle.packed)
+        message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
+        async for outcome in self._outcomes(message):
+            recording = self._kept.get(indexes[outcome.index])
+            if recording is None:
+                continue
+            self.report.policy_episodes += 1
+            difference = await self._policy_difference(played, recording, outcome)
+            if difference is not None:
+                self.report.policy_differences.append(
+                    Finding(episode=played.name(recording.index), difference=difference)
+                )
+
+    async def check_fingerprint(self) -> None:
+        """Compares the library versions of the connected workers with the run's; call it when workers have worked."""
+        known = self._run.record.versions.fingerprint
+        found: dict[str, None] = {}
+        for fingerprint in (await self._describe()).fingerprints if known else ():
+            here = _flat(fingerprint)
+            for name in sorted(known.keys() | here.keys()):
+                ours, theirs = known.get(name, "none"), here.get(name, "none")
+                if ours != theirs:
+                    found[f"{name}: {ours} in the run, {theirs} on the workers"] = None
+        self.report.fingerprint_differences = list(found)
+
+    # What was recorded.
+
+    async def _recordings(self, played: Played, indexes: Sequence[int]) -> list[_Recording]:
+        known = await self._stored(played) if self._knows_run else {}
+        found = []
+        for index in indexes:
+            name = played.name(index)
+            outcome = known.get(index)
+            rows = self._rows(played, index)
+            stored: bytes | None = None
+            if outcome is not None and outcome.trajectory is not None:
+                stored = await self._fetch(outcome.trajectory)
+                actions = action_log([row.action for row in decode(stored).rows()])
+            elif rows is not None:
+                try:
+                    actions = action_log(verify_compare.actions_of(rows))
+                except Exception as error:
+                    # JSON of any shape and size: an agent without a jail could have written it.
+                    self.report.differs(
+                        name, f"its actions cannot be played: {type(error).__name__}: {error}"
+                    )
+                    continue
+                self.report.from_files += 1
+            else:
+                if not played.folders:
+                    self.report.not_checked.append(
+                        Finding(episode=name, difference="the coordinator has no record of it any more")
+                    )
+                continue
+            found.append(
+                _Recording(
+                    index=index, actions=actions, outcome=outcome, stored=stored, files=rows is not None
+                )
+            )
+        self._kept = {recording.index: recording for recording in found}
+        return found
+
+    def _rows(self, played: Played, index: int) -> list[dict[str, Any]] | None:
+        if not played.folders:
+            return None
+        try:
+            rows = verify_compare.read_rows(played.folders[index])
+        except (OSError, ValueError) as error:
+            self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
+            return None
+        if not rows:
+            self.report.differs(played.name(index), "trajectory.jsonl has no step")
+            return None
+        return rows
+
+    async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
+        """Outcomes that the coordinator stored, by index."""
+        found: dict[int, EpisodeOutcome] = {}
+        cursor = 0
+        while True:
+            message = RecordedRequest(
+                token=self._token,
+                run=self._run.record.run,
+                split=played.split,
+                submit_index=played.submit_index,
+                cursor=cursor,
+            )
+            page = await self._ask.until_answered("recorded", message, EvaluationPage, patience_s=_PATIENCE_S)
+            found.update((outcome.index, outcome) for outcome in page.outcomes)
+            if page.finished:
+                return found
+            cursor = page.cursor
+
+    # What comes of it now.
+
+    async def _compare(self, played: Played, recording: _Recording, outcome: EpisodeOutcome) -> None:
+        self.report.episodes += 1
+        index, name = recording.index, played.name(recording.index)
+        assert outcome.trajectory is not None
+        replayed = decode(await self._fetch(outcome.trajectory))
+        for what, told in (
+            ("the stored record", _stored_difference(recording, replayed, outcome)),
+            ("the feedback files", self._files_difference(played, recording, replayed)),
+        ):
+            if told is not None:
+                self.report.differs(name, f"{what}: {told}")
+        if played.returns is not None and not verify_compare.same(
+            played.returns[index], outcome.episode_return
+        ):
+            self.report.differs(
+                name, f"return {played.returns[index]!r} is told, {outcome.episode_return!r} came"
+            )
+        if played.lengths is not None and played.lengths[index] != outcome.length:
+            self.report.differs(name, f"{played.lengths[index]} steps are told, {outcome.length} came")
+
+    def _files_difference(self, played: Played, recording: _Recording, replayed: Trajectory) -> str | None:
+        if not recording.files:
+            return None
+        known = recording.stored is not None
+        return _of_files(
+            played, recording.index, decode(recording.stored) if recording.stored else replayed, actions=known
+        )
+
+    async def _policy_difference(
+        self, played: Played, recording: _Recording, outcome: EpisodeOutcome
+    ) -> str | None:
+        if outcome.failure is not None and outcome.length == 0:
+            return f"{outcome.failure.category}: {outcome.failure.message}"
+        assert outcome.trajectory is not None
+        again = decode(await self._fetch(outcome.trajectory))
+        if recording.stored is not None:
+            return verify_compare.first_difference(decode(recording.stored), again)
+        return _of_files(played, recording.index, again, actions=True)
+
+    # The cluster.
+
+    async def _describe(self) -> EnvironmentState:
+        record = self._run.record
+        dimensions = record.experiment_dimensions
+        message = DescribeEnvironment(
+            token=self._token,
+            env=record.env,
+            run=record.run,
+            n_validation=dimensions.n_validation,
+            n_heldout=dimensions.n_heldout,
+        )
+        return await self._ask.until_answered("describe", message, EnvironmentState, patience_s=_PATIENCE_S)
+
+    def _evaluate(
+        self,
+        played: Played,
+        indexes: Sequence[int],
+        record: Record,
+        *,
+        bundle: str | None = None,
+        replays: tuple[BlobRef, ...] = (),
+    ) -> Evaluate:
+        dimensions = self._run.record.experiment_dimensions
+        return Evaluate(
+            token=self._token,
+            key=uuid.uuid4().hex,
+            env=self._run.record.env,
+            bundle=bundle,
+            split=played.split,
+            cases=tuple(played.env_instances[index] for index in indexes),
+            record=record,
+            sandbox_tier=self._tier,
+            limits=self._limits,
+            replays=replays,
+            as_in=PlayedAs(
+                run=self._run.record.run,
+                submit_index=played.submit_index,
+                env_instances=played.env_instances,
+                indexes=tuple(indexes),
+                modulo=played.modulo,
+                remaining_budget_after=played.remaining_budget_after,
+                policy_scope=dimensions.policy_scope,
+                # Random actions had no policy to give lists to, and are recorded as arrays.
+                observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
+            ),
+        )
+
+    async def _outcomes(self, message: Evaluate) -> Any:
+        """Outcomes as they come; what is not waited for to its end is cancelled."""
+        started = await self._ask.until_answered(
+            "evaluate", message, EvaluationStarted, patience_s=_PATIENCE_S
+        )
+        cursor, finished = 0, False
+        try:
+            while not finished:
+                poll = EvaluationPoll(
+                    token=self._token, evaluation=started.evaluation, cursor=cursor, wait_s=_WAIT_S
+                )
+                page = await self._ask.until_answered("poll", poll, EvaluationPage, wait_s=_WAIT_S)
+                cursor, finished = page.cursor, page.finished
+                self._came += len(page.outcomes)
+                self._tell(self._came, "" if page.outcomes else page.waits_for)
+                for outcome in page.outcomes:
+                    yield outcome
+        finally:
+            if not finished:
+                cancel = CancelRun(token=self._token, run=started.evaluation)
+                with contextlib.suppress(EvopolicyError):
+                    await self._ask.once("cancel", cancel, Done)
+
+    async def _fetch(self, ref: BlobRef) -> bytes:
+        if ref.inline is None:
+            return await self._ask.download(_SENDER, self._token, ref.digest)
+        if digest_of(ref.inline) != ref.digest:
+            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
+        return ref.inline
+
+
+def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:
+    """Where an episode's feedback files part from `episode`."""
+    folder = played.folders[index]
+    try:
+        rows = verify_compare.read_rows(folder)
+        return verify_compare.files_difference(folder, rows, episode, actions=actions)
+    except Exception as error:
+        # An agent without a jail could have written the files: damaged archives, arrays of any size.
+        return f"cannot be read: {type(error).__name__}: {error}"
+
+
+def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: EpisodeOutcome) -> str | None:
+    then = recording.outcome
+    if recording.stored is None or then is None:
+        return None
+    told = verify_compare.first_difference(decode(recording.stored), replayed)
+    return told or verify_compare.outcome_difference(then, outcome)
+
+
+def _flat(fingerprint: Fingerprint) -> dict[str, str]:
+    """As `run.json` has it."""
+    return {
+        **fingerprint.packages,
+        "python": fingerprint.python,
+        "cpu": fingerprint.cpu,
+        "evopolicy-worker": fingerprint.code_version,
+    }

@@ -1,0 +1,191 @@
+"""What a finished run directory says was played: the lists of episodes that can be played again, and their files.
+
+Rules: nothing here is trusted to be what the run left; what cannot be read is told by name. An episode that left no
+trajectory (its submit was not `ok`) is not in any list.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.run_record import (
+    CheckpointMetrics,
+    RunRecord,
+    decode_checkpoint_metrics,
+    decode_run_record,
+)
+from evopolicy_common.records.summary import Summary, decode_summary
+
+RANDOM = -1
+"""Submit index of the random reference."""
+_MAX_DIGITS = 9
+
+
+class Played(msgspec.Struct, frozen=True, kw_only=True):
+    """A list of cases that one policy played: a submit's, or a checkpoint's hidden ones."""
+
+    split: Split
+    submit_index: int
+    """`RANDOM` for the random reference."""
+    env_instances: tuple[int, ...]
+    """Ids in the split, in order."""
+    modulo: int
+    """Episodes of the policy's own submit."""
+    remaining_budget_after: int
+    returns: tuple[float, ...] | None
+    """As the run directory tells them; None where it tells only `mean`."""
+    lengths: tuple[int, ...] | None = None
+    mean: float | None = None
+    folders: tuple[Path, ...] = ()
+    """Each train episode's folder; empty for hidden ones."""
+    checkpoint: Path | None = None
+    """`checkpoints/submit_NNN` of the policy; None for the random reference."""
+    digest: str = ""
+    """Of the policy's bundle, as `metrics.json` has it."""
+
+    def name(self, index: int) -> str:
+        """How an episode is called in what is told of it."""
+        if self.folders:
+            return f"submit {self.submit_index}, {self.folders[index].name}"
+        policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"
+        return f"{policy}, {self.split} episode {index}"
+
+    def mean_differs(self, returns: dict[int, float]) -> bool:
+        """Whether all returns are there and their mean is not the one that the run directory tells."""
+        if self.mean is None or len(returns) < len(self.env_instances):
+            return False
+        return math.fsum(returns.values()) / len(returns) != self.mean
+
+
+class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
+    """A run directory."""
+
+    root: Path
+    record: RunRecord
+    train: tuple[Played, ...]
+    hidden: tuple[Played, ...]
+
+
+def read_run(root: Path) -> RunUnderTest:
+    """What was played in a run. ConfigError when `root` is no finished run's directory, or a file of it is damaged."""
+    path = root / "run.json"
+    try:
+        record = decode_run_record(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{root} is no finished run's directory: {path.name}: {error.strerror}") from error
+    except ProtocolError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    train = [
+        played
+        for folder in sorted((root / "workspace" / "feedback").glob("submit_*"))
+        if (played := _train(root, record, folder))
+    ]
+    return RunUnderTest(
+        root=root,
+        record=record,
+        train=tuple(train),
+        hidden=tuple(_hidden(record, {one.submit_index: one for one in train})),
+    )
+
+
+def _train(root: Path, record: RunRecord, folder: Path) -> Played | None:
+    """An ok submit; None for any other."""
+    summary = _summary(folder)
+    if summary is None or summary.env_instances is None:
+        return None
+    width = max(3, len(str(record.experiment_dimensions.episode_budget)))
+    first = summary.first_global_episode
+    checkpoint = root / "checkpoints" / folder.name
+    metrics = _metrics(checkpoint)
+    return Played(
+        split="train",
+        submit_index=summary.submit_index,
+        env_instances=summary.env_instances,
+        modulo=len(summary.env_instances),
+        remaining_budget_after=summary.remaining_budget,
+        returns=summary.returns,
+        lengths=summary.episode_lengths,
+        folders=tuple(
+            folder / "episodes" / f"ep_{first + index:0{width}d}"
+            for index in range(len(summary.env_instances))
+        ),
+        checkpoint=checkpoint,
+        digest="" if metrics is None else metrics.digest,
+    )
+
+
+def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
+    dimensions, outcome = record.experiment_dimensions, record.outcome
+    found: list[Played] = []
+
+    def add(split: Split, own: Played, n: int, returns: tuple[float, ...] | None, mean: float | None) -> None:
+        found.append(
+            msgspec.structs.replace(
+                own,
+                split=split,
+                env_instances=tuple(range(n)),
+                returns=returns,
+                lengths=None,
+                mean=mean,
+                folders=(),
+            )
+        )
+
+    for text, mean in outcome.val_scores.items():
+        index = int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else -1
+        if (own := train.get(index)) is not None:
+            add("validation", own, dimensions.n_validation, None, mean)
+    if outcome.best_submit_index is not None and (own := train.get(outcome.best_submit_index)) is not None:
+        add(
+            "heldout", own, len(outcome.heldout_returns), outcome.heldout_returns, outcome.heldout_mean_return
+        )
+    reference = outcome.random_reference
+    if reference is not None and reference.returns:
+        n = len(reference.returns)
+        found.append(
+            Played(
+                split="heldout",
+                submit_index=RANDOM,
+                env_instances=tuple(range(n)),
+                modulo=n,
+                remaining_budget_after=0,
+                returns=reference.returns,
+                mean=reference.mean_return,
+            )
+        )
+    return found
+
+
+def _summary(folder: Path) -> Summary | None:
+    path = folder / "summary.json"
+    try:
+        return decode_summary(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ProtocolError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+
+
+def _metrics(checkpoint: Path) -> CheckpointMetrics | None:
+    try:
+        return decode_checkpoint_metrics((checkpoint / "metrics.json").read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ProtocolError) as error:
+        raise ConfigError(f"{checkpoint}/metrics.json cannot be read: {error}") from error
+
+
+def sample(lists: list[Played], n: int | None, seed: int) -> list[tuple[Played, tuple[int, ...]]]:
+    """`n` episodes of all lists drawn without repetition (None: all), as indexes of each list that has some."""
+    everything = [(k, index) for k, played in enumerate(lists) for index in range(len(played.env_instances))]
+    chosen = everything if n is None or n >= len(everything) else random.Random(seed).sample(everything, n)
+    by_list: dict[int, list[int]] = {}
+    for k, index in chosen:
+        by_list.setdefault(k, []).append(index)
+    return [(lists[k], tuple(sorted(by_list[k]))) for k in sorted(by_list)]

@@ -1,0 +1,1 @@
+"""Episodes: what the environment's process of a slot runs."""

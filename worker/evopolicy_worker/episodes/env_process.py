@@ -1,0 +1,191 @@
+"""The environment's process of a slot: `python -m evopolicy_worker.episodes.env_process`, started and told by `slot.Slot`.
+
+It owns seeds, rewards and trajectories, imports the simulators it plays and nothing of Zenoh, and ends with its parent.
+It begins inside a jail (`sandbox.env_jail`), starts the policies' sandbox there, and seals itself before it imports a
+simulator: what comes later may be anyone's code. Commands come on standard input, answers go to what was standard output; whatever simulators print goes to standard
+error. The main thread plays; the monitor's thread hears commands meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import sys
+import threading
+import time
+from pathlib import Path
+
+from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_worker import environments
+from evopolicy_worker.episodes.loop import CancelledJobError, Player, Progress, fault_of
+from evopolicy_worker.episodes.monitor import Monitor
+from evopolicy_worker.episodes.policy_process import BundleFiles
+from evopolicy_worker.sandbox import env_jail, jail
+from evopolicy_worker.sandbox.zygote import Zygote
+from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slots.child_pipes import take_pipes
+
+_PROGRESS_S = 0.25
+
+
+class Channel:
+    """Commands in, answers out."""
+
+    def __init__(self, commands: int, answers: int) -> None:
+        self._commands = commands
+        self._answers = answers
+        self._received = bytearray()
+        self._lock = threading.Lock()
+
+    def receive(self) -> list[messages.Command]:
+        """The commands that arrived; blocks until there are bytes. Ends this process when the slot is gone."""
+        data = os.read(self._commands, 1 << 20)
+        if not data:
+            os._exit(0)
+        self._received += data
+        found: list[messages.Command] = []
+        size = messages.LENGTH.size
+        while len(self._received) >= size:
+            (length,) = messages.LENGTH.unpack_from(self._received)
+            if len(self._received) < size + length:
+                break
+            found.append(messages.commands.decode(bytes(self._received[size : size + length])))
+            del self._received[: size + length]
+        return found
+
+    def send(self, message: messages.Message) -> None:
+        self.send_frame(messages.framed(message))
+
+    def send_frame(self, frame: bytes) -> None:
+        data = memoryview(frame)
+        with self._lock:
+            while data:
+                data = data[os.write(self._answers, data) :]
+
+
+class EnvProcess:
+    """One slot's life: start, then job after job."""
+
+    def __init__(self, channel: Channel, commands: int) -> None:
+        self._channel = channel
+        self._jobs: queue.SimpleQueue[tuple[messages.Play, Progress] | messages.Describe] = (
+            queue.SimpleQueue()
+        )
+        self._bundle: tuple[str, BundleFiles] | None = None
+        self._progress: Progress | None = None
+        self._told = (0.0, 0)
+        self._monitor = Monitor(commands, self._hear, self._tell)
+
+    def run(self, start: messages.Start, early: list[messages.Command]) -> None:
+        if start.core is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(0, {start.core})
+        scratch = Path(start.scratch)
+        # Without its parents: a worker that has gone meanwhile has taken them with it.
+        scratch.mkdir(exist_ok=True)
+        env_jail.enclose(start.tier, scratch, draws=start.draws)
+        plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed, user=start.user)
+        with env_jail.expendable():
+            zygote = Zygote(plan, scratch)
+        env_jail.seal(start.tier, scratch, plan.user, draws=start.draws)
+        player = Player(zygote, plan, self._monitor, scratch)
+        for command in early:
+            self._take(command)
+        self._monitor.start()
+        player.prepare()
+        self._channel.send(messages.Ready())
+        while True:
+            work = self._jobs.get()
+            if isinstance(work, messages.Describe):
+                self._channel.send(_described(work.environments))
+                continue
+            self._channel.send(self._play(player, *work))
+            # A sandbox that has ended meanwhile is the next job's to find.
+            with contextlib.suppress(SandboxError, SlotDiedError):
+                player.prepare()
+
+    def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Answer:
+        self._monitor.ticking = True
+        self._monitor.wake()
+        try:
+            files = self._files(command.bundle)
+            player.play(
+                command.job, files, progress, self._channel.send_frame, command.first, command.failure
+            )
+            return messages.Played(cancelled=progress.cancelled)
+        except CancelledJobError:
+            return messages.Played(cancelled=True)
+        except Exception as error:
+            if progress.cancelled:
+                # Whatever it met on its way out.
+                return messages.Played(cancelled=True)
+            kind = "sandbox" if isinstance(error, SandboxError | SlotDiedError) else "worker"
+            return messages.Fault(kind=kind, message=fault_of(error))
+        finally:
+            self._progress = None
+            self._monitor.ticking = False
+
+    def _files(self, bundle: messages.Files | None) -> BundleFiles | None:
+        if bundle is None:
+            return None
+        if bundle.names is not None:
+            self._bundle = bundle.key, BundleFiles(bundle.names, bundle.data)
+        if self._bundle is None or self._bundle[0] != bundle.key:
+            raise WorkerError("a job came without its bundle's files")
+        return self._bundle[1]
+
+    def _hear(self) -> None:
+        for command in self._channel.receive():
+            self._take(command)
+
+    def _take(self, command: messages.Command) -> None:
+        if isinstance(command, messages.Describe):
+            self._jobs.put(command)
+        elif isinstance(command, messages.Play):
+            # From now on it can be cancelled, also before it is taken up.
+            self._told = 0.0, 0
+            self._progress = Progress()
+            self._jobs.put((command, self._progress))
+        elif isinstance(command, messages.Cancel):
+            progress = self._progress
+            if progress is not None:
+                progress.cancel()
+
+    def _tell(self) -> None:
+        progress = self._progress
+        if progress is None:
+            return
+        now = time.monotonic()
+        at, steps = self._told
+        if progress.steps != steps and now - at >= _PROGRESS_S:
+            self._told = now, progress.steps
+            self._channel.send(messages.Told(episodes_done=progress.episodes_done, steps=progress.steps))
+
+
+def _described(env_ids: tuple[str, ...]) -> messages.Answer:
+    try:
+        return messages.Described(environments=tuple(environments.describe(env_id) for env_id in env_ids))
+    except Exception as error:
+        return messages.Fault(kind="worker", message=fault_of(error))
+
+
+def main() -> None:
+    """The process's entry."""
+    commands, answers = take_pipes()
+    channel = Channel(commands, answers)
+    received: list[messages.Command] = []
+    while not received:
+        received = channel.receive()
+    start, *early = received
+    if not isinstance(start, messages.Start):
+        sys.exit(f"the first command is {type(start).__name__}, not Start")
+    try:
+        EnvProcess(channel, commands).run(start, early)
+    except EvopolicyError as error:
+        kind = "sandbox" if isinstance(error, SandboxError) else "worker"
+        channel.send(messages.Fault(kind=kind, message=str(error)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,534 @@
+"""The episode loop: one environment, one policy process, step by step; what the environment's process runs.
+
+Rules:
+- The policy is given observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, an info.
+- A policy that fails is replaced for the rest of the episode by uniform random actions keyed by the policy seed, and
+  every row with such an action says `policy_failed`. An action outside the space is repaired and its row marked.
+- A recording that is played again takes the policy's place: its actions, to its last step; then the episode stops,
+  whether or not the environment ended it.
+- A video is made of the episode's actions after its end (see `video.py`); playing it never draws.
+- What the policy did is a result, and so is what its actions did to the environment: an environment that breaks down on
+  them plays the episode once more, anew and with random actions alone. What the environment or the sandbox did wrong
+  otherwise is raised.
+- A policy that is ended from outside is started again, and the episode with it. What it had returned stands: whatever a
+  policy may do to itself, it never gets to throw its dice again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import sys
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.episode import (
+    LARGEST_LIMITS,
+    NO_POLICY,
+    BlobRef,
+    EpisodeOutcome,
+    EpisodeSpec,
+    Job,
+    PolicyFailure,
+    ResourceLimits,
+)
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.trajectory import Recorder, decode
+from evopolicy_common.wire import codec
+from evopolicy_worker import environments
+from evopolicy_worker.environments import Environment
+from evopolicy_worker.episodes import float_environment
+from evopolicy_worker.episodes.monitor import Monitor
+from evopolicy_worker.episodes.policy_process import (
+    BundleFiles,
+    Ended,
+    PolicyFailedError,
+    PolicyProcess,
+    oom_kills,
+)
+from evopolicy_worker.sandbox.jail import Jail
+from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.slots import endings
+from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
+from evopolicy_worker.slots.recording import VideoRecorder
+
+MAX_FAULT = 4000
+"""Characters of an error that are told."""
+MAX_JOB_OUTPUT_BYTES = 64 << 20
+"""Of what is kept of a job's stdout, stderr and tracebacks, each episode has an equal share: 327 may use their limits up."""
+MAX_ENDS = 5
+"""So often is one episode's policy started again here after an end from outside; then the job is played elsewhere."""
+MAX_WARM_ENVIRONMENTS = 4
+"""Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
+
+
+_ACTING = messages.framed(messages.Acting())
+
+
+class CancelledJobError(Exception):
+    """The job was cancelled while it ran."""
+
+
+class Progress:
+    """How far the running job is; written by the loop, read by the monitor's thread."""
+
+    def __init__(self) -> None:
+        self.episodes_done = 0
+        self.steps = 0
+        self.cancelled = False
+        self.policy: PolicyProcess | None = None
+
+    def cancel(self) -> None:
+        """Ends the running job at the next step, and the policy at once."""
+        self.cancelled = True
+        policy = self.policy
+        if policy is not None:
+            policy.kill()
+
+
+class Player:
+    """Plays jobs one after another with warm environments and a zygote."""
+
+    def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
+        self._zygote = zygote
+        self._jail = jail
+        self._monitor = monitor
+        self._scratch = scratch
+        self._environments: OrderedDict[str, Environment] = OrderedDict()
+        self._prepared: Child | None = None
+        self._n_policies = 0
+        self._folders: list[Path] = []
+        self._oom_kills = oom_kills()
+        self._videos = VideoRecorder()
+
+    def play(
+        self,
+        job: Job,
+        files: BundleFiles | None,
+        progress: Progress,
+        tell: Callable[[bytes], None],
+        first: int = 0,
+        failure: PolicyFailure | None = None,
+    ) -> None:
+        """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`. `files`: its bundle.
+
+        It begins with the `first`, which is played without its policy where that has failed with `failure`.
+        Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
+        """
+        environment = self._environment(job.env)
+        job = msgspec.structs.replace(job, limits=_within_share(job))
+        if job.bundle is not None and files is None:
+            raise WorkerError("a job with a bundle came without the bundle")
+        policies = _Policies(self, job, files, environment)
+        if not job.video:
+            self._videos.close()
+        try:
+            progress.episodes_done = first
+            for k in range(first, len(job.episodes)):
+                spec = job.episodes[k]
+                if progress.cancelled:
+                    raise CancelledJobError
+                failure, frame = self._play(k, job, spec, policies, progress, tell, failure)
+                tell(frame)
+                progress.episodes_done += 1
+                if failure is not None and _verdict_of_submit(job, spec, failure):
+                    for other in job.episodes[k + 1 :]:
+                        tell(_framed(_brief(_unplayed(other.index, failure), _share(job))))
+                    break
+                failure = None
+        finally:
+            policies.close(progress)
+
+    def _play(
+        self,
+        k: int,
+        job: Job,
+        spec: EpisodeSpec,
+        policies: _Policies,
+        progress: Progress,
+        tell: Callable[[bytes], None],
+        failure: PolicyFailure | None,
+    ) -> tuple[PolicyFailure | None, bytes]:
+        """The failure in one episode, and its outcome as it is told."""
+        taken: list[Any] = []
+        n_ends = 0
+        while True:
+            environment = self._environment(job.env)
+            episode = _Episode(job, spec, environment, policies, progress, self._videos, tell, taken, failure)
+            try:
+                outcome = episode.play(k)
+                return outcome.failure, _framed(_brief(outcome, _share(job)))
+            except EndedFromOutsideError as error:
+                # Where one policy plays several episodes it took with it what it had learned.
+                n_ends += 1
+                if progress.cancelled or job.policy_scope == "submit" or n_ends > MAX_ENDS:
+                    raise
+                note(f"a policy is started again: {fault_of(error)}")
+                policies.drop()
+            except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
+                raise
+            except Exception as error:
+                if progress.cancelled or not episode.acted or failure is not None:
+                    raise
+                # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
+                note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
+                self._environments.pop(job.env).close()
+                failure = episode.failure or endings.broken_down(Ending("environment", "exit"))
+
+    def prepare(self) -> None:
+        """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
+        self._bury()
+        if self._prepared is None:
+            self._prepared = self._zygote.spawn()
+        self._oom_kills = oom_kills()
+
+    def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
+        child, self._prepared = self._prepared, None
+        if child is None:
+            self._bury()
+            child = self._zygote.spawn()
+            self._oom_kills = oom_kills()
+        self._n_policies += 1
+        folder = self._scratch / "policies" / str(self._n_policies)
+        if self._jail.home is None:
+            self._folders.append(folder)
+        return PolicyProcess(
+            self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
+        )
+
+    def _bury(self) -> None:
+        """The processes of the policies so far are gone after this, and so are their folders."""
+        self._zygote.bury()
+        while self._folders:
+            remove_tree(self._folders.pop())
+
+    def close(self) -> None:
+        for environment in self._environments.values():
+            environment.close()
+        self._environments.clear()
+        self._videos.close()
+        self._zygote.close()
+
+    def _environment(self, env_id: str) -> Environment:
+        environment = self._environments.get(env_id)
+        if environment is None:
+            while len(self._environments) >= MAX_WARM_ENVIRONMENTS:
+                self._environments.popitem(last=False)[1].close()
+            environment = self._environments[env_id] = environments.make(env_id)
+        self._environments.move_to_end(env_id)
+        return environment
+
+
+class _Policies:
+    """The policy of each episode of a job: its own, or one for several."""
+
+    def __init__(self, player: Player, job: Job, files: BundleFiles | None, environment: Environment) -> None:
+        self._player = player
+        self._job = job
+        self._files = files
+        description = environment.description
+        self._env_meta = job.env_meta | {
+            "obs_space": description.obs_space,
+            "action_space": description.action_space,
+            "obs_storage": description.obs_storage,
+        }
+        if description.reward_components:
+            self._env_meta["reward_components"] = dict(description.reward_texts)
+        self._policy: PolicyProcess | None = None
+
+    def take(self, k: int, spec: EpisodeSpec, progress: Progress) -> PolicyProcess:
+        """The policy for the job's k-th episode, before its reset. Raises PolicyFailedError."""
+        job, files = self._job, self._files
+        assert files is not None
+        if self._policy is not None and not (job.policy_every and k % job.policy_every == 0):
+            self._policy.begin_episode(first=False)
+            return self._policy
+        self._end()
+        if not any(name == "policy.py" for name, _, _ in files.names):
+            raise PolicyFailedError(
+                PolicyFailure(
+                    category="missing_policy",
+                    step_index=None,
+                    message="there is no policy.py in system/; it must hold a top-level class Policy",
+                )
+            )
+        policy = self._policy = progress.policy = self._player.new_policy(job.limits)
+        policy.init(files, spec.policy_seed, self._env_meta, job.observations)
+        return policy
+
+    def release(self) -> Ended:
+        """What the policy leaves of the episode that ended; a policy for one episode ends with it."""
+        policy = self._policy
+        if policy is None:
+            return Ended(b"", b"", 0.0)
+        if self._job.policy_scope == "submit" and not policy.dead:
+            ended = policy.take_output()
+            if not policy.dead:
+                return ended
+        else:
+            ended = policy.end()
+        self._policy = None
+        return ended
+
+    def close(self, progress: Progress) -> None:
+        progress.policy = None
+        self._end()
+
+    def drop(self) -> None:
+        """The policy is lost; the next episode gets another one."""
+        self._end()
+
+    def _end(self) -> None:
+        if self._policy is not None:
+            policy, self._policy = self._policy, None
+            policy.kill()
+            # What is wrong with the sandbox was told by what the job did with it.
+            with contextlib.suppress(EvopolicyError):
+                policy.end()
+
+
+class _Episode:
+    """One episode from reset to its end."""
+
+    def __init__(
+        self,
+        job: Job,
+        spec: EpisodeSpec,
+        environment: Environment,
+        policies: _Policies,
+        progress: Progress,
+        videos: VideoRecorder,
+        tell: Callable[[bytes], None],
+        taken: list[Any],
+        failure: PolicyFailure | None,
+    ) -> None:
+        """`taken`: what the policy has returned in this episode before it was ended from outside, which stands: it is asked
+        again, and its first answers do not count. Those that do are added. `failure`: why no policy is asked, and random
+        actions are played from the first step on.
+        """
+        self._tell = tell
+        self._taken = taken
+        self._job = job
+        self._spec = spec
+        self._environment = environment
+        self._policies = policies
+        self._progress = progress
+        self._videos = videos
+        self.failure = failure
+        self.acted = False
+        """Whether an action of the policy's has reached the environment."""
+
+    def play(self, k: int) -> EpisodeOutcome:
+        job, spec = self._job, self._spec
+        start = time.monotonic()
+        policy = self._begin(k) if job.bundle is not None and self.failure is None else None
+        if self.failure is not None and _verdict_of_submit(job, spec, self.failure):
+            ended = self._policies.release()
+            return msgspec.structs.replace(
+                _unplayed(spec.index, self.failure),
+                stdout=ended.stdout,
+                stderr=ended.stderr,
+                policy_cpu_s=ended.cpu_s,
+                wall_s=time.monotonic() - start,
+            )
+        recorder = Recorder(job.record, job.observations)
+        films = job.video and (not job.video_episodes or k < job.video_episodes)
+        played = Recorder("actions") if films else None
+        total, components, length, terminated, truncated = self._steps(policy, recorder, played)
+        wall_s = time.monotonic() - start
+        ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
+        return EpisodeOutcome(
+            index=spec.index,
+            episode_return=total,
+            length=length,
+            terminated=terminated,
+            truncated=truncated,
+            failure=self.failure,
+            reward_components=components,
+            trajectory=_blob(recorder.finish()),
+            video=None if played is None else self._video(played.finish(), length),
+            stdout=ended.stdout,
+            stderr=ended.stderr,
+            wall_s=wall_s,
+            policy_cpu_s=ended.cpu_s,
+        )
+
+    def _video(self, actions: bytes, length: int) -> BlobRef | None:
+        """The episode's video; None where there can be none."""
+        progress = self._progress
+        mp4 = self._videos.record(
+            self._environment.description, self._spec.case, actions, length, lambda: progress.cancelled
+        )
+        if progress.cancelled:
+            raise CancelledJobError
+        return None if mp4 is None else _blob(mp4)
+
+    def _begin(self, k: int) -> PolicyProcess | None:
+        """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
+        try:
+            policy = self._policies.take(k, self._spec, self._progress)
+            policy.reset(self._spec.episode_index)
+            policy.prepare_acts()
+            return policy
+        except PolicyFailedError as error:
+            self._note(error.failure)
+            return None
+
+    def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
+        if self._progress.cancelled:
+            raise CancelledJobError
+        self.failure = msgspec.structs.replace(failure, step_index=step)
+
+    def _steps(
+        self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
+    ) -> tuple[float, dict[str, float], int, bool, bool]:
+        """Play to the end: return, components of the reward, length, terminated, truncated.
+
+        `played` is given the actions as they were played, for the video.
+        """
+        environment, progress = self._environment, self._progress
+        codec = environment.action_codec
+        repair, step, append = codec.repair, environment.step, recorder.append
+        actions_only = self._job.record == "actions"
+        recorded = _recorded_actions(self._spec)
+        rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
+        failed = self._job.bundle is not None and policy is None
+        names = environment.description.reward_components
+        sums = dict.fromkeys(names, 0.0)
+        total, t = 0.0, 0
+        taken = self._taken
+        n_taken, keep = len(taken), taken.append
+        float_environment.reset()
+        obs = environment.reset(self._spec.case)
+        while True:
+            invalid = False
+            if policy is not None:
+                try:
+                    returned = policy.act(obs)
+                    if not self.acted:
+                        self.acted = True
+                        self._tell(_ACTING)
+                    if t < n_taken:
+                        returned = taken[t]
+                    else:
+                        keep(returned)
+                    action, invalid = repair(returned)
+                except PolicyFailedError as error:
+                    self._note(error.failure, t)
+                    policy, failed = None, True
+                    rng = random_actions(self._spec.policy_seed)
+            if rng is not None:
+                action = returned = codec.sample(rng)
+            elif recorded is not None:
+                returned = recorded[t]
+                action, invalid = repair(returned)
+            next_obs, reward, terminated, truncated, info = step(action)
+            told = info.get("rewards", info)
+            for name in names:
+                sums[name] += _number(told.get(name))
+            if invalid:
+                info = {**info, "action_invalid": True}
+            if failed:
+                info = {**info, "policy_failed": True}
+            append(obs, action if actions_only else returned, reward, terminated, truncated, info)
+            if played is not None:
+                played.append(None, action, reward, terminated, truncated, info)
+            total += reward
+            t += 1
+            progress.steps += 1
+            if terminated or truncated or (recorded is not None and t == len(recorded)):
+                break
+            if progress.cancelled:
+                raise CancelledJobError
+            obs = next_obs
+        for name, value in (("return", total), *sums.items()):
+            if not math.isfinite(value):
+                raise WorkerError(f"{self._job.env}, episode {self._spec.index}: its {name} is {value}")
+        return total, sums, t, terminated, truncated
+
+
+def random_actions(policy_seed: bytes) -> np.random.Generator:
+    """The generator of the uniform random actions that play in place of a policy."""
+    digest = hashlib.sha256(b"evopolicy random actions\0" + policy_seed).digest()
+    return np.random.default_rng(int.from_bytes(digest, "little"))
+
+
+def _recorded_actions(spec: EpisodeSpec) -> list[Any] | None:
+    """The actions that are played again, at least one; None where a policy acts."""
+    if spec.replay is None:
+        return None
+    if spec.replay.inline is None:
+        raise WorkerError(f"episode {spec.index} came without the recording that it plays")
+    actions = [row.action for row in decode(spec.replay.inline).rows()]
+    if not actions:
+        raise WorkerError(f"episode {spec.index}: its recording has no step")
+    return actions
+
+
+def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:
+    """Whether the failure says that the whole submit yields no Policy: there is nothing to play then.
+
+    Hidden episodes are played in any case: a return of nothing would beat every policy where steps cost.
+    """
+    return spec.index == 0 and job.record == "full" and failure.category in NO_POLICY
+
+
+def _share(job: Job) -> int:
+    """Bytes that one episode of the job may say."""
+    return max(1024, MAX_JOB_OUTPUT_BYTES // len(job.episodes))
+
+
+def _within_share(job: Job) -> ResourceLimits:
+    """The job's limits with the output that there is room for in its results."""
+    most = min(LARGEST_LIMITS["output_bytes"], _share(job) // 3)
+    return msgspec.structs.replace(job.limits, output_bytes=min(job.limits.output_bytes, most))
+
+
+def _brief(outcome: EpisodeOutcome, share: int) -> EpisodeOutcome:
+    """The outcome with no more of a traceback than its share; of that the end tells most."""
+    failure = outcome.failure
+    if failure is None or 4 * len(failure.traceback) <= share // 3:
+        return outcome
+    kept = failure.traceback[-(share // 12) :]
+    return msgspec.structs.replace(outcome, failure=msgspec.structs.replace(failure, traceback=kept))
+
+
+def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
+    return EpisodeOutcome(
+        index=index, episode_return=0.0, length=0, terminated=False, truncated=False, failure=failure
+    )
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _framed(outcome: EpisodeOutcome) -> bytes:
+    return messages.framed(messages.Finished(outcome=outcome))
+
+
+def _blob(data: bytes) -> BlobRef:
+    if len(data) > codec.MAX_BLOB_BYTES:
+        raise WorkerError(f"a recording of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
+    return BlobRef(digest=digest_of(data), size=len(data), inline=data)
+
+
+def note(text: str) -> None:
+    """Tell an operator, by the worker's log."""
+    print(f"{messages.NOTE}{text}", file=sys.stderr, flush=True)
+
+
+def fault_of(error: BaseException) -> str:
+    """An error of ours in one line, with its kind where it is not one raised on purpose."""
+    text = str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"
+    return text.encode("utf-8", "replace").decode()[:MAX_FAULT]

@@ -1,0 +1,538 @@
+"""One policy in the sandbox, as the episode loop sees it: init, reset, act, and how it failed.
+
+Rules: whatever the policy does is either an answer or a `PolicyFailedError`; what is the sandbox's own fault, or was done
+to it from outside (`endings`), is a SandboxError and never blamed on the policy. A policy that failed by dying or by breaking the
+pipes' rules is `dead`; one whose code raised lives on. Once an episode is played, no end of its policy voids it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from typing import Any, NamedTuple
+
+from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
+from evopolicy_common.simulators import SIMULATORS
+from evopolicy_worker.episodes import frames
+from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
+from evopolicy_worker.sandbox import zygote as zygotes
+from evopolicy_worker.sandbox.jail import Jail
+from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
+from evopolicy_worker.slots import endings
+from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
+
+_DENIED = frozenset(
+    {
+        *SIMULATORS,
+        *("evopolicy_common", "evopolicy_worker", "evopolicy_coordinator", "evopolicy_gateway", "zenoh"),
+    }
+)
+"""What a policy that asks for it is told it may not import: simulators and our own code, which it does not see."""
+_GRACE_S = 1.0
+_SEAL_S = 60.0
+"""For what is our own work before the bundle is imported."""
+_EXIT_S = 5.0
+"""For a process that is ending to be gone."""
+_PF_EXITING = 0x4
+_LARGE_SHARE = 0.125
+"""Where the system has ended processes for want of memory, and this one without a word: it was for its own memory when it held
+more than such a share of its limit."""
+_SHIM_BROKEN = 70
+"""The status with which `inside/zygote.py` ends a process that it should never come back from."""
+_ARRAY_HEAD_BYTES = 8 + 4 * 64
+"""Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
+_USUAL_ACTION_BYTES = 256
+"""An action of so many bytes, beside 16 for each number of the action space, counts for nothing in its episode."""
+_MAX_MESSAGE = 2000
+_MAX_TRACEBACK = 16_000
+_STAGES: dict[str, FailureCategory] = {
+    "import": "import_error",
+    "init": "init_error",
+    "reset": "reset_error",
+    "act": "act_error",
+}
+
+
+class PolicyFailedError(Exception):
+    """The policy failed; `failure` says how (its step is for the episode loop to add)."""
+
+    def __init__(self, failure: PolicyFailure) -> None:
+        super().__init__(failure.message)
+        self.failure = failure
+
+
+class BundleFiles(NamedTuple):
+    """A bundle's files, read once per job."""
+
+    names: list[tuple[str, bool, int]]
+    """Path, executable, size in bytes."""
+    data: bytes
+    """Their contents, one after another."""
+
+
+class Ended(NamedTuple):
+    """What a policy leaves behind."""
+
+    stdout: bytes
+    stderr: bytes
+    cpu_s: float
+
+
+class PolicyProcess:
+    """A forked process of the zygote's that becomes one Policy."""
+
+    def __init__(
+        self,
+        zygote: Zygote,
+        child: Child,
+        monitor: Monitor,
+        jail: Jail,
+        limits: ResourceLimits,
+        folder: str,
+        oom_kills: int | None = None,
+    ) -> None:
+        """`folder` is where its files are when the jail gives it no home of its own; `oom_kills`, what that function gave
+        before."""
+        self._zygote = zygote
+        self._child = child
+        self._monitor = monitor
+        self._limits = limits
+        self._home = jail.home or folder
+        self._enclosed = jail.home is not None
+        # A CPU limit of the worker's own is the policy's too, and ends it by SIGKILL.
+        self._held = bool(jail.config["seals"]) and resource.getrlimit(resource.RLIMIT_CPU) == (-1, -1)
+        self._watch = Watch(child, limits, count_threads=not self._enclosed, held=self._held)
+        self._base_bytes, self._base_resident = _memory(child.host_pid)
+        self._oom_kills = oom_kills
+        self._write: frames.Writer = list
+        self._action_bytes = 0
+        self._usual_bytes = 0
+        self._surplus_bytes = 0
+        self._exit: Exit | None = None
+        self._gone = False
+        self._finished: Ended | None = None
+        self._closing = threading.Lock()
+        self._requests = child.requests
+        self._replies = child.replies
+        self.dead = False
+
+    def init(
+        self,
+        bundle: BundleFiles,
+        seed: bytes,
+        env_meta: dict[str, Any],
+        observations: str,
+    ) -> None:
+        """Seal the process, import the bundle and build its Policy.
+
+        Raises PolicyFailedError with a category of NO_POLICY.
+        """
+        limits = self._limits
+        needed = 16 * frames.elements(env_meta["action_space"])
+        self._action_bytes = limits.action_bytes + needed
+        self._usual_bytes = _USUAL_ACTION_BYTES + needed
+        n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
+        rlimits = {
+            "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
+            "RLIMIT_FSIZE": limits.file_bytes,
+            "RLIMIT_NOFILE": limits.open_files,
+            "RLIMIT_CORE": 0,
+            "RLIMIT_MEMLOCK": 0,
+            "RLIMIT_MSGQUEUE": 0,
+            "RLIMIT_SIGPENDING": 256,
+        }
+        if self._enclosed:
+            # Counted per user namespace: its parent and the zygote are in it too.
+            rlimits["RLIMIT_NPROC"] = limits.processes + 2
+        init = {
+            "home": self._home,
+            "home_bytes": limits.file_bytes + sum(-(-size // 4096) * 4096 for _, _, size in bundle.names),
+            "home_inodes": limits.files + len(bundle.names) + n_folders,
+            "files": bundle.names,
+            "limits": rlimits,
+            "seed": seed.hex(),
+            "obs_space": env_meta["obs_space"],
+            "action_space": env_meta["action_space"],
+            "env_meta": env_meta,
+            "observations": observations,
+            "action_bytes": self._action_bytes,
+        }
+        self._write = frames.compile_writer(env_meta["obs_space"])
+        self._monitor.watch(self._watch)
+        self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
+        frame = [frames.REQUEST_HEADER.pack(0, frames.LOAD, 0)]
+        self._watch.spent_s = 0.0
+        self._expect_ok(frame, "init", limits.init_wall_s)
+
+    def begin_episode(self, *, first: bool) -> None:
+        """Wall, CPU time and output count from here; the first episode's include the import."""
+        if not first:
+            self._watch.begin_episode()
+
+    def reset(self, episode_index: int) -> None:
+        """Raises PolicyFailedError."""
+        self._surplus_bytes = 0
+        frame = [frames.REQUEST_HEADER.pack(0, frames.RESET, episode_index)]
+        self._expect_ok(frame, "reset", self._limits.act_wall_s)
+
+    def prepare_acts(self) -> None:
+        """After `reset`: what `act` need not do on every step."""
+        self._watch.what = "act"
+        self._watch.answer_limit_s = self._limits.act_wall_s
+
+    def act(self, obs: Any) -> Any:
+        """The policy's answer to one observation, as it returned it. Raises PolicyFailedError."""
+        parts = self._write(obs)
+        length = 0
+        for part in parts:
+            length += part.nbytes if type(part) is not bytes else len(part)
+        tag, payload = self._exchange(
+            [frames.REQUEST_HEADER.pack(length, frames.ACT, 0), *parts], 16 + length
+        )
+        if tag <= frames.GENERIC:
+            if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
+                how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
+                raise self._broken(how, self._action_bytes, len(payload))
+            if len(payload) > self._usual_bytes:
+                self._count_surplus(len(payload) - self._usual_bytes)
+            try:
+                return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
+            except frames.BadReplyError as error:
+                raise self._broken(str(error)) from None
+        raise self._told(tag, payload, "act")
+
+    def _count_surplus(self, n_bytes: int) -> None:
+        """Actions are kept as they came: what they take beyond the usual is bounded for the whole episode too."""
+        self._surplus_bytes += n_bytes
+        limit = self._limits.episode_action_bytes
+        if self._surplus_bytes > limit:
+            text = f"actions larger than the action space needs came to {self._surplus_bytes:,} bytes in this episode;"
+            raise self._failed(
+                "act_error", f"{text} {limit:,} are the limit", limit=limit, used=self._surplus_bytes
+            )
+
+    @property
+    def spent_s(self) -> float:
+        """The policy's own wall time in this episode, seconds."""
+        return self._watch.spent_s
+
+    def take_output(self) -> Ended:
+        """Output and CPU time of the episode that ends; the policy lives on when it can.
+
+        EndedFromOutsideError when it was ended so: the policy of the episodes to come is lost.
+        """
+        if not self.dead:
+            with contextlib.suppress(PolicyFailedError):
+                self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.FLUSH, 0)], "act", _GRACE_S)
+        if self.dead:
+            return self.end()
+        # Under the monitor's lock: nobody else reads meanwhile.
+        self._monitor.watch(None)
+        self._watch.drain()
+        cpu_s = self._watch.cpu_s() - self._watch.cpu_start_s
+        ended = Ended(self._watch.stdout.take(), self._watch.stderr.take(), cpu_s)
+        self._monitor.watch(self._watch)
+        return ended
+
+    def end(self) -> Ended:
+        """End the process, if it has not ended, and collect what it leaves."""
+        if self._finished is None:
+            if not self.dead:
+                with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
+                    self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.END, 0)], "act", _GRACE_S)
+            watch = self._watch
+            cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
+            self._monitor.watch(None)
+            watch.drain()
+            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
+            with self._closing:
+                if self._gone:
+                    self._child.close()
+                else:
+                    # It has said its last; what a hostile one writes from now on is not read.
+                    self._zygote.bury_later(self._child)
+        return self._finished
+
+    def kill(self) -> None:
+        """SIGKILL from any thread; the loop finds out by itself."""
+        with self._closing:
+            if self._finished is None:
+                self._child.kill()
+
+    # What passes over the pipes.
+
+    def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> None:
+        self._watch.what = what
+        self._watch.answer_limit_s = limit_s
+        tag, payload = self._exchange(parts, sum(map(len, parts)))
+        if tag != frames.OK:
+            raise self._told(tag, payload, what)
+
+    def _exchange(self, parts: list[Any], total: int) -> tuple[int, bytes]:
+        watch = self._watch
+        start = watch.since = time.monotonic()
+        try:
+            # The system takes 1,024 pieces at once; only odd spaces have more leaves.
+            n = os.writev(self._requests, parts[:1024])
+            if n < total:
+                self._write_rest(parts, n)
+            data = os.read(self._replies, 65536)
+        except BrokenPipeError:
+            data = b""
+        if len(data) < 8:
+            data = self._read_more(data, 8)
+        length, tag = frames.REPLY_HEADER.unpack_from(data)
+        if len(data) != 8 + length:
+            if length > frames.MAX_REPLY_BYTES:
+                raise self._broken(
+                    f"it announced an answer of {length:,} bytes; {frames.MAX_REPLY_BYTES:,} are the limit",
+                    frames.MAX_REPLY_BYTES,
+                    length,
+                )
+            data = self._read_more(data, 8 + length)
+            if len(data) > 8 + length:
+                raise self._broken("it sent more than one answer to one question")
+        watch.since = 0.0
+        watch.spent_s += time.monotonic() - start
+        return tag, data[8:]
+
+    def _write_rest(self, parts: list[Any], n: int) -> None:
+        left = memoryview(
+            b"".join([bytes(part) if type(part) is bytes else part.tobytes() for part in parts])
+        )[n:]
+        while left:
+            left = left[os.write(self._requests, left) :]
+
+    def _read_more(self, data: bytes, wanted: int) -> bytes:
+        pieces = [data]
+        have = len(data)
+        while have < wanted:
+            piece = os.read(self._replies, min(1 << 20, wanted - have))
+            if not piece:
+                raise self._died()
+            pieces.append(piece)
+            have += len(piece)
+        return b"".join(pieces)
+
+    # How it failed.
+
+    def _told(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
+        """The failure that the policy's process reports of itself."""
+        if what == "seal":
+            # None of the bundle's code has run: this is ours.
+            self._bury()
+            raise SandboxError(
+                f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
+            )
+        if tag != frames.FAILED:
+            return self._broken(f"it answered {what} with frame {tag}")
+        try:
+            report = frames.report(payload)
+        except frames.BadReplyError as error:
+            return self._broken(str(error))
+        stage = report.stage if what == "init" and report.stage in ("import", "init") else what
+        category = _STAGES[stage]
+        limit, used = None, None
+        limits = self._limits
+        by_kind: dict[str, tuple[FailureCategory, float, float | None, str]] = {
+            "memory": (
+                "oom",
+                limits.memory_bytes,
+                self._memory_used(),
+                f"memory: {limits.memory_bytes:,} bytes beside Python's own are the limit",
+            ),
+            "files": (
+                "file_limit",
+                limits.file_bytes,
+                limits.file_bytes,
+                f"files: {limits.file_bytes:,} bytes written are the limit",
+            ),
+            "inodes": (
+                "file_limit",
+                limits.files,
+                limits.files,
+                f"files: {limits.files:,} files and folders are the limit",
+            ),
+            "descriptors": (
+                "file_limit",
+                limits.open_files,
+                limits.open_files,
+                f"files: {limits.open_files} open descriptors are the limit",
+            ),
+            "processes": (
+                "process_limit",
+                limits.processes,
+                limits.processes,
+                f"processes: {limits.processes} threads are the limit, whose stacks count as memory, and no process may"
+                " be started",
+            ),
+        }
+        message = report.message
+        if report.kind in by_kind:
+            of_kind, limit, used, text = by_kind[report.kind]
+            if stage in ("reset", "act"):
+                category = of_kind
+            message = f"{message} [{text}]"
+        elif report.kind == "action":
+            limit, used = self._action_bytes, report.used
+        if stage == "import" and report.missing:
+            top = report.missing.partition(".")[0]
+            if top in _DENIED:
+                category = "denied_import"
+                message = f"{message}: policies may not import {top}; they see observations only"
+        return self._failed(category, message, report.traceback, limit, used)
+
+    def _broken(self, how: str, limit: float | None = None, used: float | None = None) -> PolicyFailedError:
+        """It did what no honest policy process does on its pipes."""
+        self._bury()
+        text = f"the policy's process was ended: {how}"
+        return self._failed(self._fatal("killed"), text, limit=limit, used=used)
+
+    def _died(self) -> PolicyFailedError:
+        """Its pipe closed: the policy's failure, by the table of endings. EndedFromOutsideError when it is none."""
+        watch, limits = self._watch, self._limits
+        alive = not wait_dead(self._child.pidfd, 0.05)
+        if alive and _exiting(self._child.host_pid):
+            alive = not wait_dead(self._child.pidfd, _EXIT_S)
+        self._bury()
+        exit_, found = self._exit, watch.verdict
+        if found is None and exit_ is not None and not alive and not watch.stopped:
+            found = self._limit_of(exit_)
+        if found is not None:
+            ending, text = Ending("policy", "SIGKILL", found.category), found.message
+        elif watch.stopped:
+            ending, text = Ending("policy", "stop"), f"the policy's process was stopped for {STOPPED_S:g} s"
+        elif alive:
+            ending, text = Ending("policy", "pipe"), "the policy closed the pipe that it answers on"
+        elif exit_ is None:
+            ending, text = Ending("sandbox", "SIGKILL"), "the policy's sandbox ended"
+        else:
+            ending, text = (
+                Ending("policy", endings.how(exit_.status)),
+                f"the policy's process {exit_.describe()}",
+            )
+            if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
+                text += ", as it does when the code in it that answers for the policy was broken"
+            if os.WIFSIGNALED(exit_.status) and os.WTERMSIG(exit_.status) == signal.SIGBUS:
+                text += f", as for writing to a mapped file when its files have {limits.file_bytes:,} bytes, the limit"
+        category = endings.verdict(ending._replace(began=watch.what != "seal", held=self._held))
+        if category is None:
+            if watch.what == "seal":
+                raise EndedFromOutsideError(f"a policy's process could not seal itself: {text}")
+            raise EndedFromOutsideError(f"{text}, and neither the policy nor a limit can have done that")
+        if found is None:
+            return self._failed(self._fatal(category), text)
+        return self._failed(self._fatal(category), text, limit=found.limit, used=found.used)
+
+    def _limit_of(self, exit_: Exit) -> Verdict | None:
+        """The limit for which the system ended it."""
+        if not os.WIFSIGNALED(exit_.status):
+            return None
+        limits, cpu_s = self._limits, self._cpu_of_episode()
+        if cpu_s > limits.cpu_s:
+            text = f"the policy used more than {limits.cpu_s:g} s of CPU time"
+            return Verdict("cpu_limit", text, limits.cpu_s, cpu_s)
+        held = exit_.peak_bytes - self._base_resident
+        counted = oom_kills()
+        killed = endings.how(exit_.status) == "SIGKILL"
+        if (
+            killed
+            and held > _LARGE_SHARE * limits.memory_bytes
+            and (counted is None or counted != self._oom_kills)
+        ):
+            text = (
+                f"the system ended the policy for want of memory: it held {held:,} bytes beside Python's own;"
+                f" {limits.memory_bytes:,} are the limit"
+            )
+            return Verdict("oom", text, limits.memory_bytes, held)
+        return None
+
+    def _fatal(self, category: FailureCategory) -> FailureCategory:
+        """Before there is a Policy, whatever ends the process means that the bundle yields none."""
+        return "init_error" if self._watch.what == "init" else category
+
+    def _bury(self) -> None:
+        """The process is dead when this returns, or was told to die and is buried later; `_exit` says how it ended."""
+        self.dead = True
+        self._watch.since = 0.0
+        self._child.kill()
+        self._gone = wait_dead(self._child.pidfd, zygotes.DEATH_TIMEOUT_S)
+        if self._gone:
+            # None when the sandbox has ended.
+            with contextlib.suppress(SlotDiedError):
+                self._exit = self._zygote.wait(self._child)
+
+    def _cpu_of_episode(self) -> float:
+        """CPU time that the dead process had used since the episode began, seconds; 0.0 when nobody knows."""
+        return max(0.0, self._exit.cpu_s - self._watch.cpu_start_s) if self._exit is not None else 0.0
+
+    def _memory_used(self) -> float | None:
+        """The most that it had beside Python's own, bytes; None when that cannot be read."""
+        with contextlib.suppress(OSError, ValueError), open(f"/proc/{self._child.host_pid}/status") as lines:
+            for line in lines:
+                if line.startswith("VmPeak:"):
+                    return max(0.0, float(int(line.split()[1]) * 1024 - self._base_bytes))
+        return None
+
+    def _failed(
+        self,
+        category: FailureCategory,
+        message: str,
+        traceback: str = "",
+        limit: float | None = None,
+        used: float | None = None,
+    ) -> PolicyFailedError:
+        self._watch.since = 0.0
+        return PolicyFailedError(
+            PolicyFailure(
+                category=category,
+                step_index=None,
+                message=self._without_paths(message)[:_MAX_MESSAGE],
+                traceback=self._without_paths(traceback)[-_MAX_TRACEBACK:],
+                limit=limit,
+                used=used,
+            )
+        )
+
+    def _without_paths(self, text: str) -> str:
+        """Text without this machine's folders: `system/policy.py`, `python3.11/random.py`, `numpy/…`."""
+        text = text.encode("utf-8", "replace").decode().replace(f"{self._home}/", "")
+        library = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        for prefix in (os.path.realpath(sys.base_prefix), sys.base_prefix):
+            text = text.replace(f"{prefix}/lib/{library}/", f"{library}/")
+        return text.replace("/packages/", "")
+
+
+def oom_kills() -> int | None:
+    """How many processes this machine has ended so far for want of memory; None when it does not tell."""
+    with contextlib.suppress(OSError, ValueError), open("/proc/vmstat") as lines:
+        for line in lines:
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    return None
+
+
+def _memory(pid: int) -> tuple[int, int]:
+    """Bytes of address space and of memory that the process has; what Python with numpy has when that cannot be read."""
+    try:
+        with open(f"/proc/{pid}/statm") as file:
+            space, resident = file.read().split()[:2]
+    except (OSError, ValueError):
+        return 1 << 29, 1 << 25
+    page = os.sysconf("SC_PAGE_SIZE")
+    return int(space) * page, int(resident) * page
+
+
+def _exiting(pid: int) -> bool:
+    """Whether the process is on its way out."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return bool(int(file.read().rpartition(")")[2].split()[6]) & _PF_EXITING)
+    except (OSError, ValueError, IndexError):
+        return True

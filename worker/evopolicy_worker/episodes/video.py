@@ -1,0 +1,148 @@
+"""An episode's video: `python -m evopolicy_worker.episodes.video ENV_ID`, started and told by `recording.VideoRecorder`.
+
+Rules:
+- The episode is played a second time, from its actions, in an environment of this process's own that renders. The
+  episode that counts never draws: with and without a video it is the same bytes, and drawing is charged to no policy.
+- Frame t shows the state in which row t's action was chosen, which the row's observation is of. So the first frame is
+  the first observation's, there are as many frames as rows, and the state after the last step has none.
+- A replay that departs from the episode, in any reward or flag, gives no video: it would show another episode.
+- One episode at a time: a framed `Order` on standard input, a framed `Made` on what was standard output. What
+  simulators and drivers print goes to standard error.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from typing import BinaryIO
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.records.trajectory import decode
+from evopolicy_worker import environments
+from evopolicy_worker.environments import Environment, Frame
+from evopolicy_worker.slots.child_pipes import take_pipes
+from evopolicy_worker.slots.slot_messages import LENGTH
+
+CRF = 28
+"""x264's constant rate factor: 200 frames of 600 × 400 come to some 66 KiB."""
+PRESET = "veryfast"
+MIN_RATE, MAX_RATE = 4, 30
+"""Frames a second."""
+EPISODE_S = 10
+"""An episode of full length should last about so long, where the rates allow it."""
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """The episode to record."""
+
+    case: Case
+    actions: bytes
+    """`trajectory` codec bytes with record "actions": what was played, after repair, and what came of it."""
+
+
+class Made(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to an order."""
+
+    mp4: bytes | None
+    error: str = ""
+    """Why there is no video."""
+
+
+class Encoder:
+    """Frames in, MP4 out: H.264 in 4:2:0, encoded in this process and in memory, by one thread for the same bytes."""
+
+    def __init__(self, rate: int) -> None:
+        """`rate`: frames a second. WorkerError where PyAV is not installed."""
+        try:
+            import av
+        except ImportError as error:
+            raise WorkerError(
+                f"videos are encoded with PyAV: install the extra `evopolicy[worker]` ({error})"
+            ) from error
+        self._from_ndarray = av.VideoFrame.from_ndarray
+        self._file = io.BytesIO()
+        self._container = av.open(self._file, "w", format="mp4")
+        self._stream = self._container.add_stream(
+            "libx264", rate=rate, options={"preset": PRESET, "crf": str(CRF)}
+        )
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.codec_context.thread_count = 1
+        self._shape: tuple[int, ...] | None = None
+
+    def add(self, frame: Frame) -> None:
+        """The next frame, all of one size. An odd side gains a line, as 4:2:0 needs: its last one again."""
+        if self._shape is None:
+            self._shape = frame.shape
+            self._stream.height, self._stream.width = (side + side % 2 for side in frame.shape[:2])
+        if frame.shape != self._shape:
+            raise WorkerError(f"a frame of shape {frame.shape} follows frames of shape {self._shape}")
+        height, width = frame.shape[:2]
+        if height % 2 or width % 2:
+            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        self._container.mux(self._stream.encode(self._from_ndarray(frame, format="rgb24")))
+
+    def finish(self) -> bytes:
+        """The file's bytes. The encoder is not used afterwards."""
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+        return self._file.getvalue()
+
+
+def rate_of(max_episode_steps: int) -> int:
+    """Frames a second, by the environment alone, so that videos of one environment run side by side."""
+    return max(MIN_RATE, min(MAX_RATE, max_episode_steps // EPISODE_S))
+
+
+def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
+    """MP4 bytes of the episode in `actions`, a frame a row.
+
+    `environment` was made with `render=True`. WorkerError where it does not draw, or plays another episode.
+    """
+    encoder = Encoder(rate_of(environment.description.max_episode_steps))
+    environment.reset(case)
+    for row in decode(actions).rows():
+        encoder.add(environment.render())
+        # Repaired already, and once more for its type: the codec's arrays may come back as other views.
+        step = environment.step(environment.action_codec.repair(row.action)[0])
+        if (step.reward, step.terminated, step.truncated) != (row.reward, row.terminated, row.truncated):
+            raise WorkerError(
+                f"{environment.description.env} departs from the recorded episode at step {row.t}"
+            )
+    return encoder.finish()
+
+
+def serve(env_id: str, orders: BinaryIO, answers: BinaryIO) -> None:
+    """Record one episode after another until there are no more orders."""
+    environment: Environment | None = None
+    decoder = msgspec.msgpack.Decoder(Order)
+    while head := orders.read(LENGTH.size):
+        order = decoder.decode(orders.read(LENGTH.unpack(head)[0]))
+        try:
+            if environment is None:
+                environment = environments.make(env_id, render=True)
+            made = Made(mp4=replay(environment, order.case, order.actions))
+        except Exception as error:
+            # Whatever a driver or a simulator has against it: a missing picture is no failure of the episode.
+            what = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
+            made = Made(mp4=None, error=what)
+        data = msgspec.msgpack.encode(made)
+        answers.write(LENGTH.pack(len(data)) + data)
+        answers.flush()
+
+
+def main() -> None:
+    """The process's entry."""
+    orders, answers = take_pipes()
+    with os.fdopen(orders, "rb") as reader, os.fdopen(answers, "wb") as writer:
+        serve(sys.argv[1], reader, writer)
+        # Not by way of exit handlers, of which a graphics driver's may hang or crash.
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

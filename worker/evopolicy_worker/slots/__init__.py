@@ -1,0 +1,1 @@
+"""Slots: one core's worth of episodes each, as the supervisor sees them."""

@@ -1,0 +1,327 @@
+"""A slot: one core's worth of episodes. The supervisor's end of an environment process and its sandbox.
+
+Rules: a job's failure is its policy's (an outcome) or ours (WorkerError, SandboxError, SlotDiedError: played elsewhere), as the
+table of `endings` says. Where the environment's process crashes on a policy's actions, a new one plays the episode with random
+actions, and what is left of the job. `cancel` leaves the slot usable; after an error `start` makes it new. One job at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_worker.episodes.monitor import is_stopped
+from evopolicy_worker.sandbox import env_jail, jail
+from evopolicy_worker.slots import endings
+from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slots.endings import Ending, How
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+START_TIMEOUT_S = 120.0
+CANCEL_TIMEOUT_S = 20.0
+LAST_WORDS_S = 5.0
+"""A cancelled job that has not stopped by then takes its processes with it."""
+STOPPED_S = 30.0
+"""Processes that are stopped from outside for so long are ended, and their job is played elsewhere."""
+_LOOK_S = 5.0
+MAX_ANSWER_BYTES = 1 << 31
+
+
+class Slot:
+    """An environment process in a jail of its own and, inside a sandbox, the policies that it plays. Used by one asyncio loop."""
+
+    def __init__(
+        self,
+        core: int | None,
+        tier: Tier,
+        scratch: Path,
+        allowed_packages: tuple[str, ...] = ("numpy",),
+        *,
+        sealed: bool = True,
+    ) -> None:
+        """`core` is the CPU that all its processes are pinned to; None leaves that to the system.
+
+        `scratch` is a folder of the slot's own. `sealed=False` (tests only) leaves the policy's process unsealed.
+        """
+        self._start = messages.Start(
+            tier=tier,
+            core=core,
+            scratch=str(scratch),
+            allowed_packages=allowed_packages,
+            user=jail.some_user() if tier == "bwrap" and os.geteuid() == 0 else None,
+            sealed=sealed,
+        )
+        self._scratch = scratch
+        self._cancelled = False
+        self._sent = ""
+        self._process: asyncio.subprocess.Process | None = None
+        self._said: deque[str] = deque(maxlen=40)
+        self._listener: asyncio.Task[None] | None = None
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    async def start(self) -> None:
+        """Start the processes, ending those of before.
+
+        SandboxError, with what to do, when this machine cannot provide the tier; WorkerError for other failures.
+        """
+        await self.close()
+        self._scratch.mkdir(parents=True, exist_ok=True)
+        self._sent = ""
+        self._process = await asyncio.create_subprocess_exec(
+            *env_jail.command(self._start.tier, self._scratch, draws=self._start.draws),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            env=env_jail.variables(self._scratch),
+            start_new_session=True,
+            limit=1 << 20,
+        )
+        self._said.clear()
+        self._listener = asyncio.create_task(self._listen(self._process))
+        try:
+            async with asyncio.timeout(START_TIMEOUT_S):
+                await self._send(self._start)
+                answer = await self._answer()
+        except TimeoutError:
+            await self.close()
+            raise WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s") from None
+        except SlotDiedError as error:
+            await self.close()
+            raise WorkerError(str(error)) from error
+        if not isinstance(answer, messages.Ready):
+            await self.close()
+            raise _error(answer)
+
+    async def play(
+        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]:
+        """Play a job: an outcome for each of its episodes, in order, trajectories inline.
+
+        `bundle` is the unpacked bundle's folder, None for random actions; `on_progress` is told episodes and steps done.
+        A cancelled job gives nothing. Raises SlotDiedError, SandboxError or WorkerError.
+        """
+        if self._process is None:
+            raise WorkerError("the slot is not started")
+        if job.tier != self._start.tier:
+            raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
+        self._idle.clear()
+        self._cancelled = False
+        watcher = asyncio.create_task(self._end_what_is_stopped())
+        outcomes: list[EpisodeOutcome] = []
+        try:
+            if job.video and not self._start.draws and env_jail.graphics_devices():
+                self._start = msgspec.structs.replace(self._start, draws=True)
+                await self.start()
+            files = None if bundle is None else await asyncio.to_thread(bundle_files, bundle, self._sent)
+            if self._cancelled:
+                return ()
+            failure: PolicyFailure | None = None
+            while True:
+                began = False
+                try:
+                    await self._send(
+                        messages.Play(job=job, bundle=files, first=len(outcomes), failure=failure)
+                    )
+                    self._sent = files.key if files is not None else self._sent
+                    while not isinstance(answer := await self._answer(), messages.Played):
+                        if isinstance(answer, messages.Told):
+                            on_progress(answer.episodes_done, answer.steps)
+                        elif isinstance(answer, messages.Acting):
+                            began = True
+                        elif isinstance(answer, messages.Finished):
+                            began = False
+                            outcomes.append(answer.outcome)
+                        else:
+                            raise _error(answer)
+                    return () if answer.cancelled else tuple(outcomes)
+                except SlotDiedError as error:
+                    failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=began))
+                    if failure is None or self._cancelled or bundle is None:
+                        raise
+                    log.warning("slot died on a policy's actions", job=job.job_id, error=str(error))
+                await self.start()
+                files = await asyncio.to_thread(bundle_files, bundle)
+        except asyncio.CancelledError:
+            # Nobody reads the rest of this job's answers: the processes are of no more use.
+            self._end_process()
+            raise
+        finally:
+            watcher.cancel()
+            self._idle.set()
+
+    async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
+        """What these environments are: their simulators are imported in the slot's process. Raises as `play`."""
+        if self._process is None:
+            raise WorkerError("the slot is not started")
+        await self._send(messages.Describe(environments=tuple(env_ids)))
+        answer = await self._answer()
+        if isinstance(answer, messages.Described):
+            return answer.environments
+        raise _error(answer)
+
+    async def cancel(self) -> None:
+        """Stop the running job at once; its `play` returns and the slot can be used again. Nothing runs: no effect."""
+        if self._idle.is_set():
+            return
+        process = self._process
+        self._cancelled = True
+        with contextlib.suppress(SlotDiedError):
+            await self._send(messages.Cancel())
+        try:
+            async with asyncio.timeout(CANCEL_TIMEOUT_S):
+                await self._idle.wait()
+        except TimeoutError:
+            if process is self._process:
+                self._end_process()
+
+    async def close(self) -> None:
+        """End the slot's processes and remove its scratch folder; a second close does nothing."""
+        process, self._process = self._process, None
+        if process is not None:
+            _kill(process)
+            await process.wait()
+            # Open as long as anyone in the jail lives, whom the kernel ends after the jail's first process.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LAST_WORDS_S):
+                    while process.stdout is not None and await process.stdout.read(1 << 20):
+                        pass
+        if self._listener is not None:
+            self._listener.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._listener
+            self._listener = None
+        await asyncio.to_thread(remove_tree, self._scratch)
+
+    def _end_process(self) -> None:
+        if self._process is not None:
+            _kill(self._process)
+
+    async def _send(self, message: messages.Message) -> None:
+        process = self._process
+        assert process is not None
+        assert process.stdin is not None
+        try:
+            process.stdin.write(messages.framed(message))
+            await process.stdin.drain()
+        except (ConnectionError, OSError) as error:
+            raise SlotDiedError(await self._last_words()) from error
+
+    async def _answer(self) -> messages.Answer:
+        process = self._process
+        assert process is not None
+        assert process.stdout is not None
+        try:
+            (length,) = messages.LENGTH.unpack(await process.stdout.readexactly(messages.LENGTH.size))
+            if length > MAX_ANSWER_BYTES:
+                raise SlotDiedError(f"the slot's process announced an answer of {length} bytes")
+            return messages.answers.decode(await process.stdout.readexactly(length))
+        except DECODE_ERRORS as error:
+            raise WorkerError(f"an answer of the slot's process cannot be read: {error}") from error
+        except (asyncio.IncompleteReadError, ConnectionError) as error:
+            raise SlotDiedError(await self._last_words()) from error
+
+    async def _end_what_is_stopped(self) -> None:
+        """Ends the processes when the environment's has been stopped from outside for long."""
+        stood_s = 0.0
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            process = self._process
+            pids = [] if process is None else [process.pid, *_children(process.pid, self._start.tier)]
+            stood_s = stood_s + _LOOK_S if any(map(is_stopped, pids)) else 0.0
+            if stood_s >= STOPPED_S:
+                log.warning("slot was stopped from outside", for_s=stood_s)
+                self._end_process()
+
+    def _how_it_ended(self) -> How:
+        code = None if self._process is None else self._process.returncode
+        if code is None:
+            return "pipe"
+        if self._start.tier == "bwrap" and code > 128:
+            code = 128 - code  # bubblewrap's word for a signal
+        return endings.how(-code if code < 0 else code << 8)
+
+    async def _last_words(self) -> str:
+        process = self._process
+        status = "?"
+        if process is not None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LAST_WORDS_S):
+                    status = str(await process.wait())
+        await asyncio.sleep(0)
+        return f"the slot's process ended with status {status}; {' | '.join(self._said) or 'it said nothing'}"
+
+    async def _listen(self, process: asyncio.subprocess.Process) -> None:
+        """Keeps what the process says on standard error (simulators' notices, our tracebacks)."""
+        assert process.stderr is not None
+        while True:
+            try:
+                line = await process.stderr.readline()
+            except ValueError:  # a line beyond the reader's limit; it is dropped
+                continue
+            if not line:
+                return
+            text = line.decode("utf-8", "replace").rstrip()[:500]
+            self._said.append(text)
+            if text.startswith(messages.NOTE):
+                log.warning("slot notes", text=text.removeprefix(messages.NOTE))
+            else:
+                log.debug("slot says", text=text)
+
+
+def _children(pid: int, tier: Tier) -> list[int]:
+    """The environment's process inside its jail, and what stands between; of tier bwrap, below which the policies' is."""
+    found: list[int] = []
+    with contextlib.suppress(OSError, ValueError):
+        for _ in range(2 if tier == "bwrap" else 0):
+            pid = int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
+            found.append(pid)
+    return found
+
+
+def bundle_files(folder: Path, sent: str = "") -> messages.Files:
+    """The unpacked bundle in `folder`; without its contents when it is the one that was sent last."""
+    key = str(folder)
+    names: list[tuple[str, bool, int]] = []
+    data: list[bytes] = []
+    if key == sent:
+        return messages.Files(key=key, names=None, data=b"")
+    for root, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            path = os.path.join(root, name)
+            try:
+                # Never through a link: an unpacked bundle has none.
+                with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+                    content = file.read()
+                    executable = bool(os.fstat(file.fileno()).st_mode & 0o100)
+            except OSError as error:
+                raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
+            names.append((os.path.relpath(path, folder), executable, len(content)))
+            data.append(content)
+    return messages.Files(key=key, names=names, data=b"".join(data))
+
+
+def _error(answer: messages.Answer) -> WorkerError | SandboxError:
+    if not isinstance(answer, messages.Fault):
+        return WorkerError(f"the slot's process answered {type(answer).__name__} out of turn")
+    return SandboxError(answer.message) if answer.kind == "sandbox" else WorkerError(answer.message)
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        # Its group: the sandbox dies with its parent, simulators' helpers with the group.
+        os.killpg(process.pid, signal.SIGKILL)
