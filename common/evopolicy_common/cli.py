@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn, TextIO, cast
 import structlog
 import typer
 
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
 from evopolicy_common.terminal import harmless, one_line, say
 
@@ -109,13 +109,19 @@ def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
     raise SystemExit(code)
 
 
+def code_of(error: ConfigError) -> int:
+    """What a program that cannot begin ends with: it is not started again with wrong options."""
+    return FAILURE if isinstance(error, MachineError) else USAGE_ERROR
+
+
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line: exit code 2 for wrong options and files, 1 for what went wrong later."""
+    """Turns our errors into one line: exit code 2 for wrong options and files, 1 for what the machine refuses and for what
+    went wrong later."""
     try:
         yield
     except ConfigError as error:
-        fail(str(error), USAGE_ERROR)
+        fail(str(error), code_of(error))
     except EvopolicyError as error:
         fail(str(error), FAILURE)
     except OSError as error:

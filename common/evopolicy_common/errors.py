@@ -32,6 +32,13 @@ class ConfigError(EvopolicyError):
     """A setting, file or command-line value is wrong; the message names it and the remedy."""
 
 
+class MachineError(ConfigError):
+    """The machine refuses what is needed, as a full or read-only disk does, and may give it later.
+
+    Exit code 1, not 2: whoever keeps the program up starts it again.
+    """
+
+
 class BundleError(EvopolicyError):
     """A policy folder cannot be snapshot, or stored bytes are not the bundle their digest names."""
 

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
-from evopolicy_common.errors import ConfigError, SlotDiedError, WorkerError
+from evopolicy_common.errors import ConfigError, MachineError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
@@ -112,11 +112,11 @@ def work(
             )
         # Until the worker can drain, SIGTERM ends it as an exception does: what it has begun is cleared away.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-        found = credentials.find("worker", tuple(connect or ()), credentials_file)
         check_scratch()
+        found = credentials.find("worker", tuple(connect or ()), credentials_file)
         tiers = available_tiers(unsandboxed=unsandboxed)
         if not tiers:
-            raise ConfigError(
+            raise MachineError(
                 "no sandbox works here: `evopolicy-worker doctor` tells why and what to do; --unsandboxed plays runs that"
                 " ask for --tier none"
             )

@@ -15,7 +15,7 @@ import orjson
 import structlog
 import typer
 
-from evopolicy_common.cli import FAILURE, USAGE_ERROR, fail_on_our_errors, run_app, setup_logging
+from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, run_app, setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.processes.preflight import explained
 from evopolicy_gateway.http.door import AgentPlace, place_of
@@ -89,7 +89,7 @@ def _failures_in_the_log() -> Iterator[None]:
         yield
     except ConfigError as error:
         log.error("the gateway cannot serve", error=str(error))
-        raise SystemExit(USAGE_ERROR) from error
+        raise SystemExit(code_of(error)) from error
     except Exception as error:
         foreseen = explained(error) if isinstance(error, OSError) else None
         if foreseen is None and isinstance(error, EvopolicyError):

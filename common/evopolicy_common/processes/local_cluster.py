@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import os
 import sys
+import time
 from collections.abc import AsyncIterator, Collection, Sequence
 from pathlib import Path
 
@@ -25,7 +26,10 @@ from evopolicy_common.wire.ready import Ready, read_ready
 START_PATIENCE_S = 60.0
 END_GRACE_S = 10.0
 _RESTART_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 5.0
 _MAX_DEATHS = 10
+"""In a row, each within `_SOON_S` of the start before."""
+_SOON_S = 60.0
 
 
 class LocalCluster:
@@ -147,17 +151,18 @@ class _Processes:
             await child.end(END_GRACE_S)
 
     async def _keep_up(self, child: ChildProcess, name: str, program: Sequence[str]) -> None:
-        deaths = 0
+        deaths, began = 0, time.monotonic()
         while True:
             code = await child.ended()
             self._running.remove(child)
-            deaths += 1
+            deaths = deaths + 1 if time.monotonic() - began < _SOON_S else 1
             said = child.last_words() or f"see {child.log}"
             if code == USAGE_ERROR:
                 raise ConfigError(said)
             if deaths == _MAX_DEATHS:
                 raise ConfigError(f"{name} ends again and again: {said}")
-            await asyncio.sleep(_RESTART_PAUSE_S)
+            await asyncio.sleep(min(_LONGEST_PAUSE_S, _RESTART_PAUSE_S * 2 ** (deaths - 1)))
+            began = time.monotonic()
             child = await self._start(name, program)
 
     async def _start(self, name: str, program: Sequence[str]) -> ChildProcess:

@@ -8,7 +8,7 @@ import socket
 import tempfile
 from pathlib import Path
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, MachineError
 
 LOOPBACK = "127.0.0.1"
 LEAST_BYTES = 1 << 20
@@ -30,6 +30,10 @@ _REMEDIES = {
     errno.EADDRINUSE: "something else listens there",
 }
 """The machine's faults that a user can mend, and what to do."""
+_MAY_PASS = frozenset(
+    {errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO}
+)
+"""Those that may be over when the program is started again."""
 
 
 def explained(error: OSError) -> str | None:
@@ -39,6 +43,11 @@ def explained(error: OSError) -> str | None:
         return None
     where = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else "a file"
     return f"{where}: {os.strerror(error.errno or 0)}: {remedy}"
+
+
+def refused(error: OSError, message: str) -> ConfigError:
+    """`message` as the error of a place that cannot be used: MachineError where it may be usable later."""
+    return (MachineError if error.errno in _MAY_PASS else ConfigError)(message)
 
 
 def check_text(path: Path, choose: str) -> None:
@@ -54,7 +63,8 @@ def check_text(path: Path, choose: str) -> None:
 def check_writable(
     folder: Path, choose: str, *, least_bytes: int = LEAST_BYTES, may_be_full: bool = False
 ) -> None:
-    """ConfigError unless files can be made in `folder`, which is made later if it is not there.
+    """ConfigError unless files can be made in `folder`, which is made later if it is not there: MachineError where the disk
+    refuses.
 
     `choose`: the option or variable that names another folder. `may_be_full`: for who waits for room, or makes it.
     """
@@ -72,23 +82,23 @@ def check_writable(
         if may_be_full and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return
         why = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
-        raise ConfigError(
-            f"cannot write to {folder}: {why}, or choose another folder with {choose}"
+        raise refused(
+            error, f"cannot write to {folder}: {why}, or choose another folder with {choose}"
         ) from error
     n_bytes, least_inodes = free.f_bavail * free.f_frsize, LEAST_INODES if free.f_files else 0
     if not may_be_full and (n_bytes < least_bytes or free.f_favail < least_inodes):
-        raise ConfigError(
+        raise MachineError(
             f"cannot work in {folder}: {n_bytes >> 10:,} KiB and {free.f_favail:,} inodes are free, {least_bytes >> 10:,} KiB"
             f" and {least_inodes} are needed; make room, or choose another folder with {choose}"
         )
 
 
 def check_scratch() -> None:
-    """ConfigError when the system's temporary folder is full, or there is none."""
+    """MachineError when the system's temporary folder is full or read-only, or there is none."""
     try:
         folder = Path(tempfile.gettempdir())
     except FileNotFoundError as error:
-        raise ConfigError(
+        raise MachineError(
             f"no temporary folder can be written: {error.strerror}; make room, or name one with TMPDIR"
         ) from error
     check_writable(folder, "TMPDIR", least_bytes=LEAST_SCRATCH_BYTES)

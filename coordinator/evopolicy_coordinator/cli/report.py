@@ -1,7 +1,7 @@
 """`evopolicy report`: run directories in, a folder with the report out.
 
 It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes: 0
-written, 1 no complete run among what was given, 2 wrong usage, 3 the runs are no fair comparison.
+written, 1 no complete run among what was given or a disk that refuses, 2 wrong usage, 3 the runs are no fair comparison.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from evopolicy_common.cli import code_of
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json, say_lines, terminal
@@ -26,7 +27,7 @@ from evopolicy_coordinator.analysis.study import Study, study_of
 if TYPE_CHECKING:
     from evopolicy_coordinator.analysis.write import Progress as Tell
 
-NOTHING, USAGE, MIXED = 1, 2, 3
+NOTHING, MIXED = 1, 3
 
 app = typer.Typer(name="report", add_completion=False, rich_markup_mode=None)
 
@@ -97,7 +98,7 @@ def report(
         )
         _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
     except ConfigError as error:
-        _fail(str(error), USAGE)
+        _fail(str(error), code_of(error))
     if unknown := sum(run.record.hidden_isolation == "unknown" for run in study.runs):
         say(
             f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"

@@ -27,7 +27,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
 from evopolicy_common.wire.credentials import Credentials, Role
@@ -157,7 +157,7 @@ def _make_private(root: Path) -> None:
         root.mkdir(parents=True, mode=0o700, exist_ok=True)
         mode = stat.S_IMODE(root.stat().st_mode)
     except OSError as error:
-        raise ConfigError(f"cannot make state folder {root}: {error.strerror}") from error
+        raise refused(error, f"cannot make state folder {root}: {error.strerror}") from error
     if mode & 0o077:
         raise ConfigError(
             f"state folder {root} may be entered by others (mode {mode:04o}); it holds hidden cases: chmod 700 {root}"

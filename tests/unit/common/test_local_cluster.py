@@ -95,6 +95,23 @@ def test_a_worker_that_dies_again_and_again_is_given_up(
     assert bring_up(tmp_path) == "worker ends again and again: no room"
 
 
+def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deaths = tmp_path / "deaths"
+    programs(monkeypatch, SERVES, f"open({str(deaths)!r}, 'a').write('.'); raise SystemExit(1)")
+    monkeypatch.setattr(local_cluster, "_SOON_S", 0.0)
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+            await cluster.start_workers(["toy/line"], slots=1)
+            while not deaths.exists() or len(deaths.read_text()) <= local_cluster._MAX_DEATHS + 2:
+                assert not cluster.failed.done(), cluster.failed.exception()
+                await asyncio.sleep(0.02)
+
+    asyncio.run(main())
+
+
 def test_workers_divide_the_slots_of_an_audited_cluster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,6 +27,22 @@ def test_a_full_disk_is_told_unless_who_asks_waits_for_room(
     check_writable(tmp_path / "new", "--state", may_be_full=True)
 
 
+@pytest.mark.parametrize(
+    ("fault", "code"),
+    [(errno.ENOSPC, 1), (errno.EROFS, 1), (errno.EDQUOT, 1), (errno.EACCES, 2), (errno.ENOTDIR, 2)],
+)
+def test_only_what_may_pass_ends_a_program_so_that_it_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: int, code: int
+) -> None:
+    def refuses(**_: Any) -> None:
+        raise OSError(fault, os.strerror(fault))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuses)
+    with pytest.raises(SystemExit) as ended, fail_on_our_errors():
+        check_writable(tmp_path, "--state")
+    assert ended.value.code == code
+
+
 def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:
     check_writable(tmp_path / "a/b/c", "--out")
     assert list(tmp_path.iterdir()) == []

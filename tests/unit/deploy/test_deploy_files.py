@@ -23,6 +23,8 @@ import pytest
 import yaml
 from documents import APPS, blocks_of_commands, parse
 
+from evopolicy_common.cli import USAGE_ERROR
+
 ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "deploy"
 UNITS = ("evopolicy-coordinator.service", "evopolicy-worker@.service")
@@ -74,6 +76,14 @@ def test_a_unit_starts_its_command_with_options_that_this_takes(name: str, file:
     for variables in (own, {**own, **given}):
         parse(started(unit, variables))
     assert f"-/etc/evopolicy/{file}" in unit.all("EnvironmentFile")
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_only_wrong_options_keep_a_unit_down(name: str) -> None:
+    unit = Unit(DEPLOY / name)
+    assert unit["Service"]["Restart"] == "always"
+    assert unit["Service"]["RestartPreventExitStatus"] == str(USAGE_ERROR)
+    assert unit["Unit"]["StartLimitIntervalSec"] == "0"
 
 
 def test_parsing_a_command_finds_an_option_that_is_not_there() -> None:
