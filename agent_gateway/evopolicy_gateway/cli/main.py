@@ -64,6 +64,7 @@ def run(
     jail: JailOptions,
     served: DoorOptions,
     slots: options.Slots = 2,
+    data: options.DataFolder = None,
     hidden_isolation: options.Isolation = None,
     as_json: options.Json = False,
 ) -> None:
@@ -73,12 +74,16 @@ def run(
             raise ConfigError(
                 "--local brings up a cluster of its own; it does not go with --connect or --credentials"
             )
+        if data is not None and not local:
+            raise ConfigError(
+                "--data goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --data"
+            )
         isolation = options.isolation_of(hidden_isolation, local=local)
         held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
         plans = _plans(given, [options.one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots, hidden_isolation=isolation)
+            where = Cluster(local_slots=slots, data=data, hidden_isolation=isolation)
         _play(plans, where, 1, as_json)
 
 

@@ -13,7 +13,8 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
-from evopolicy_common.messages.operator import HiddenCases
+from evopolicy_common.messages.gateway import Profile
+from evopolicy_common.messages.operator import PUBLISHED
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
@@ -54,12 +55,44 @@ Isolation = Annotated[
     ),
 ]
 HiddenCasesOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--hidden-cases",
-        help="Validation and held-out cases: shared by all runs of an environment, or per-run (nothing can be paired).",
+        help="Validation and held-out cases: shared by all runs of an environment (default), or per-run (nothing can be paired).",
     ),
 ]
+
+
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        help="published: every choice of the published protocol (docs/reference/protocol.md), with its case files in --data."
+    ),
+]
+OWN = {
+    "policy_scope": "episode",
+    "observations": "arrays",
+    "simulation": "forbidden",
+    "finish": "early",
+    "step_limit": "published",
+    "hidden_cases": "shared",
+}
+"""What is chosen where neither an option nor a profile says."""
+
+
+def settings_of(profile: str | None, **told: str | None) -> dict[str, str]:
+    """The settings that a profile decides, and the profile; `told` by name of `RunSettings`, None for what was not told.
+
+    ConfigError for a profile that there is not, or that sets otherwise what was told.
+    """
+    chosen = one_of("--profile", profile or "own", Profile)
+    usual = PUBLISHED if chosen == "published" else OWN
+    for name, value in told.items():
+        if chosen == "published" and value not in (None, usual[name]):
+            raise ConfigError(
+                f"profile published has {name} = {usual[name]}, and {value} is asked for: leave out one of them"
+            )
+    return usual | {name: value for name, value in told.items() if value is not None} | {"profile": chosen}
 
 
 def tier_of(text: str) -> Tier:
@@ -124,9 +157,11 @@ def isolation_of(text: str | None, *, local: bool) -> str | None:
     return None if text is None else one_of("--hidden-isolation", text, HiddenIsolation)
 
 
-def hidden_cases_of(text: str) -> HiddenCases:
-    """The hidden cases that `--hidden-cases` names. ConfigError when there are none of that name."""
-    return one_of("--hidden-cases", text, Literal["shared", "per-run"]).replace("-", "_")  # type: ignore[return-value]
+def hidden_cases_of(text: str | None) -> str | None:
+    """The hidden cases that `--hidden-cases` names, if it does. ConfigError when there are none of that name."""
+    if text is None:
+        return None
+    return one_of("--hidden-cases", text, Literal["shared", "per-run"]).replace("-", "_")
 
 
 def one_of(option: str, text: str, kind: object) -> str:

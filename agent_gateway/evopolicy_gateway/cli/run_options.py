@@ -9,18 +9,20 @@ import msgspec
 import typer
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope
-from evopolicy_common.messages.gateway import SimulationRule, VideoOption
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.gateway import FinishRule, SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
 from evopolicy_gateway.cli.options import (
     HiddenCasesOption,
     Limits,
+    ProfileOption,
     TierName,
     hidden_cases_of,
     limits_of,
     one_of,
+    settings_of,
     tier_of,
 )
 from evopolicy_gateway.http.door import Door, agent_host_of, door_of
@@ -30,6 +32,15 @@ WALL_S = 12 * 3600.0
 
 Several = list[str] | None
 """An option that may be repeated."""
+
+
+_CHOICES: dict[str, object] = {
+    "policy_scope": PolicyScope,
+    "observations": ObservationForm,
+    "simulation": SimulationRule,
+    "finish": FinishRule,
+    "step_limit": StepLimit,
+}
 
 
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,17 +68,32 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     max_episodes: Annotated[int | None, typer.Option(min=1, help="Most episodes of a submit.")] = None
     validation: Annotated[int | None, typer.Option(min=1, help="Hidden validation cases.")] = None
     heldout: Annotated[int | None, typer.Option(min=1, help="Hidden held-out cases.")] = None
-    hidden_cases: HiddenCasesOption = "shared"
+    profile: ProfileOption = None
+    hidden_cases: HiddenCasesOption = None
     policy_scope: Annotated[
-        str, typer.Option(help="episode: a fresh Policy each; submit: one through a submit.")
-    ] = "episode"
-    observations: Annotated[str, typer.Option(help="arrays, or lists as in v2.0-draft.")] = "arrays"
+        str | None,
+        typer.Option(help="episode: a fresh Policy each (default); submit: one through a submit."),
+    ] = None
+    observations: Annotated[str | None, typer.Option(help="arrays (default), or lists as published.")] = None
     simulation: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="forbidden: only submits play the environment; allowed: the agent may simulate it."
+            help="forbidden: only submits play the environment (default); allowed: the agent may simulate it."
         ),
-    ] = "forbidden"
+    ] = None
+    finish: Annotated[
+        str | None,
+        typer.Option(
+            help="early: an agent may stop before its budget is spent (default); budget: that is an error, as published."
+        ),
+    ] = None
+    step_limit: Annotated[
+        str | None,
+        typer.Option(
+            help="published: episodes are cut where the published software cuts them (default); natural: by their"
+            " environment alone."
+        ),
+    ] = None
     tier: TierName = "bwrap"
     video: Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")] = "off"
     replays: Annotated[
@@ -103,16 +129,21 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             max_episodes_per_submit=self.max_episodes,
             n_validation=self.validation,
             n_heldout=self.heldout,
-            hidden_cases=hidden_cases_of(self.hidden_cases),
             agent_host=agent_host,
-            policy_scope=one_of("--policy-scope", self.policy_scope, PolicyScope),  # type: ignore[arg-type]
-            observations=one_of("--observations", self.observations, ObservationForm),  # type: ignore[arg-type]
-            simulation=one_of("--simulation", self.simulation, SimulationRule),  # type: ignore[arg-type]
+            **settings_of(
+                self.profile,
+                hidden_cases=hidden_cases_of(self.hidden_cases),
+                **{name: self._one_of(name, kind) for name, kind in _CHOICES.items()},
+            ),  # type: ignore[arg-type]
             sandbox_tier=tier_of(self.tier),
             video=one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
             replays=None if self.replays is None else one_of("--replays", self.replays, VideoOption),  # type: ignore[arg-type]
             limits=limits_of(self.limit or ()),
         )
+
+    def _one_of(self, name: str, kind: object) -> str | None:
+        told = getattr(self, name)
+        return None if told is None else one_of(f"--{name.replace('_', '-')}", told, kind)
 
 
 class JailOptions(msgspec.Struct, frozen=True, kw_only=True):

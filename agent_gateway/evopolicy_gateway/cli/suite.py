@@ -45,7 +45,10 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 def suite(
     file: Annotated[
-        str, typer.Argument(help="TOML file, or a shipped one: smoke.toml, core16.toml, core16-paper.toml.")
+        str,
+        typer.Argument(
+            help="TOML file, or a shipped one: smoke.toml, core16.toml, core16-paper.toml, core16-published.toml."
+        ),
     ],
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
@@ -56,6 +59,7 @@ def suite(
     only: Annotated[
         list[str] | None, typer.Option(help="Glob of run names, such as 'evolve/*'; may be repeated.")
     ] = None,
+    profile: options.ProfileOption = None,
     parallel: Annotated[
         int | None, typer.Option(min=1, max=256, help="Runs at once, over the file's.")
     ] = None,
@@ -88,6 +92,10 @@ def suite(
         if parallel is not None:
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
             wanted = msgspec.structs.replace(wanted, parallel=limits)
+        if profile is not None:
+            chosen = options.settings_of(profile)["profile"]
+            defaults = msgspec.structs.replace(wanted.defaults, profile=chosen)
+            wanted = msgspec.structs.replace(wanted, defaults=defaults)
         expanded = suite_file.expand(wanted, Path.cwd(), tuple(only or ()))
         root = (runs or Path("runs") / wanted.name).absolute()
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
@@ -99,6 +107,7 @@ def suite(
                 audit=audit,
                 hidden_isolation=isolation,
             )
+        where.check_cases(run.settings for run in expanded)
         order = Order(
             suite=wanted,
             runs=tuple(expanded),

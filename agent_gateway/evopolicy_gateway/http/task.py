@@ -49,7 +49,7 @@ class Policy:
 `n_episodes_this_submit`, `remaining_budget_after`, `max_episode_steps`, `obs_space`, `action_space`, `obs_storage`.
 Observations arrive {form}. Other files in `system/` can be imported and read: the working
 directory and `sys.path[0]` are the policy's own copy of `system/`, writable and thrown away afterwards.
-An episode ends by itself or after {run.env.max_episode_steps} steps.
+An episode ends by itself or after {run.told_steps} steps.
 An action outside the action space is repaired, and the step's `info.action_invalid` is true: numbers are clipped, shapes
 broadcast, and an action that cannot be read counts as zeros (the lowest choice where there are choices).
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
 from evopolicy_common.processes.preflight import explained
 from evopolicy_common.records.run_record import RunRecord
@@ -41,6 +42,18 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """Of a local one: share of the episodes that a second worker plays again."""
     hidden_isolation: str | None = None
     """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
+
+    def check_cases(self, runs: Iterable[RunSettings]) -> None:
+        """ConfigError where a local one has not the case files that a run plays."""
+        if (
+            self.local_slots is not None
+            and self.data is None
+            and any(run.profile == "published" for run in runs)
+        ):
+            raise ConfigError(
+                "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
+                " published software, which holds gym/acrobot/train.json and so on"
+            )
 
 
 class RunResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -102,6 +115,7 @@ async def play_all(
     results: dict[int, RunResult] = {}
     with watching(console) as watch:
         settings = [plan.settings for plan in plans]
+        where.check_cases(settings)
         async with connected(
             where, [one.env for one in settings], {one.sandbox_tier for one in settings}
         ) as (operations, gateway, failed):

@@ -97,6 +97,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
             cases=trial.cases,
             sandbox_tier=trial.tier,
             limits=trial.limits,
+            step_limit="published",
         )
         outcomes = await _outcomes(operations, message, console)
         folder = await asyncio.to_thread(_new_folder, trial.out, trial.env)
@@ -136,6 +137,7 @@ async def play_random(
                 record="actions",
                 # No policy plays, so nothing needs a sandbox; a worker of another cluster may offer no tier `none`.
                 sandbox_tier="bwrap" if where.local_slots is None else "none",
+                step_limit="published",
             )
             outcomes = await _outcomes(operations, message, console)
             ids = range(len(outcomes)) if cases is None else cases

@@ -114,6 +114,9 @@ def run_record(
             or suite.n_heldout,
             video=settings.video,
             limits=settings.limits,
+            finish=settings.finish,
+            step_limit=settings.step_limit,
+            profile=settings.profile,
             hidden_cases=settings.hidden_cases,
         ),
         timing=Timing(

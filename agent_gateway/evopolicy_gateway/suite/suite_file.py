@@ -18,14 +18,14 @@ from msgspec import Meta
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.episode import ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SimulationRule, VideoOption
+from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.wire import keys
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
-from evopolicy_gateway.cli.options import hidden_cases_of
+from evopolicy_gateway.cli.options import hidden_cases_of, settings_of
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.layout import RunFolder, run_folder
@@ -46,10 +46,13 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     max_episodes: Positive | None = None
     validation: Positive | None = None
     heldout: Positive | None = None
+    profile: Profile | None = None
     hidden_cases: Literal["shared", "per-run"] | None = None
     policy_scope: PolicyScope | None = None
     observations: ObservationForm | None = None
     simulation: SimulationRule | None = None
+    finish: FinishRule | None = None
+    step_limit: StepLimit | None = None
     tier: Tier | None = None
     video: VideoOption | None = None
     replays: VideoOption | None = None
@@ -147,10 +150,14 @@ class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
         if self.config is not None:
             told = _unusual(msgspec.to_builtins(self.config), msgspec.to_builtins(AgentConfig(harness="")))
             config = {name: value for name, value in told.items() if name not in _OPERATIONAL}
-        usual = RunSettings(env="", entry="", model="", exp_id="", attempt=self.settings.attempt)
-        settings = _unusual(msgspec.to_builtins(self.settings), msgspec.to_builtins(usual))
-        settings.pop("replays", None)  # recorded once all is over, it changes nothing of the run
-        found = {"agent": self.harness, "config": config, "settings": settings, "agent_wall_s": self.wall_s}
+        settings = self.settings
+        # Without a published limit both kinds are the same.
+        both = catalogue.entry(settings.env).published_steps is not None
+        limit: StepLimit = "natural" if both else settings.step_limit
+        usual = RunSettings(env="", entry="", model="", exp_id="", attempt=settings.attempt, step_limit=limit)
+        told = _unusual(msgspec.to_builtins(settings), msgspec.to_builtins(usual))
+        told.pop("replays", None)  # recorded once all is over, it changes nothing of the run
+        found = {"agent": self.harness, "config": config, "settings": told, "agent_wall_s": self.wall_s}
         if self.silence_s != SILENCE_S:
             found["agent_silence_s"] = self.silence_s
         # What a jail shows (`read`) is where programs lie, which differs from host to host.
@@ -291,10 +298,15 @@ def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunT
         max_episodes_per_submit=table.max_episodes,
         n_validation=table.validation,
         n_heldout=table.heldout,
-        hidden_cases=hidden_cases_of(table.hidden_cases or "shared"),
-        policy_scope=table.policy_scope or "episode",
-        observations=table.observations or "arrays",
-        simulation=table.simulation or "forbidden",
+        **settings_of(
+            table.profile,
+            hidden_cases=hidden_cases_of(table.hidden_cases),
+            policy_scope=table.policy_scope,
+            observations=table.observations,
+            simulation=table.simulation,
+            finish=table.finish,
+            step_limit=table.step_limit,
+        ),  # type: ignore[arg-type]
         sandbox_tier=table.tier or "bwrap",
         video=table.video or "off",
         replays=table.replays,

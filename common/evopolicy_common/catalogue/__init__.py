@@ -36,6 +36,9 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Short name for tables, such as `Acrobot`."""
     max_episode_steps: int
     """Upper bound on an episode's length, in steps."""
+    published_steps: int | None = None
+    """Where the published software cuts an episode, and what it tells as the limit; None: as here. It takes 1,000 where
+    Gymnasium has no limit registered, though all but one of these environments end earlier by themselves."""
     step_bytes: int
     """About what a step takes of a run directory in a train episode's feedback, without video; as measured."""
     observation: ObservationKind

@@ -17,6 +17,8 @@ SpaceSchema = Plain
 Split = Literal["train", "validation", "heldout"]
 PolicyScope = Literal["episode", "submit"]
 ObservationForm = Literal["arrays", "lists"]
+StepLimit = Literal["published", "natural"]
+"""Whether an episode is cut where the published software cuts it, or ends by its environment's own limit."""
 ObsStorage = Literal["inline", "npy", "npz"]
 
 

@@ -129,6 +129,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     tier: Tier = "bwrap"
     """The sandbox tier that the run demands."""
     limits: ResourceLimits = ResourceLimits()
+    max_steps: Int = 0
+    """An episode is cut after so many steps; 0: only its environment ends it."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):

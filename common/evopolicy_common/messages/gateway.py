@@ -37,6 +37,10 @@ CANCELLED = "cancelled"
 VideoOption = Literal["off", "first", "all"]
 SimulationRule = Literal["forbidden", "allowed"]
 """Whether the agent's rules let it simulate the environment outside its submits."""
+FinishRule = Literal["early", "budget"]
+"""Whether a run whose agent stops before its budget is spent is scored, or is an error."""
+Profile = Literal["own", "published"]
+"""`published`: all choices of the published protocol together (`operator.off_profile`)."""
 
 
 class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
@@ -124,6 +128,13 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     denied_imports: Many[Text]
     state: RunState
     simulation: SimulationRule = "forbidden"
+    max_steps: Int = 0
+    """Steps after which an episode is cut, and which agents are told as the limit; 0: the environment's own."""
+
+    @property
+    def told_steps(self) -> int:
+        """What agents and policies are told as `max_episode_steps`."""
+        return self.max_steps or self.env.max_episode_steps
 
 
 class StateRequest(Message, frozen=True, kw_only=True, tag="state"):

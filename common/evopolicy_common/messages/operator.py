@@ -8,9 +8,9 @@ import msgspec
 
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.bounds import Int, Many, Named, Number, Numbered, Plain, Text, Word
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
+from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, SubmitStatus, VideoOption
 from evopolicy_common.messages.worker import (
     BlobAck,
     BlobChunk,
@@ -58,6 +58,10 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The operator's own labels; kept in `run.json`."""
     hidden_cases: HiddenCases = "shared"
     simulation: SimulationRule = "forbidden"
+    finish: FinishRule = "early"
+    step_limit: StepLimit = "natural"
+    """Rows and messages of earlier versions tell none."""
+    profile: Profile = "own"
     agent_host: Word = ""
     """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
 
@@ -65,6 +69,29 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     def recorded_heldout(self) -> VideoOption:
         """Which held-out episodes are recorded."""
         return self.video if self.replays is None else self.replays
+
+
+PUBLISHED: dict[str, str] = {
+    "policy_scope": "submit",
+    "observations": "lists",
+    "simulation": "forbidden",
+    "finish": "budget",
+    "step_limit": "published",
+    "hidden_cases": "shared",
+}
+"""What the profile `published` chooses, by the names of `RunSettings`. Its cases are the published files besides."""
+PUBLISHED_TRAIN = 1024
+"""Train ids of the published case files."""
+
+
+def off_profile(settings: RunSettings) -> str:
+    """The settings in which a run of profile `published` differs from it, in words; empty where there are none."""
+    if settings.profile == "own":
+        return ""
+    told = {name: getattr(settings, name) for name in PUBLISHED}
+    return ", ".join(
+        f"{name} {told[name]} (not {value})" for name, value in PUBLISHED.items() if told[name] != value
+    )
 
 
 class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
@@ -202,6 +229,7 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded before, `bundle` None."""
     as_in: PlayedAs | None = None
     """None for what was not played in a run before."""
+    step_limit: StepLimit = "natural"
 
 
 class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):

@@ -14,9 +14,9 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SimulationRule, SubmitStatus, VideoOption
+from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, SubmitStatus, VideoOption
 from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
 
 SCHEMA_VERSION = 1
@@ -78,6 +78,13 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
     """Whether the agent's rules let it simulate the environment. Runs from before this was recorded had no rule against it."""
+    finish: FinishRule = "early"
+    """Whether a run whose agent stops before its budget is spent is scored (`early`) or an error (`budget`)."""
+    step_limit: StepLimit = "natural"
+    """Where episodes are cut: as the published software cuts them, or by their environment's own limit alone, as all runs
+    from before this was recorded."""
+    profile: Profile = "own"
+    """`published`: all choices of the published protocol together, its public case files among them."""
     hidden_cases: HiddenCases = "shared"
     """Validation and held-out cases: `shared` by all runs of the environment, or `per_run`, which allows no pairing."""
 

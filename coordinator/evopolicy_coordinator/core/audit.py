@@ -229,6 +229,7 @@ def _play(core: Core, run: Run, row: AuditRow, turn: Turn) -> None:
         video="off",
         tier=settings.sandbox_tier,
         limits=settings.limits,
+        max_steps=run.row.max_steps,
         replays=(row.actions,),
     )
     group = JobGroup(

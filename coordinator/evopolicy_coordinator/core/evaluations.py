@@ -69,6 +69,7 @@ def request(core: Core, event: events.EvaluationRequested, turn: Turn) -> None:
         limits=message.limits,
         replays=message.replays,
         as_in=message.as_in,
+        max_steps=event.max_steps,
         created_at=turn.now,
         stimulus_id=turn.stimulus_id,
     )
@@ -130,6 +131,7 @@ def play(core: Core, evaluation: Evaluation, turn: Turn) -> None:
         video="off",
         tier=row.tier,
         limits=row.limits,
+        max_steps=row.max_steps,
         replays=row.replays,
         indexes=place.indexes,
     )

@@ -58,6 +58,8 @@ class RunCreated(Asked[CreateRun], frozen=True, kw_only=True):
     split_secret: bool
     allowed_imports: tuple[str, ...] = ()
     denied_imports: tuple[str, ...] = ()
+    max_steps: int = 0
+    """As in `Job`."""
 
 
 class EvaluationRequested(Asked[Evaluate], frozen=True, kw_only=True):
@@ -68,6 +70,8 @@ class EvaluationRequested(Asked[Evaluate], frozen=True, kw_only=True):
     cases: tuple[Case, ...]
     """In the order of `case_ids`."""
     secret: bytes
+    max_steps: int = 0
+    """As in `Job`."""
 
 
 class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):

@@ -93,6 +93,7 @@ def _open(
         video=settings.recorded_heldout if kind == "heldout" else "off",
         tier=settings.sandbox_tier,
         limits=settings.limits,
+        max_steps=run.row.max_steps,
     )
     group = JobGroup(
         id=name,
@@ -146,6 +147,9 @@ def advance(core: Core, run: Run, turn: Turn) -> None:
     """Take a closed run as far as it can go now."""
     if run.state.phase != "closed" or run.open is not None:
         return
+    if _unspent(run):
+        _finish(core, run, None, turn, unplayed=True)
+        return
     if random_group(run.id) not in run.hidden_returns:
         _open(core, run, "random", None, REFERENCE, turn)
     waiting = [row for row in _ok(run) if row.val_mean is None and row.ineligible is None]
@@ -160,6 +164,12 @@ def advance(core: Core, run: Run, turn: Turn) -> None:
         return
     if random_group(run.id) in run.hidden_returns and not audit.holds_up(core, run, turn):
         _finish(core, run, best, turn)
+
+
+def _unspent(run: Run) -> int:
+    """Episodes of its budget that the agent of a run which must spend it has left; what no submit can have does not count."""
+    left = run.ledger.available
+    return left if run.row.settings.finish == "budget" and left >= run.row.min_episodes_per_submit else 0
 
 
 def _ok(run: Run) -> list[SubmitRow]:
@@ -201,16 +211,24 @@ def cancel(core: Core, event: events.Asked[operator.CancelRun], turn: Turn) -> N
         run.change(turn, phase="closed", closed_at=turn.now, close_reason=gateway.CANCELLED)
         core.isolation.cancelled(run.id, turn)
     core.isolation.drop_asks(run.id, Refusal.RUN_CANCELLED, f"run {run.id!r} was cancelled", turn)
-    _finish(core, run, None, turn, cancelled=True)
+    _finish(core, run, None, turn, cancelled=True, unplayed=True)
     turn.reply(event.request, operator.Done())
 
 
-def _finish(core: Core, run: Run, best: SubmitRow | None, turn: Turn, *, cancelled: bool = False) -> None:
-    """The run is over: its result becomes durable, and all that the core holds of it goes."""
+def _finish(
+    core: Core,
+    run: Run,
+    best: SubmitRow | None,
+    turn: Turn,
+    *,
+    cancelled: bool = False,
+    unplayed: bool = False,
+) -> None:
+    """The run is over: its result becomes durable, and all that the core holds of it goes. `unplayed`: as far as it got."""
     audit.cancel(core, run, turn)
     core.timers.disarm(("audits", run.id))
-    for group in [group for group in core.groups.values() if group.run == run.id] if cancelled else []:
-        core.close_group(group, turn, "run cancelled")
+    for group in [group for group in core.groups.values() if group.run == run.id] if unplayed else []:
+        core.close_group(group, turn, "run cancelled" if cancelled else "budget not spent")
     result = _result(core, run, best, turn.now, cancelled=cancelled)
     turn.persist(FinishedRow(run=run.id, result=result))
     run.change(turn, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
@@ -228,6 +246,12 @@ def _result(
     error = None
     if cancelled:
         status = "cancelled"
+    elif left := _unspent(run):
+        status = "error"
+        error = (
+            f"the run ended ({state.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left, and"
+            " must spend them (finish = budget)"
+        )
     elif not ok:
         status = "no_ok_submit"
     elif best is None:

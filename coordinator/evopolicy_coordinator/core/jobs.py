@@ -93,6 +93,8 @@ class Template:
     video: VideoOption
     tier: Tier
     limits: ResourceLimits
+    max_steps: int
+    """As in `Job`."""
     replays: tuple[BlobRef, ...] = ()
     """Recorded actions for each index, in place of a policy; empty for none."""
     indexes: tuple[int, ...] = ()
@@ -269,7 +271,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         policy_every=template.modulo if template.scope == "submit" else 0,
         env_meta={
             **template.env_meta,
-            "max_episode_steps": description.max_episode_steps,
+            "max_episode_steps": template.max_steps or description.max_episode_steps,
             "obs_storage": description.obs_storage,
         },
         observations=template.observations,
@@ -278,4 +280,5 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         video_episodes=1 if template.video == "first" else 0,
         tier=template.tier,
         limits=template.limits,
+        max_steps=template.max_steps,
     )

@@ -52,6 +52,8 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     split_secret: bool
     allowed_imports: tuple[str, ...] = ()
     denied_imports: tuple[str, ...] = ()
+    max_steps: int = 0
+    """Steps after which an episode is cut; 0: only its environment ends it."""
     audit_share: float = 0.0
     """Of the run's episodes, played again on another worker."""
     reference_by_case: bool = False
@@ -160,6 +162,7 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     """Why it ended early (the policy brought its slot down too often); empty when it ran through."""
     replays: tuple[BlobRef, ...] = ()
     as_in: PlayedAs | None = None
+    max_steps: int = 0
 
 
 class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):

@@ -114,6 +114,7 @@ def create(core: Core, event: events.RunCreated, turn: Turn) -> None:
         split_secret=event.split_secret,
         allowed_imports=event.allowed_imports,
         denied_imports=event.denied_imports,
+        max_steps=event.max_steps,
         audit_share=core.settings.audit_share,
         reference_by_case=True,
         created_at=turn.now,
@@ -189,6 +190,7 @@ def opened(core: Core, event: events.Asked[gateway.OpenRun], turn: Turn) -> None
             allowed_imports=row.allowed_imports,
             denied_imports=row.denied_imports,
             simulation=settings.simulation,
+            max_steps=row.max_steps,
             state=run_state(core, run, turn.now),
         ),
     )
@@ -378,6 +380,7 @@ def play(core: Core, run: Run, row: SubmitRow, turn: Turn) -> JobGroup:
         video=settings.video,
         tier=settings.sandbox_tier,
         limits=settings.limits,
+        max_steps=run.row.max_steps,
     )
     group = JobGroup(
         id=train_group(run.id, row.submit_index),

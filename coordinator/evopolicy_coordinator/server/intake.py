@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.environment import Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
@@ -264,6 +264,7 @@ class Intake:
             least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
             most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
             check_counts(budget, least, most, wanted.n_validation, wanted.n_heldout)
+            self._check_profile(wanted)
             cases = self._source.splits(
                 suite.name,
                 wanted.env,
@@ -272,6 +273,8 @@ class Intake:
             )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
+        if wanted.profile == "published":
+            self._check_published(len(cases.train))
         if wanted.policy_scope == "submit":
             check_job((*cases.train, *cases.validation, *cases.heldout), most)
         return events.RunCreated(
@@ -291,6 +294,7 @@ class Intake:
             split_secret=cases.secret,
             allowed_imports=self._allowed_imports,
             denied_imports=self._denied_imports,
+            max_steps=_max_steps(wanted.env, wanted.step_limit),
         )
 
     def _evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
@@ -325,7 +329,28 @@ class Intake:
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
             secret=secrets.token_bytes(32),
+            max_steps=_max_steps(m.env, m.step_limit),
         )
+
+    def _check_profile(self, wanted: operator.RunSettings) -> None:
+        """ConfigError where a run of profile `published` has other settings, or would play other than case files."""
+        if wanted.profile == "own":
+            return
+        if differences := operator.off_profile(wanted):
+            raise ConfigError(f"a run of profile published cannot have {differences}")
+        if not self._source.from_files:
+            raise ConfigError(
+                "profile published plays the published case files, and this coordinator derives its cases from a secret:"
+                " start it with --data FOLDER, the folder data/main-128 of the published software"
+            )
+
+    def _check_published(self, n_train: int) -> None:
+        if n_train != operator.PUBLISHED_TRAIN:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"the published train splits have {operator.PUBLISHED_TRAIN:,} cases each, the one in this coordinator's"
+                f" --data has {n_train:,}; give it data/main-128 of the published software, or leave out the profile",
+            )
 
     def split_hashes(self, m: operator.DescribeEnvironment) -> dict[str, str]:
         """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits."""
@@ -429,3 +454,8 @@ _EVENTS: dict[type[Message], Callable[[Intake, Any, int, str], AnyEvent]] = {
 
 def _or(value: int | None, otherwise: int) -> int:
     return otherwise if value is None else value
+
+
+def _max_steps(env: str, step_limit: StepLimit) -> int:
+    """Steps after which an episode is cut; 0: only its environment ends it."""
+    return (catalogue.entry(env).published_steps or 0) if step_limit == "published" else 0

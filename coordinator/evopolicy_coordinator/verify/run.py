@@ -349,6 +349,7 @@ class Verifier:
             sandbox_tier=self._tier,
             limits=self._limits,
             replays=replays,
+            step_limit=dimensions.step_limit,
             as_in=PlayedAs(
                 run=self._run.record.run,
                 submit_index=played.submit_index,

@@ -33,6 +33,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "denied_imports": "[str]",
         "state": "RunState",
         "simulation": "'allowed' | 'forbidden'",
+        "max_steps": "int",
     },
     "EnvironmentDescription": {
         "env": "str",

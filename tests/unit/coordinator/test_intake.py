@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -304,3 +305,45 @@ def test_only_what_makes_something_new_asks_for_change(intake: Intake) -> None:
     assert not intake.asks_for_change(OPS, codec.encode(operator.StatusRequest(token="")))
     assert not intake.asks_for_change(SUBMIT, b"junk")
     assert not intake.asks_for_change(keys.worker_key("c", "done"), codec.encode(hand_in()))
+
+
+MINIGRID = "gymnasium/MiniGrid-DoorKey-16x16-v0"
+
+
+def test_episodes_are_cut_where_the_published_software_cuts_them_if_asked(intake: Intake) -> None:
+    assert event(intake, OPS, create(env=MINIGRID, step_limit="published")).max_steps == 1000
+    assert event(intake, OPS, create(env=MINIGRID, step_limit="natural")).max_steps == 0
+    assert event(intake, OPS, create(env="gym/acrobot", step_limit="published")).max_steps == 0
+    assert event(intake, OPS, evaluate(env=MINIGRID, step_limit="published")).max_steps == 1000
+    assert event(intake, OPS, evaluate(env=MINIGRID)).max_steps == 0
+
+
+def published_tree(root: Path, n_train: int) -> Path:
+    """Case files as the published software has them."""
+    folder = root / "toy" / "line"
+    folder.mkdir(parents=True)
+    numbers = iter(range(10**6))
+    for split, n in (("train", n_train), ("valid", 64), ("heldout", 256)):
+        cases = [{"seed": next(numbers)} for _ in range(n)]
+        document = {"env": "toy/line", "split": split, "cases": cases}
+        (folder / f"{split}.json").write_text(json.dumps(document))
+    return root
+
+
+def test_profile_published_plays_the_published_files_by_the_published_rules_or_not_at_all(
+    blobs: BlobStore, tmp_path: Path
+) -> None:
+    def at(data: Path | None) -> Intake:
+        source = SplitSource(data=data, secret=b"s" * 32)
+        return Intake(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())
+
+    published = {**operator.PUBLISHED, "profile": "published"}
+    whole = at(published_tree(tmp_path / "whole", 1024))
+    made = event(whole, OPS, create(**published, n_validation=16, n_heldout=32))
+    assert (len(made.train), len(made.validation), len(made.heldout)) == (1024, 16, 32)
+    assert not made.split_secret
+    assert "start it with --data" in refused(at(None), OPS, create(**published)).message
+    short = at(published_tree(tmp_path / "short", 64))
+    assert "1,024 cases each" in refused(short, OPS, create(**published)).message
+    for name, value in (("observations", "arrays"), ("finish", "early"), ("simulation", "allowed")):
+        assert f"{name} {value} (not" in refused(whole, OPS, create(**(published | {name: value}))).message

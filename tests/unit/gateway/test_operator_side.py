@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
-from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.messages.operator import PUBLISHED, RunProgress, off_profile
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_common.terminal import Terminal
 from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.control import AgentDoing, Progress
-from evopolicy_gateway.operator.runs import RunResult, exit_code, report
+from evopolicy_gateway.operator.runs import Cluster, RunResult, exit_code, report
 from evopolicy_gateway.operator.watch import watching
 from evopolicy_gateway.run.layout import Staged
 from evopolicy_gateway.run.play import Plan
@@ -144,9 +144,32 @@ def test_wrong_option_values_name_the_option() -> None:
             cases_of(wrong)
     with pytest.raises(ConfigError, match="16 environments"):
         one_environment("core16")
-    for field, text in (("policy_scope", "run"), ("observations", "x"), ("tier", "docker"), ("video", "on")):
+    choices = [
+        ("policy_scope", "run"),
+        ("observations", "x"),
+        ("finish", "late"),
+        ("step_limit", "9"),
+        ("profile", "p"),
+    ]
+    for field, text in (*choices, ("tier", "docker"), ("video", "on")):
         with pytest.raises(ConfigError, match=f"--{field.replace('_', '-')} '{text}'"):
             RunOptions(agent="evolve", **{field: text}).settings("toy/line", "t")
+
+
+def test_profile_published_makes_every_published_choice_and_takes_no_other() -> None:
+    own = RunOptions(agent="evolve").settings("toy/line", "t")
+    assert (own.profile, own.policy_scope, own.observations) == ("own", "episode", "arrays")
+    assert (own.finish, own.step_limit, own.hidden_cases) == ("early", "published", "shared")
+    published = RunOptions(agent="evolve", profile="published", finish="budget").settings("toy/line", "t")
+    assert off_profile(published) == ""
+    assert {name: getattr(published, name) for name in PUBLISHED} == PUBLISHED
+    for name, value in (("observations", "arrays"), ("policy_scope", "episode"), ("hidden_cases", "per-run")):
+        with pytest.raises(ConfigError, match=f"profile published has {name} = "):
+            RunOptions(agent="evolve", profile="published", **{name: value}).settings("toy/line", "t")
+    with pytest.raises(ConfigError, match="give --data FOLDER"):
+        Cluster(local_slots=1).check_cases([published])
+    Cluster(local_slots=1).check_cases([own])
+    Cluster(local_slots=1, data=Path("data")).check_cases([published])
 
 
 def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:

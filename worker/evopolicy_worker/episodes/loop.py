@@ -401,6 +401,7 @@ class _Episode:
         repair, step, append = codec.repair, environment.step, recorder.append
         actions_only = self._job.record == "actions"
         recorded = _recorded_actions(self._spec)
+        last = (self._job.max_steps or sys.maxsize) - 1
         rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
         failed = self._job.bundle is not None and policy is None
         names = environment.description.reward_components
@@ -433,6 +434,7 @@ class _Episode:
                 returned = recorded[t]
                 action, invalid = repair(returned)
             next_obs, reward, terminated, truncated, info = step(action)
+            truncated = truncated or t >= last
             told = info.get("rewards", info)
             for name in names:
                 sums[name] += _number(told.get(name))

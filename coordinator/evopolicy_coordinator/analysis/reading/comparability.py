@@ -1,7 +1,7 @@
 """What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, whether
 hidden episodes and agents shared a kernel, and results that an audit has put in question with any others.
 
-Budget, scope, observation form, jail, hidden isolation and hidden cases must agree over all runs of a suite; splits (by
+Budget, scope, observation form, finish rule, profile, jail, hidden isolation and hidden cases must agree over all runs of a suite; splits (by
 hash), library fingerprint, environment version, how large a submit may be, a policy's limits, and whether feedback has
 videos over the runs of one environment, since environments differ in them anyway. Runs that played hidden cases of their
 own differ in these splits by design.
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import msgspec
 
+from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_coordinator.analysis.reading.records import Run
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, suites_of
@@ -52,6 +53,8 @@ _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "policy scope": lambda run: run.record.experiment_dimensions.policy_scope,
     "observation form": lambda run: run.record.experiment_dimensions.observations,
     "simulation rule": lambda run: run.record.experiment_dimensions.simulation,
+    "finish rule": lambda run: run.record.experiment_dimensions.finish,
+    "profile": lambda run: run.record.experiment_dimensions.profile,
     "jail": lambda run: run.record.jail,
     "hidden cases": lambda run: run.record.experiment_dimensions.hidden_cases,
 }
@@ -62,12 +65,20 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
     "environment version": lambda run: run.record.versions.env,
     "episodes a submit": lambda run: run.submit_size,
     "policy limits": lambda run: _limits(run),
+    "step limit": lambda run: _step_limit(run),
     "videos in feedback": lambda run: run.record.experiment_dimensions.video,
 }
 
 
 def _hidden_split(run: Run, digest: str) -> str:
     return "its own" if run.record.experiment_dimensions.hidden_cases == "per_run" else digest[:12]
+
+
+def _step_limit(run: Run) -> str:
+    """Empty where the environment has one limit only."""
+    entry = catalogue.entries().get(run.env)
+    both = entry is not None and entry.published_steps is not None
+    return run.record.experiment_dimensions.step_limit if both else ""
 
 
 def _limits(run: Run) -> str:

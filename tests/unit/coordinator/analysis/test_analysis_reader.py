@@ -218,6 +218,8 @@ def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: di
     ("change", "what"),
     [
         ({"observations": "lists"}, "observation form"),
+        ({"finish": "budget"}, "finish rule"),
+        ({"profile": "published"}, "profile"),
         ({"max_episodes_per_submit": 1}, "episodes a submit"),
         ({"limits": {"cpu_s": 1.0}}, "policy limits"),
         ({"video": "all"}, "videos in feedback"),
@@ -300,3 +302,14 @@ def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path)
     write_run(tmp_path, VERSIONS, entry="Agent B")
     write_run(tmp_path, VERSIONS, env="gym/ant5", fingerprint={"numpy": "2.4.6", "mujoco": "3.10.0"})
     assert mixtures(load_runs([tmp_path]).runs) == []
+
+
+def test_step_limits_are_compared_where_an_environment_has_two(tmp_path: Path) -> None:
+    for env, found in (("gym/acrobot", []), ("gymnasium/MiniGrid-DoorKey-16x16-v0", ["step limit"])):
+        runs = tmp_path / env
+        write_run(runs, VERSIONS, env=env)
+        run = write_run(runs, VERSIONS, env=env, entry="Agent B")
+        record = json.loads((run / "run.json").read_text())
+        record["experiment_dimensions"]["step_limit"] = "published"
+        (run / "run.json").write_text(json.dumps(record))
+        assert [mixture.what for mixture in mixtures(load_runs([runs]).runs)] == found

@@ -182,7 +182,7 @@ class Rig:
 
     def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
                budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
-               hidden_from: int = 1000, **settings: Any) -> Any:  # fmt: skip
+               hidden_from: int = 1000, max_steps: int = 0, **settings: Any) -> Any:  # fmt: skip
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
         reply = self.tell(
             asked(
@@ -202,6 +202,7 @@ class Rig:
                 heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
                 split_hashes={},
                 split_secret=True,
+                max_steps=max_steps,
             )
         )
         if agent is not None and run in self.core.runs:

@@ -330,3 +330,56 @@ def test_the_same_key_gives_the_same_run(again: bool) -> None:
     if again:
         rig.load()
     assert rig.create("r2", key="same") == first
+
+
+def test_a_run_that_must_spend_its_budget_and_has_not_is_an_error_without_hidden_episodes() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(budget=4, finish="budget")
+    rig.submit(0, 1)
+    rig.work_off(session)
+    rig.submit(0, key="k1")
+    rig.close()
+    leases = rig.poll(session, n=4)
+    assert {split_of(lease.job) for lease in leases} <= {"train", "validation"}
+    rig.hand_in(session, *(done(lease) for lease in leases))
+    assert not rig.poll(session, n=4)
+    finished = rig.finished()
+    assert (finished.status, finished.final_score, finished.random_heldout_returns) == ("error", None, ())
+    assert finished.error is not None
+    assert "1 of its 4 episodes left" in finished.error
+    assert finished.budget_used == 3
+    assert not rig.core.groups
+
+
+@pytest.mark.parametrize("left", [0, 2])
+def test_a_run_that_has_spent_what_it_can_is_scored(left: int) -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(budget=3 + left, least=3, finish="budget")
+    rig.submit(0, 1, 2)
+    rig.work_off(session)
+    rig.close()
+    rig.work_off(session)
+    assert rig.finished().status == "completed"
+
+
+def test_every_episode_of_a_run_is_cut_where_its_policy_is_told() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(max_steps=7)
+    rig.submit(0)
+    kinds = {}
+    for closing in (False, True):
+        if closing:
+            rig.close()
+        while leases := rig.poll(session, n=4):
+            for lease in leases:
+                kinds[split_of(lease.job)] = (lease.job.max_steps, lease.job.env_meta["max_episode_steps"])
+            rig.hand_in(session, *(done(lease) for lease in leases))
+    assert len(kinds) >= 3
+    assert set(kinds.values()) == {(7, 7)}
+    rig.create("r2")
+    rig.submit(0, run="r2", key="k2")
+    (lease,) = [lease for lease in rig.poll(session, n=4) if split_of(lease.job) == "train"]
+    assert (lease.job.max_steps, lease.job.env_meta["max_episode_steps"]) == (0, 10)

@@ -121,7 +121,10 @@ def test_a_wrong_file_is_refused_with_the_place(tmp_path: Path, text: str, messa
         suite_in(tmp_path, text)
 
 
-@pytest.mark.parametrize("name", ["smoke.toml", "core16.toml", "core16-paper.toml"])
+SHIPPED = ["smoke.toml", "core16.toml", "core16-paper.toml", "core16-published.toml"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ANTHROPIC_AUTH_TOKEN", "set")
     suite = read(name)
@@ -129,7 +132,8 @@ def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest
     core16 = catalogue.resolve(["core16"])
     assert len(runs) == len(suite.agents) * 16
     assert {run.settings.env for run in runs} == set(core16)
-    if name == "core16-paper.toml":
+    paper = name in SHIPPED[2:]
+    if paper:
         assert {run.settings.model for run in runs} == {
             *("gpt-5.5", "claude-opus-4-7-thinking-max", "MiniMax-M3", "deepseek-v4-pro"),
         }
@@ -139,7 +143,16 @@ def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest
         }
         assert numbers == (128, 16, 32)
         scopes = {run.settings.policy_scope for run in runs}
-        assert scopes == {"submit" if "paper" in name else "episode"}
+        assert scopes == {"submit" if paper else "episode"}
+        assert {run.settings.observations for run in runs} == {"lists" if paper else "arrays"}
+    profiles = {(run.settings.profile, run.settings.finish) for run in runs}
+    assert profiles == {("published", "budget") if "published" in name else ("own", "early")}
+
+
+def test_a_file_that_contradicts_its_profile_is_refused(tmp_path: Path) -> None:
+    text = FILE.replace("budget = 8", 'budget = 8\nprofile = "published"\nobservations = "arrays"')
+    with pytest.raises(ConfigError, match="observations = lists, and arrays is asked for"):
+        suite_in(tmp_path, text)
 
 
 def entry(run: SuiteRun, **more: object) -> Entry:

@@ -414,3 +414,11 @@ def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slo
     # Where a system's C library has no C.UTF-8, it is C, and Python reads UTF-8 all the same.
     assert "C.UTF-8 ('UTC', 'UTC')" in told or " C ('UTC', 'UTC')" in told
     assert told.endswith("0 True\n")
+
+
+def test_an_episode_is_cut_after_the_jobs_steps_and_no_later_than_its_environments(slots: Slots) -> None:
+    for max_steps, length in ((7, 7), (1000, 60), (0, 60)):
+        outcome = slots.play(HONEST, max_steps=max_steps)
+        played = rows(outcome)
+        assert (outcome.length, outcome.truncated) == (length, True)
+        assert [row.truncated for row in played] == [False] * (length - 1) + [True]
