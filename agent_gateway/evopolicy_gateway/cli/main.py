@@ -31,7 +31,7 @@ from evopolicy_gateway.operator.runs import Cluster, exit_code, play_all
 from evopolicy_gateway.operator.runs import report as report_runs
 from evopolicy_gateway.run import processes
 from evopolicy_gateway.run.gateway import folder_of
-from evopolicy_gateway.run.play import Plan
+from evopolicy_gateway.run.plan import Plan
 
 T = TypeVar("T")
 

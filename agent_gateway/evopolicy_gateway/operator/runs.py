@@ -22,7 +22,8 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials
 from evopolicy_gateway.operator.watch import Watch, watching
-from evopolicy_gateway.run.play import Plan, RunPlay
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.play import RunPlay
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
 _AGENT_FAILED = ("agent_failed", "silent")

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 
@@ -43,12 +43,10 @@ from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.layout import RunFolder, Staged
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.submits.formatting import submit_id
 from evopolicy_gateway.submits.journal import Journal, Rejected
-
-if TYPE_CHECKING:
-    from evopolicy_gateway.run.play import Plan
 
 
 async def write(

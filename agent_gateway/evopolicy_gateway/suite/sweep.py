@@ -36,7 +36,8 @@ from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder
-from evopolicy_gateway.run.play import Plan, RunPlay
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.play import RunPlay
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Decision, Found, side_by_side
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun

@@ -24,7 +24,7 @@ from evopolicy_gateway.operator.control import AgentDoing, Progress
 from evopolicy_gateway.operator.runs import Cluster, RunResult, exit_code, report
 from evopolicy_gateway.operator.watch import watching
 from evopolicy_gateway.run.layout import Staged
-from evopolicy_gateway.run.play import Plan
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.submits.journal import Rejected

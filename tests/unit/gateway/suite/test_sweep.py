@@ -15,7 +15,7 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.run.layout import RunFolder
-from evopolicy_gateway.run.play import Plan
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index, sweep
