@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from agent_fakes import FakeGateway, Play, serving
 
-from evopolicy_gateway.agents import evolve
 from evopolicy_gateway.agents.client import Client, ProtocolError
-from evopolicy_gateway.agents.evolve import Agent
+from evopolicy_gateway.agents.evolve import agent as evolve
+from evopolicy_gateway.agents.evolve.agent import Agent
 
 UNIT = {"type": "Box", "shape": [2], "dtype": "float32", "low": [-1.0, -1.0], "high": [1.0, 1.0]}
 CHOICE = {"type": "Discrete", "n": 3}

@@ -10,7 +10,7 @@ import pytest
 from agent_fakes import FakeGateway, serving
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.staging import stage_code
+from evopolicy_gateway.agents.evolve.staging import stage_code
 
 BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from evopolicy_gateway.agents.feedback import Step
-from evopolicy_gateway.agents.plant import find_plant
+from evopolicy_gateway.agents.evolve.feedback import Step
+from evopolicy_gateway.agents.evolve.plant import find_plant
 
 N_OBS = 7
 HAND = [5, 2, 4]

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from agent_fakes import load_policy
 
-from evopolicy_gateway.agents.evolved.controllers import build, parameter_count
-from evopolicy_gateway.agents.evolved.spaces import ActionHead, Features
-from evopolicy_gateway.agents.families import families_for
-from evopolicy_gateway.agents.search import Candidate, Search
-from evopolicy_gateway.agents.staging import stage_candidates, stage_code
+from evopolicy_gateway.agents.evolve.evolved.controllers import build, parameter_count
+from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features
+from evopolicy_gateway.agents.evolve.families import families_for
+from evopolicy_gateway.agents.evolve.search import Candidate, Search
+from evopolicy_gateway.agents.evolve.staging import stage_candidates, stage_code
 
 BOX = {"type": "Box", "shape": [2], "dtype": "float32", "low": [-2.0, 0.0], "high": [2.0, "inf"]}
 WIDE = {"type": "Box", "shape": [40], "dtype": "float64", "low": "-inf", "high": "inf"}

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evopolicy_gateway.agents.families import families_for
-from evopolicy_gateway.agents.search import Candidate, Episode, Search, make_plan
+from evopolicy_gateway.agents.evolve.families import families_for
+from evopolicy_gateway.agents.evolve.search import Candidate, Episode, Search, make_plan
 
 BOX = {"type": "Box", "shape": [3], "dtype": "float32", "low": [-1.0] * 3, "high": [1.0] * 3}
 DISCRETE = {"type": "Discrete", "n": 3}

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evopolicy_gateway.agents.evolved.controllers import build
-from evopolicy_gateway.agents.evolved.grids import find_grid, read_symbols
-from evopolicy_gateway.agents.families import seeking_family
-from evopolicy_gateway.agents.feedback import Step
-from evopolicy_gateway.agents.lessons import Lessons
-from evopolicy_gateway.agents.views import find_views, view_logs
+from evopolicy_gateway.agents.evolve.evolved.controllers import build
+from evopolicy_gateway.agents.evolve.evolved.grids import find_grid, read_symbols
+from evopolicy_gateway.agents.evolve.families import seeking_family
+from evopolicy_gateway.agents.evolve.feedback import Step
+from evopolicy_gateway.agents.evolve.lessons import Lessons
+from evopolicy_gateway.agents.evolve.views import find_views, view_logs
 
 LEFT, RIGHT, TAKE, ADVANCE = range(4)
 FLOOR, WALL, LAMP, DOOR, GOAL, OUTSIDE = 1, 2, 3, 4, 5, 0

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from evopolicy_gateway.agents.evolved.controllers import fingerprint
+from evopolicy_gateway.agents.evolve.evolved.controllers import fingerprint
 
 NAMED_NUMBERS = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.evolved.spaces import Schema, goal_keys
-from evopolicy_gateway.agents.feedback import Step
+from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.evolve.feedback import Step
 
 N_AXES = 3
 """Goals are taken for positions when they have this many elements: things in a plane leave no way over them."""

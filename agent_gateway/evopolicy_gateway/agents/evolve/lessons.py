@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from evopolicy_gateway.agents.evolved.grids import find_grid
-from evopolicy_gateway.agents.evolved.spaces import Schema, goal_keys
-from evopolicy_gateway.agents.families import Family, moving_families, seeking_family
-from evopolicy_gateway.agents.feedback import Step
-from evopolicy_gateway.agents.plant import find_plant
-from evopolicy_gateway.agents.views import ViewLog, find_views, view_logs
+from evopolicy_gateway.agents.evolve.evolved.grids import find_grid
+from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.evolve.families import Family, moving_families, seeking_family
+from evopolicy_gateway.agents.evolve.feedback import Step
+from evopolicy_gateway.agents.evolve.plant import find_plant
+from evopolicy_gateway.agents.evolve.views import ViewLog, find_views, view_logs
 
 MAX_VIEW_LOGS = 96
 

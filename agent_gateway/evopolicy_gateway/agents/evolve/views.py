@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.evolved.grids import find_grid, read_symbols
-from evopolicy_gateway.agents.evolved.spaces import Schema
-from evopolicy_gateway.agents.feedback import Step
+from evopolicy_gateway.agents.evolve.evolved.grids import find_grid, read_symbols
+from evopolicy_gateway.agents.evolve.evolved.spaces import Schema
+from evopolicy_gateway.agents.evolve.feedback import Step
 
 MIN_MOVES = 25
 """Transitions of an action that changed the view, to learn its map from."""

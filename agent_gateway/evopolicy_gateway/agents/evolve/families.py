@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.evolved.controllers import parameter_count
-from evopolicy_gateway.agents.evolved.spaces import ActionHead, Features, Schema, bounds
+from evopolicy_gateway.agents.evolve.evolved.controllers import parameter_count
+from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features, Schema, bounds
 
 Vector = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from evopolicy_gateway.agents.families import Family, Vector
+from evopolicy_gateway.agents.evolve.families import Family, Vector
 
 MEAN_AFTER = 2
 """The mean of the best becomes a final after this many others."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from evopolicy_gateway.agents.evolved.policy import CANDIDATES_FILE
-from evopolicy_gateway.agents.search import Candidate
+from evopolicy_gateway.agents.evolve.evolved.policy import CANDIDATES_FILE
+from evopolicy_gateway.agents.evolve.search import Candidate
 
 PACKAGE = "evolved"
 ENTRY_POINT = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""\n\nfrom {PACKAGE}.policy import Policy as Policy\n'
@@ -20,7 +20,7 @@ def stage_code(system: Path) -> None:
     """Put the policy's code into `system`, replacing the `policy.py` that was there."""
     target = system / PACKAGE
     target.mkdir(parents=True, exist_ok=True)
-    source = resources.files("evopolicy_gateway.agents") / PACKAGE
+    source = resources.files("evopolicy_gateway.agents.evolve") / PACKAGE
     for item in source.iterdir():
         if item.name.endswith(".py"):
             with resources.as_file(item) as path:

@@ -1,12 +1,4 @@
-"""`evolve`: the reference agent. Improves a parametrised policy under the run's budget, with no language model.
-
-It knows what every agent may know: `/info`, `/task`, `/submit` and the feedback files. Run as
-`python -m evopolicy_gateway.agents.evolve` in the workspace, with the `EVOPOLICYGYM_*` URLs set.
-
-One submit plays a whole population, a candidate an episode, since the policy is told the episode's index. The last
-submits hold one candidate each: those are the checkpoints meant for the hidden validation, which plays every episode
-of a checkpoint, whatever its index.
-"""
+"""The agent: plays populations, then finals, and learns from what the feedback tells."""
 
 from __future__ import annotations
 
@@ -17,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.families import families_for
-from evopolicy_gateway.agents.feedback import Step, episode_folders, novelty, read_steps
-from evopolicy_gateway.agents.lessons import Lessons
-from evopolicy_gateway.agents.search import Candidate, Episode, Search, make_plan
-from evopolicy_gateway.agents.staging import stage_candidates, stage_code
+from evopolicy_gateway.agents.evolve.families import families_for
+from evopolicy_gateway.agents.evolve.feedback import Step, episode_folders, novelty, read_steps
+from evopolicy_gateway.agents.evolve.lessons import Lessons
+from evopolicy_gateway.agents.evolve.search import Candidate, Episode, Search, make_plan
+from evopolicy_gateway.agents.evolve.staging import stage_candidates, stage_code
 
 MAX_ROWS_READ = 3000
 """Rows of one trajectory that the agent reads at most."""
@@ -156,7 +148,3 @@ def main() -> int:
         print(f"evolve: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
