@@ -27,7 +27,7 @@ from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Index
-from evopolicy_gateway.suite.suite_view import JsonView, results_table, viewing
+from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
 from evopolicy_gateway.suite.sweep import Sweep, look
 
 
@@ -152,7 +152,8 @@ async def _suite(order: Order) -> int:
                     _keep(order, index, one)
             suite_index.save(order.root, index)
             names = [run.name for run in order.runs]
-            with viewing(names, order.suite.parallel.machine, console, as_json=order.as_json) as view:
+            view = view_of(names, order.suite.parallel.machine, console, as_json=order.as_json)
+            with view.shown():
                 for one in decided:
                     if one.kind == "keep":
                         view.kept(one.run.name, index.runs.get(one.run.name))

@@ -21,7 +21,7 @@ from evopolicy_common.terminal import Terminal
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials
-from evopolicy_gateway.operator.watch import Watch, watching
+from evopolicy_gateway.operator.watch import RunView, Watch
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.play import RunPlay
 
@@ -114,7 +114,7 @@ async def play_all(
 ) -> list[RunResult]:
     """Plays all plans, so many agents at once; one that fails does not stop the others."""
     results: dict[int, RunResult] = {}
-    with watching(console) as watch:
+    with RunView(console).shown() as watch:
         settings = [plan.settings for plan in plans]
         where.check_cases(settings)
         async with connected(

@@ -1,11 +1,17 @@
-"""What an operator sees of runs while they go on: a live table on a terminal, plain lines elsewhere."""
+"""What an operator sees of runs while they go on: a live table on a terminal, plain lines elsewhere.
+
+A view keeps what it is told of each run, and makes events of it. On a terminal the table shows what is kept, and a few
+kinds of events scroll by above it; elsewhere every event that has words is a line.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, Protocol, Self, TypeVar
 
+from rich.console import RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -45,155 +51,192 @@ class Watch(Protocol):
         """Finalisation has moved."""
 
 
-class Lines:
-    """A line for each submit and phase: for logs and pipes."""
-
-    def __init__(self, console: Terminal) -> None:
-        self._console = console
-        self._seen: dict[str, tuple[object, ...]] = {}
-
-    def note(self, run: str, text: str) -> None:
-        self._console.print(f"{run}: {text}", soft_wrap=True)
-
-    def progress(self, run: str, progress: Progress) -> None:
-        if progress.last_submit_id is not None and self._changed(f"{run} submit", progress.last_submit_id):
-            mean = "" if progress.last_mean is None else f", mean return {progress.last_mean:.4g}"
-            self.note(
-                run,
-                f"{progress.last_submit_id} {progress.last_status}{mean};"
-                f" {progress.remaining_budget} of {progress.episode_budget} episodes left",
-            )
-        self._waits_for(run, progress.waits_for)
-
-    def held(self, run: str, what: str) -> None:
-        self._waits_for(run, what)
-
-    def turn(self, run: str, turn: int, text: str) -> None:
-        self.note(run, f"turn {turn}: {first_line(text)}")
-
-    def doing(self, run: str, doing: AgentDoing) -> None:
-        if doing.note:
-            self.note(run, doing.note)
-        if doing.paused_s:
-            self.note(run, f"{first_line(doing.action)} (for {doing.paused_s:.0f} s)")
-
-    def phase(self, run: str, progress: RunProgress) -> None:
-        if self._changed(f"{run} phase", progress.phase) and progress.phase != "finished":
-            self.note(run, PHASES[progress.phase])
-        self._waits_for(run, progress.waits_for)
-
-    def _waits_for(self, run: str, what: str) -> None:
-        if what and self._changed(f"{run} waits", what):
-            self.note(run, f"waiting for {what}")
-
-    def _changed(self, key: str, *value: object) -> bool:
-        if self._seen.get(key) == value:
-            return False
-        self._seen[key] = value
-        return True
-
-
-class LiveTable:
-    """A table with a row a run, drawn anew as things happen; notes scroll by above it."""
-
-    def __init__(self, console: Terminal) -> None:
-        self._console = console
-        self._rows: dict[str, _Row] = {}
-        self._live = Live(console=console, get_renderable=self._table, refresh_per_second=4, transient=True)
-
-    @contextlib.contextmanager
-    def shown(self) -> Iterator[LiveTable]:
-        with self._live:
-            yield self
-
-    def note(self, run: str, text: str) -> None:
-        self._row(run)
-        self._console.print(f"{run}: {text}")
-
-    def progress(self, run: str, progress: Progress) -> None:
-        row = self._row(run)
-        if progress.last_submit_id not in (None, row.last_submit):
-            row.last_submit = progress.last_submit_id
-            row.last = f"{progress.last_status}" + (
-                "" if progress.last_mean is None else f" {progress.last_mean:.4g}"
-            )
-        row.progress = progress
-
-    def held(self, run: str, what: str) -> None:
-        self._row(run).held = what
-        if what:
-            self.note(run, f"waiting for {what}")
-
-    def turn(self, run: str, turn: int, text: str) -> None:
-        self._row(run).said = first_line(text)
-
-    def doing(self, run: str, doing: AgentDoing) -> None:
-        if doing.note:
-            self.note(run, doing.note)
-        if doing.action:
-            self._row(run).said = first_line(doing.action)
-
-    def phase(self, run: str, progress: RunProgress) -> None:
-        self._row(run).phase = progress
-
-    def _row(self, run: str) -> _Row:
-        return self._rows.setdefault(run, _Row())
-
-    def _table(self) -> Table:
-        table = Table(box=None, pad_edge=False)
-        for title in ("run", "budget used", "submits", "last", "best visible mean", "now"):
-            table.add_column(title, no_wrap=title != "now", overflow="ellipsis")
-        for name, row in self._rows.items():
-            table.add_row(name, *row.cells())
-        return table
-
-
-class _Row:
-    """What the table tells of one run."""
+class Row:
+    """What is known of one run."""
 
     def __init__(self) -> None:
         self.progress: Progress | None = None
         self.phase: RunProgress | None = None
-        self.last_submit: str | None = None
-        self.last = ""
-        self.said = ""
+        self.action = ""
         self.held = ""
-
-    def cells(self) -> tuple[Text, ...]:
-        progress = self.progress
-        if progress is None:
-            return (Text(""),) * 4 + (Text(f"waiting for {self.held}" if self.held else "starting"),)
-        used = progress.episode_budget - progress.remaining_budget
-        best = "" if progress.best_mean is None else f"{progress.best_mean:.4g}"
-        return (
-            Text(f"{_bar(used, progress.episode_budget)} {used}/{progress.episode_budget}"),
-            Text(str(progress.n_submits)),
-            Text(self.last),
-            Text(best),
-            Text(self._now(progress)),
-        )
-
-    def _now(self, progress: Progress) -> str:
-        if self.held:
-            return f"waiting for {self.held}"
-        if self.phase is not None:
-            done = f" {self.phase.done}/{self.phase.total}" if self.phase.total else ""
-            waits = f", waiting for {self.phase.waits_for}" if self.phase.waits_for else ""
-            return PHASES[self.phase.phase] + done + waits
-        if progress.submit_id is not None:
-            waits = f", waiting for {progress.waits_for}" if progress.waits_for else ""
-            return f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes} episodes{waits}"
-        return f"agent at work{f': {self.said}' if self.said else ''}"
+        """What it may not begin before; also in `waits_for`."""
+        self.waits_for = ""
 
 
-@contextlib.contextmanager
-def watching(console: Terminal) -> Iterator[Watch]:
-    """A live table on a terminal, lines elsewhere."""
-    if console.is_terminal:
-        with LiveTable(console).shown() as table:
-            yield table
-    else:
-        yield Lines(console)
+R = TypeVar("R", bound=Row)
+
+
+class View(ABC, Generic[R]):
+    """A `Watch` with a row a run."""
+
+    new_row: Callable[[], R]
+    no_news: tuple[str, ...] = ("",)
+    """What a run may wait for without an event."""
+    above: tuple[str, ...]
+    """Kinds of events that are told above the table."""
+
+    def __init__(self, console: Terminal | None) -> None:
+        """`console` None: it tells nobody."""
+        self.rows: dict[str, R] = {}
+        self._console = console
+        self._drawn = console is not None and console.is_terminal
+        self._said: dict[str, object] = {}
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[Self]:
+        """As a table, where the console is a terminal."""
+        with contextlib.ExitStack() as stack:
+            if self._drawn:
+                stack.enter_context(
+                    Live(
+                        console=self._console,
+                        get_renderable=self.render,
+                        refresh_per_second=4,
+                        transient=True,
+                    )
+                )
+            yield self
+
+    @abstractmethod
+    def render(self) -> RenderableType:
+        """The table as it is now."""
+
+    def words(self, kind: str, run: str, told: dict[str, Any]) -> str:
+        """An event as people read it; empty for one that is not worth a line."""
+        if kind == "phase":
+            return PHASES[told["phase"]]
+        if kind == "turn":
+            return f"turn {told['turn']}: {told['text']}"
+        if kind in ("waits", "held"):
+            return f"waiting for {told['what']}"
+        return str(told.get("text", ""))
+
+    def event(self, kind: str, run: str, **more: Any) -> None:
+        """Says that something happened."""
+        if self._console is None or (self._drawn and kind not in self.above):
+            return
+        if text := self.words(kind, run, more):
+            self._print(f"{run}: {text}" if run else text)
+
+    # What a run tells.
+
+    def note(self, run: str, text: str) -> None:
+        self.row(run)
+        self.event("note", run, text=text)
+
+    def progress(self, run: str, progress: Progress) -> None:
+        self.row(run).progress = progress
+        if progress.last_submit_id is not None and self.is_new(run, "submit", progress.last_submit_id):
+            self.event(
+                "submit",
+                run,
+                submit=progress.last_submit_id,
+                status=progress.last_status,
+                mean=progress.last_mean,
+                best=progress.best_mean,
+                budget_left=progress.remaining_budget,
+            )
+        self.waits_for(run, progress.waits_for)
+
+    def held(self, run: str, what: str) -> None:
+        self.row(run).held = what
+        self.waits_for(run, what, "held")
+
+    def turn(self, run: str, turn: int, text: str) -> None:
+        self.row(run).action = first_line(text)
+        self.event("turn", run, turn=turn, text=first_line(text))
+
+    def doing(self, run: str, doing: AgentDoing) -> None:
+        row = self.row(run)
+        row.action = first_line(doing.action) or row.action
+        if doing.note:
+            self.note(run, doing.note)
+        if doing.paused_s:
+            seconds, why = round(doing.paused_s), first_line(doing.action)
+            self.event("paused", run, provider=doing.provider, seconds=seconds, why=why)
+
+    def phase(self, run: str, progress: RunProgress) -> None:
+        self.row(run).phase = progress
+        if self.is_new(run, "phase", progress.phase):
+            self.event("phase", run, phase=progress.phase)
+        self.waits_for(run, progress.waits_for)
+
+    def waits_for(self, run: str, what: str, kind: str = "waits") -> None:
+        """It waits for that now; told once."""
+        self.row(run).waits_for = what
+        if what not in self.no_news and self.is_new(run, "waits", what):
+            self.event(kind, run, what=what)
+
+    def row(self, run: str) -> R:
+        if run not in self.rows:
+            self.rows[run] = self.new_row()
+        return self.rows[run]
+
+    def is_new(self, run: str, kind: str, value: object) -> bool:
+        """Whether another value of that kind was told of the run last."""
+        key = f"{run} {kind}"
+        if self._said.get(key) == value:
+            return False
+        self._said[key] = value
+        return True
+
+    def _print(self, text: str) -> None:
+        if self._console is not None:
+            self._console.print(text, soft_wrap=True)
+
+
+class RunView(View[Row]):
+    """Of the runs of `evopolicy run` and `evopolicy local`."""
+
+    new_row = Row
+    above = ("note", "held")
+
+    def words(self, kind: str, run: str, told: dict[str, Any]) -> str:
+        if kind == "submit":
+            progress = self.rows[run].progress
+            assert progress is not None
+            mean = "" if told["mean"] is None else f", mean return {told['mean']:.4g}"
+            left = f"{told['budget_left']} of {progress.episode_budget} episodes left"
+            return f"{told['submit']} {told['status']}{mean}; {left}"
+        if kind == "paused":
+            return f"{told['why']} (for {told['seconds']} s)"
+        return "" if told.get("phase") == "finished" else super().words(kind, run, told)
+
+    def render(self) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for title in ("run", "budget used", "submits", "last", "best visible mean", "now"):
+            table.add_column(title, no_wrap=title != "now", overflow="ellipsis")
+        for name, row in self.rows.items():
+            table.add_row(name, *map(Text, _cells(row)))
+        return table
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    progress = row.progress
+    if progress is None:
+        return ("", "", "", "", f"waiting for {row.held}" if row.held else "starting")
+    used = progress.episode_budget - progress.remaining_budget
+    mean = "" if progress.last_mean is None else f" {progress.last_mean:.4g}"
+    return (
+        f"{_bar(used, progress.episode_budget)} {used}/{progress.episode_budget}",
+        str(progress.n_submits),
+        "" if progress.last_submit_id is None else f"{progress.last_status}{mean}",
+        "" if progress.best_mean is None else f"{progress.best_mean:.4g}",
+        _now(row, progress),
+    )
+
+
+def _now(row: Row, progress: Progress) -> str:
+    if row.held:
+        return f"waiting for {row.held}"
+    if row.phase is not None:
+        done = f" {row.phase.done}/{row.phase.total}" if row.phase.total else ""
+        waits = f", waiting for {row.phase.waits_for}" if row.phase.waits_for else ""
+        return PHASES[row.phase.phase] + done + waits
+    if progress.submit_id is not None:
+        waits = f", waiting for {progress.waits_for}" if progress.waits_for else ""
+        return f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes} episodes{waits}"
+    return f"agent at work{f': {row.action}' if row.action else ''}"
 
 
 def _bar(part: int, whole: int, width: int = 12) -> str:

@@ -5,21 +5,18 @@ All three are told the same things; a view keeps them by run.
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Group
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.messages.gateway import FREE_SLOT
-from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import Terminal, say_json
-from evopolicy_gateway.operator.control import AgentDoing, Progress
-from evopolicy_gateway.operator.watch import PHASES, first_line
+from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.operator.watch import PHASES, Row, View
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 
 _SHOWN_ROWS = 24
@@ -29,16 +26,13 @@ _STYLES = ("bold", "red", "dim", "dim", "")
 """Of rows by `_order`: running, failed, with another host, waiting, ended."""
 
 
-class Row:
-    """What is known of one run."""
+class SuiteRow(Row):
+    """What is known of one run of a sweep."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.state = "waiting"
         self.attempt = 1
-        self.progress: Progress | None = None
-        self.phase: RunProgress | None = None
-        self.action = ""
-        self.waits_for = ""
         self.tokens: dict[str, Any] | None = None
         self.entry: Entry | None = None
 
@@ -47,14 +41,18 @@ def _ignore(_: str, __: AgentDoing) -> None:
     pass
 
 
-class SuiteView:
-    """Keeps the rows and tells nobody; the others say what they are told."""
+class SuiteView(View[SuiteRow]):
+    """Of the runs of a sweep: a table with a row for each that goes on and the last that ended."""
 
-    def __init__(self, names: list[str], parallel: int) -> None:
-        self.rows = {name: Row() for name in names}
+    new_row = SuiteRow
+    no_news = ("", FREE_SLOT)
+    above = ("finished", "note", "paused", "waits", "elsewhere")
+
+    def __init__(self, names: list[str], parallel: int, console: Terminal | None = None) -> None:
+        super().__init__(console)
+        self.rows = {name: SuiteRow() for name in names}
         self.on_doing: Callable[[str, AgentDoing], None] = _ignore
         self._parallel = parallel
-        self._said: dict[str, object] = {}
 
     # What the sweep tells.
 
@@ -79,8 +77,7 @@ class SuiteView:
     def elsewhere(self, name: str, host: str) -> None:
         """Another host plays it."""
         self.rows[name].state = f"on {host}"
-        if self._said.get(f"{name} host") != host:
-            self._said[f"{name} host"] = host
+        if self.is_new(name, "host", host):
             self.event("elsewhere", name, host=host)
 
     def waits(self, name: str) -> None:
@@ -91,65 +88,21 @@ class SuiteView:
         """Something about the sweep as a whole."""
         self.event("note", "", text=text)
 
-    # What a run tells: `watch.Watch`.
-
-    def note(self, run: str, text: str) -> None:
-        self.event("note", run, text=text)
-
-    def progress(self, run: str, progress: Progress) -> None:
-        row = self.rows[run]
-        row.progress = progress
-        self._waits_for(run, progress.waits_for)
-        if progress.last_submit_id is not None and self._said.get(f"{run} submit") != progress.last_submit_id:
-            self._said[f"{run} submit"] = progress.last_submit_id
-            self.event(
-                "submit",
-                run,
-                submit=progress.last_submit_id,
-                status=progress.last_status,
-                mean=progress.last_mean,
-                best=progress.best_mean,
-                budget_left=progress.remaining_budget,
-            )
+    # What a run tells.
 
     def held(self, run: str, what: str) -> None:
-        self._waits_for(run, what)
-
-    def turn(self, run: str, turn: int, text: str) -> None:
-        self.rows[run].action = first_line(text)
-        self.event("turn", run, turn=turn, text=first_line(text))
+        self.waits_for(run, what)
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         row = self.rows[run]
-        row.action = first_line(doing.action) or row.action
         row.tokens = doing.tokens or row.tokens
         self.on_doing(run, doing)
-        if doing.note:
-            self.note(run, doing.note)
-        if doing.paused_s:
-            self.event(
-                "paused",
-                run,
-                provider=doing.provider,
-                seconds=round(doing.paused_s),
-                why=first_line(doing.action),
-            )
-
-    def phase(self, run: str, progress: RunProgress) -> None:
-        self.rows[run].phase = progress
-        if self._said.get(f"{run} phase") != progress.phase:
-            self._said[f"{run} phase"] = progress.phase
-            self.event("phase", run, phase=progress.phase)
-        self._waits_for(run, progress.waits_for)
-
-    def _waits_for(self, run: str, what: str) -> None:
-        self.rows[run].waits_for = what
-        if what not in ("", FREE_SLOT) and self._said.get(f"{run} waits") != what:
-            self._said[f"{run} waits"] = what
-            self.event("waits", run, what=what)
+        super().doing(run, doing)
 
     def event(self, kind: str, run: str, **more: Any) -> None:
-        """Says that something happened."""
+        super().event(kind, run, **more)
+        if kind == "finished" and not self._drawn:
+            self._print(self.totals())
 
     def totals(self) -> str:
         """How far the sweep is, in one line."""
@@ -183,47 +136,28 @@ class SuiteView:
             return None
         return sum(walls) / len(walls) * left / min(self._parallel, left)
 
-
-class JsonView(SuiteView):
-    """One JSON object a line on stdout."""
-
-    def event(self, kind: str, run: str, **more: Any) -> None:
-        document = {"event": kind, "at": round(time.time(), 3), **({"run": run} if run else {}), **more}
-        say_json(document, indent=False)
-
-
-class LinesView(SuiteView):
-    """A line for each event; the totals with every finished run."""
-
-    def __init__(self, names: list[str], parallel: int, console: Terminal) -> None:
-        super().__init__(names, parallel)
-        self._console = console
-
-    def event(self, kind: str, run: str, **more: Any) -> None:
-        text = words(kind, more)
-        if text:
-            self._print(f"{run}: {text}" if run else text)
+    def words(self, kind: str, run: str, told: dict[str, Any]) -> str:
+        if kind == "started":
+            return "begins" + (f", attempt {told['attempt']}" if told["attempt"] > 1 else "")
         if kind == "finished":
-            self._print(self.totals())
-
-    def _print(self, text: str) -> None:
-        self._console.print(text, soft_wrap=True)
-
-
-class TableView(LinesView):
-    """A table with a row for each run that goes on and the last that ended; notes scroll by above it."""
-
-    @contextlib.contextmanager
-    def shown(self) -> Iterator[TableView]:
-        with Live(console=self._console, get_renderable=self.render, refresh_per_second=4, transient=True):
-            yield self
-
-    def event(self, kind: str, run: str, **more: Any) -> None:
-        if kind in ("finished", "note", "paused", "waits", "elsewhere"):
-            self._print(f"{run}: {words(kind, more)}" if run else words(kind, more))
+            if told["state"] == "completed":
+                return f"completed, score {_number(told['score'])} (random {_number(told['random'])})"
+            if told["state"] == "cancelled":
+                return str(told["error"] or "cancelled")
+            why = f": {told['error']}" if told["error"] else ""
+            return str(told["state"]).replace("_", " ") + why
+        if kind == "submit":
+            mean = "" if told["mean"] is None else f", mean return {_number(told['mean'])}"
+            return f"{told['submit']} {told['status']}{mean}; {told['budget_left']} episodes left"
+        if kind == "paused":
+            return f"{told['provider']} is away, waits {told['seconds']} s ({told['why']})"
+        if kind == "elsewhere":
+            return f"is played on {told['host']}"
+        return "" if told.get("phase") in ("open", "finished") else super().words(kind, run, told)
 
     def render(self) -> Group:
         """The table as it is now."""
+        assert self._console is not None
         table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         # Of those that ended, the last come first.
         newest = sorted(self.rows, key=lambda name: _ended(self.rows[name]), reverse=True)
@@ -243,43 +177,17 @@ class TableView(LinesView):
         return Group(table, *more, Text(self.totals()))
 
 
-def words(kind: str, told: dict[str, Any]) -> str:
-    """An event as people read it."""
-    if kind == "started":
-        return "begins" + (f", attempt {told['attempt']}" if told["attempt"] > 1 else "")
-    if kind == "finished":
-        if told["state"] == "completed":
-            return f"completed, score {_number(told['score'])} (random {_number(told['random'])})"
-        if told["state"] == "cancelled":
-            return str(told["error"] or "cancelled")
-        why = f": {told['error']}" if told["error"] else ""
-        return str(told["state"]).replace("_", " ") + why
-    if kind == "submit":
-        mean = "" if told["mean"] is None else f", mean return {_number(told['mean'])}"
-        return f"{told['submit']} {told['status']}{mean}; {told['budget_left']} episodes left"
-    if kind == "phase":
-        return "" if told["phase"] in ("open", "finished") else PHASES[told["phase"]]
-    if kind == "turn":
-        return f"turn {told['turn']}: {told['text']}"
-    if kind == "paused":
-        return f"{told['provider']} is away, waits {told['seconds']} s ({told['why']})"
-    if kind == "waits":
-        return f"waiting for {told['what']}"
-    if kind == "elsewhere":
-        return f"is played on {told['host']}"
-    return str(told.get("text", ""))
+class JsonView(SuiteView):
+    """One JSON object a line on stdout."""
+
+    def event(self, kind: str, run: str, **more: Any) -> None:
+        document = {"event": kind, "at": round(time.time(), 3), **({"run": run} if run else {}), **more}
+        say_json(document, indent=False)
 
 
-@contextlib.contextmanager
-def viewing(names: list[str], parallel: int, console: Terminal, *, as_json: bool) -> Iterator[SuiteView]:
+def view_of(names: list[str], parallel: int, console: Terminal, *, as_json: bool) -> SuiteView:
     """The view that fits where the output goes."""
-    if as_json:
-        yield JsonView(names, parallel)
-    elif console.is_terminal:
-        with TableView(names, parallel, console).shown() as view:
-            yield view
-    else:
-        yield LinesView(names, parallel, console)
+    return JsonView(names, parallel) if as_json else SuiteView(names, parallel, console)
 
 
 def results_table(entries: list[Entry]) -> Table:
@@ -301,16 +209,16 @@ def results_table(entries: list[Entry]) -> Table:
     return table
 
 
-def _order(row: Row) -> int:
+def _order(row: SuiteRow) -> int:
     kinds = {"running": 0, "error": 1, "cancelled": 1, "waiting": 3}
     return kinds.get(row.state, 2 if row.state.startswith("on ") else 4)
 
 
-def _ended(row: Row) -> str:
+def _ended(row: SuiteRow) -> str:
     return "" if row.entry is None else row.entry.finished_at
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: SuiteRow) -> tuple[str, ...]:
     progress, tokens = row.progress, _tokens(row.tokens)
     state = row.state.replace("_", " ")
     if row.state == "running" and row.phase is not None:

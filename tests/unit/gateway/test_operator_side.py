@@ -22,7 +22,7 @@ from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.control import AgentDoing, Progress
 from evopolicy_gateway.operator.runs import Cluster, RunResult, exit_code, report
-from evopolicy_gateway.operator.watch import watching
+from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.layout import Staged
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
@@ -182,7 +182,7 @@ def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
 
 def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
     out = io.StringIO()
-    with watching(Terminal(file=out, width=200)) as watch:
+    with RunView(Terminal(file=out, width=200)).shown() as watch:
         progress = Progress(
             episode_budget=8,
             remaining_budget=4,
@@ -212,7 +212,7 @@ def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
 def test_watchers_on_a_terminal_draw_a_table() -> None:
     out = io.StringIO()
     console = Terminal(file=out, force_terminal=True, width=160)
-    with watching(console) as watch:
+    with RunView(console).shown() as watch:
         watch.note("toy/line", "run r-1")
         watch.progress(
             "toy/line",

@@ -11,8 +11,8 @@ from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import Terminal, harmless
 from evopolicy_gateway.operator.control import AgentDoing, Progress
-from evopolicy_gateway.operator.watch import Lines, LiveTable, first_line
-from evopolicy_gateway.suite.suite_view import LinesView, TableView
+from evopolicy_gateway.operator.watch import RunView, first_line
+from evopolicy_gateway.suite.suite_view import SuiteView
 
 STEERING = (
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen
@@ -26,15 +26,12 @@ STEERING = (
 def test_an_agents_words_do_not_steer_the_terminal(text: str) -> None:
     out = io.StringIO()
     console = Terminal(file=out, width=200)
-    lines = Lines(console)
+    lines = RunView(console)
     lines.turn("run", 1, text)
     lines.note("run", f"agent failed: {text}")
     lines.doing("run", AgentDoing(action=text, paused_s=1.0))
-    table = LiveTable(console)
-    table.note("run", text)
-    table.turn("run", 1, text)
-    console.print(table._table())
-    sweep = LinesView(["run"], 1, console)
+    console.print(lines.render())
+    sweep = SuiteView(["run"], 1, console)
     sweep.turn("run", 1, text)
     sweep.note("run", text)
     told = out.getvalue()
@@ -52,18 +49,16 @@ def test_what_a_run_waits_for_is_said_once_and_a_free_slot_is_no_news() -> None:
     out = io.StringIO()
     console = Terminal(file=out, width=200)
     missing = "a worker that offers toy/line with sandbox tier bwrap"
-    for view in (Lines(console), LinesView(["run"], 1, console)):
+    for view in (RunView(console), SuiteView(["run"], 1, console)):
         for what in (missing, missing, ""):
             view.phase("run", RunProgress(phase="heldout", done=0, total=4, waits_for=what))
     assert out.getvalue().count(f"waiting for {missing}") == 2
-    sweep = LinesView(["run"], 1, console)
+    sweep = SuiteView(["run"], 1, console)
     sweep.rows["run"].state = "running"
     progress = Progress(
         episode_budget=8, remaining_budget=4, n_submits=1, submit_id="submit_000", n_episodes=4
     )
     sweep.progress("run", msgspec.structs.replace(progress, waits_for=FREE_SLOT))
     assert FREE_SLOT not in out.getvalue()
-    table = TableView(["run"], 1, console)
-    table.rows = sweep.rows
-    console.print(table.render())
+    console.print(sweep.render())
     assert f"waiting for {FREE_SLOT}" in out.getvalue()

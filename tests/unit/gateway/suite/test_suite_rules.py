@@ -27,7 +27,7 @@ from evopolicy_gateway.suite.decisions import (
 )
 from evopolicy_gateway.suite.suite_file import SuiteRun, check_agents_start, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index, used
-from evopolicy_gateway.suite.suite_view import TableView
+from evopolicy_gateway.suite.suite_view import SuiteView
 
 FILE = """
 name = "s"
@@ -282,7 +282,7 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     runs = suite_in(tmp_path)
     out = io.StringIO()
     console = Terminal(file=out, width=160)
-    view = TableView([run.name for run in runs], 2, console)
+    view = SuiteView([run.name for run in runs], 2, console)
     first, second, third, failed = runs[:4]
     known = entry(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")
     view.kept(first.name, known)
