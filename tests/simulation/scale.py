@@ -235,9 +235,9 @@ class Load:
         self.done += 1
         run, _, rest = lease.job.job_id.partition("/")
         group = f"{run}/{rest.rpartition('/')[0]}"
-        if "/train" in group and group not in self.core.groups:
+        if "/train" in group and group not in self.core.state.groups:
             self._go_on(run)
-        if run in self._submitted and run not in self.core.runs:
+        if run in self._submitted and run not in self.core.state.runs:
             del self._submitted[run]
             self._create()
 

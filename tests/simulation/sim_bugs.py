@@ -12,24 +12,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from evopolicy_coordinator.core import (
-    audit,
-    finalisation,
-    handin,
-    loading,
-    machine,
-    membership,
-    precedence,
-    runs,
-)
-from evopolicy_coordinator.core.isolation import Families, Isolation
-from evopolicy_coordinator.core.jobs import JobGroup
-from evopolicy_coordinator.core.leases import LeaseBook
-from evopolicy_coordinator.core.ledger import Ledger
-from evopolicy_coordinator.core.queue import Profile
-from evopolicy_coordinator.core.scheduler import Scheduler
-from evopolicy_coordinator.core.turn import Turn
-from evopolicy_coordinator.core.workers import Fleet
+from evopolicy_coordinator.core import loading, machine
+from evopolicy_coordinator.core.agents import permits, precedence
+from evopolicy_coordinator.core.isolation import bars, stays
+from evopolicy_coordinator.core.isolation.families import Families
+from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
+from evopolicy_coordinator.core.model import JobGroup, Profile
+from evopolicy_coordinator.core.runs import audits, finalisation, finished, results, submits
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.structures.ledger import Ledger
+from evopolicy_coordinator.core.workers import handin, membership, scheduler
 
 
 @dataclass(frozen=True)
@@ -55,29 +48,34 @@ def planted(bug: Bug) -> Iterator[None]:
         function.__globals__,
         made,
     )
-    handlers = machine._HANDLERS
-    handled = [kind for kind, handler in handlers.items() if handler is function]
-    imported = [bug.owner] + [each for each in (machine,) if getattr(each, bug.name, None) is function]
-    for owner in imported:
-        setattr(owner, bug.name, made[bug.name])
-    for kind in handled:
-        handlers[kind] = made[bug.name]
+    tables: tuple[dict[Any, Any], ...] = (machine.EVENTS, machine.NEWS, machine.TIMERS)
+    before = [dict(table) for table in tables]
+    planted_one = made[bug.name]
+    setattr(bug.owner, bug.name, planted_one)
+    for table in tables:
+        for key, rule in table.items():
+            table[key] = (
+                tuple(planted_one if each is function else each for each in rule)
+                if isinstance(rule, tuple)
+                else planted_one
+                if rule is function
+                else rule
+            )
     try:
         yield
     finally:
-        for owner in imported:
-            setattr(owner, bug.name, function)
-        for kind in handled:
-            handlers[kind] = function
+        setattr(bug.owner, bug.name, function)
+        for table, old in zip(tables, before, strict=True):
+            table.update(old)
 
 
 BUGS = (
     Bug("settle twice", Ledger, "_take", ".pop(submit_index, None)", ".get(submit_index)"),
-    Bug("refund what is to be charged", runs, "end", "run.ledger.settle(", "run.ledger.refund("),
-    Bug("send before persist", Turn, "effects", "[first, *self._out]", "[*self._out, first]"),
-    Bug("forget to queue after a back-off", machine.Core, "_fire", 'kind == "job"', 'kind == "no"'),
-    Bug("forget the adoption timer", loading, "load", "if core.adopting:", "if False:"),
-    Bug("forget the worker's timer", LeaseBook, "look", "if deadlines:", "if False:"),
+    Bug("refund what is to be charged", submits, "end", "run.ledger.settle(", "run.ledger.refund("),
+    Bug("send before persist", Step, "effects", "[first, *self._out]", "[*self._out, first]"),
+    Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False"),
+    Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:"),
+    Bug("forget the worker's timer", expiry, "look", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
         handin,
@@ -90,13 +88,13 @@ BUGS = (
         "keep a job open when it is done",
         handin,
         "commit",
-        'core.close_job(job, turn, "done by another attempt")',
+        'groups.close_job(state, job, step, "done by another attempt")',
         "pass",
     ),
-    Bug("answer for outcomes that were not stored", handin, "commit", "turn.persist(row)", "pass"),
-    Bug("count attempts from one after a restart", machine.Core, "__init__", "(incarnation - 1) *", "0 *"),
-    Bug("show episodes before the gate", runs, "_released", "if 0 in group.marks", "if True"),
-    Bug("let ties go to the earlier submit", finalisation, "select", ">= best_mean", "> best_mean"),
+    Bug("answer for outcomes that were not stored", handin, "commit", "step.persist(row)", "pass"),
+    Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
+    Bug("show episodes before the gate", results, "_released", "if 0 in group.marks", "if True"),
+    Bug("let ties go to the earlier submit", finished, "select", ">= best_mean", "> best_mean"),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
     Bug(
         "forget idempotency keys at a restart",
@@ -105,22 +103,22 @@ BUGS = (
         "run.keys[row.key] = row.submit_index",
         "pass",
     ),
-    Bug("take a second submit while one runs", runs, "submit", "if run.open is not None:", "if False:"),
-    Bug("take submits of a closed run", runs, "submit", 'run.state.phase != "open"', "False"),
-    Bug("accept the same key twice", runs, "submit", "known is not None", "False"),
-    Bug("never preempt", Scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:"),
+    Bug("take a second submit while one runs", submits, "submit", "if run.open is not None:", "if False:"),
+    Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False"),
+    Bug("accept the same key twice", submits, "submit", "known is not None", "False"),
+    Bug("never preempt", scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:"),
     Bug(
         "forget the hidden jobs that train jobs wait behind",
-        Scheduler,
-        "hidden_leased",
+        leases,
+        "_look_again",
         "if lane.n_ready[TRAIN]:",
         "if False:",
     ),
     Bug(
         "lease to a poll that was given up unread",
-        Scheduler,
+        scheduler,
         "poll",
-        "event.waited_s > message.wait_s + core.settings.late_s",
+        "event.waited_s > message.wait_s + state.settings.late_s",
         "False",
     ),
     Bug(
@@ -130,121 +128,131 @@ BUGS = (
         "leave runs unpinned when a worker is taken back",
         membership,
         "worker_state",
-        "_pin_waiting(core, worker, turn)",
+        "pins.pin_waiting(state, worker, step)",
         "pass",
     ),
-    Bug("let a lease expire under heartbeats", LeaseBook, "hear", "lease.renewed = now", "pass"),
+    Bug("let a lease expire under heartbeats", leases, "hear", "lease.renewed = now", "pass"),
     Bug(
         "take a liveliness hint for the truth",
         membership,
         "liveness_lost",
-        "worker.doubted_at = turn.now",
-        "core.book.lose(worker, turn)",
+        "worker.doubted_at = step.now",
+        "__import__('evopolicy_coordinator.core.leasing.expiry', fromlist=['lose']).lose(state, worker, step)",
     ),
     Bug(
         "expire leases after the loop stood still",
         machine.Core,
         "_watch",
-        "now - due > self.settings.late_s",
+        "now - due > state.settings.late_s",
         "False",
     ),
     Bug(
         "play what is done again after a restart",
-        machine.Core,
+        groups,
         "open_group",
-        "self.heads.pop(group.id, [])",
+        "loading.heads.pop(group.id, [])",
         "[]",
     ),
     Bug(
         "forget after a restart who is out of service",
-        Fleet,
-        "_count_in",
-        'self.out_of_service.get(worker.name, "active")',
+        fleet,
+        "count_in",
+        'state.out_of_service.get(worker.name, "active")',
         '"active"',
     ),
     Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.key[2]", ""),
-    Bug("adopt a job that is leased elsewhere", LeaseBook, "_adopt", "or job.lease is not None", ""),
-    Bug("forget to tell a worker to stop", LeaseBook, "hear", "stop.append(item.lease_id)", "pass"),
-    Bug("leave a lost worker's leases with it", LeaseBook, "lose", "list(worker.leases.values())", "[]"),
-    Bug("refuse a worker that comes back", Fleet, "of_session", 'if worker.state == "lost":', "if False:"),
+    Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", ""),
+    Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass"),
+    Bug("leave a lost worker's leases with it", expiry, "lose", "list(worker.leases.values())", "[]"),
+    Bug("refuse a worker that comes back", fleet, "of_session", 'if worker.state == "lost":', "if False:"),
     Bug("let a worker audit itself", JobGroup, "bars", "worker.name in self.not_on or", ""),
-    Bug("forget at a restart what is to be audited", audit, "resume", 'row.state != "open"', "True"),
-    Bug("wait for audits that nobody can play", machine.Core, "_fire", 'kind == "audits"', 'kind == "no"'),
+    Bug("forget at a restart what is to be audited", audits, "resume", 'row.state != "open"', "True"),
     Bug(
-        "call a forger who one other contradicts", audit, "compared", "elif event.replay == 1:", "elif False:"
+        "wait for audits that nobody can play",
+        finalisation,
+        "look_at_audits",
+        "if run is not None",
+        "if False",
+    ),
+    Bug(
+        "call a forger who one other contradicts",
+        audits,
+        "compared",
+        "elif event.replay == 1:",
+        "elif False:",
     ),
     Bug(
         "forget at a restart who is quarantined",
-        Fleet,
+        fleet,
         "set_state",
-        "self.quarantined[name] = reason",
+        "state.quarantined[name] = reason",
         "pass",
     ),
     Bug(
         "play hidden episodes beside an agent",
-        Isolation,
+        bars,
         "hidden_bar",
-        "if self._permits(kernel, family):",
+        "if permits_there(state, kernel, family):",
         "if False:",
     ),
     Bug(
         "play hidden episodes beside train episodes",
-        Isolation,
+        bars,
         "hidden_bar",
-        "if related(kernel.train, family) or related(self.everywhere.train, family):",
+        "if related(kernel.train, family) or related(state.everywhere.train, family):",
         "if False:",
     ),
     Bug(
         "play train episodes beside hidden ones",
-        Isolation,
+        bars,
         "train_bar",
-        "if related(kernel.hidden, family) or related(self.everywhere.hidden, family):",
+        "if related(kernel.hidden, family) or related(state.everywhere.hidden, family):",
         "if False:",
     ),
     Bug(
         "play hidden episodes on a kernel that is not known",
-        Isolation,
+        bars,
         "hidden_bar",
-        "if kernel is self.everywhere:",
+        "if kernel is state.everywhere:",
         "if False:",
     ),
     Bug(
         "take an agent that may be anywhere for one that is nowhere",
-        Isolation,
-        "_permits",
-        "or related(self.everywhere.permits, family)",
+        bars,
+        "permits_there",
+        "or related(state.everywhere.permits, family)",
         "",
     ),
     Bug(
         "let an agent start before hidden episodes have stopped",
-        Isolation,
+        bars,
         "permit_bar",
         "if not stays:",
         "if not any(stay.lease is not None and stay.lease.live for stay in stays):",
     ),
     Bug("take siblings for strangers", Families, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
-    Bug("forget permits at a restart", Isolation, "load", "row.ended_at is not None", "True"),
-    Bug("forget what a silent worker may play", Isolation, "left", "if sure:", "if True:"),
+    Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True"),
+    Bug("forget what a silent worker may play", stays, "left", "if sure:", "if True:"),
     Bug(
         "take a lease on its way for one that was let go of",
-        Isolation,
+        stays,
         "surely",
         "stay is None or settled == 0",
         "True",
     ),
     Bug(
         "take all kernels for free after a restart",
-        Isolation,
+        stays,
         "load",
         "for hidden in (True, False):",
         "for hidden in ():",
     ),
-    Bug("keep a closed run's permit", finalisation, "close", "core.isolation.end(", "(lambda *_: None)("),
+    Bug("keep a closed run's permit", finalisation, "close", "permits.end(", "(lambda *_: None)("),
     Bug(
         "never turn a kernel over to hidden episodes",
         precedence,
         "_hidden",
-        "kept_s >= core.settings.hidden_wait_s",
+        "kept_s >= state.settings.hidden_wait_s",
         "False",
     ),
     Bug(
@@ -256,10 +264,10 @@ BUGS = (
     ),
     Bug(
         "hold the submits of an agent that hidden episodes wait for",
-        Isolation,
-        "_reversed",
-        "and not self._permits(kernel, family)",
+        bars,
+        "reversed_there",
+        "and not permits_there(state, kernel, family)",
         "",
     ),
-    Bug("draw episodes anew at a restart", audit, "sample", "run.row.audit_share", "0.5"),
+    Bug("draw episodes anew at a restart", audits, "sample", "run.row.audit_share", "0.5"),
 )

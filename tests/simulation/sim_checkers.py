@@ -16,8 +16,9 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import Log
-from evopolicy_coordinator.core.jobs import EARLY_VALIDATION, TRAIN
+from evopolicy_coordinator.core.leasing import fleet
 from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.model import EARLY_VALIDATION, TRAIN
 from evopolicy_coordinator.core.records import (
     AuditRow,
     OutcomeRow,
@@ -250,7 +251,7 @@ class Checkers:
         want(job.env in able.envs, "a worker gets what it can play", worker, job.env)
         run = group.split("/")[0]
         pin = disk.states[run].fingerprint_class
-        mine = None if core is None else core.fleet.workers[worker].profile.fingerprint_class
+        mine = None if core is None else core.state.workers[worker].profile.fingerprint_class
         want(
             mine in (None, pin),
             "a run's episodes are played by its fingerprint class",
@@ -353,9 +354,11 @@ class Checkers:
             want(
                 False, "it goes on", f"nothing was committed for {quiet_s:.0f} s", status.runs, status.stalls
             )
-        for flow in core.unpinned.values():
+        for flow in core.state.unpinned.values():
             want(
-                core.fleet.offer(flow) is None, "a run is unpinned only while nobody could serve it", flow.id
+                fleet.offer(core.state, flow) is None,
+                "a run is unpinned only while nobody could serve it",
+                flow.id,
             )
         if self._steps % VALIDATE_EVERY == 0:
             core.validate()
@@ -365,18 +368,18 @@ class Checkers:
     def _preempted(self, core: Core) -> None:
         """No early validation goes on for long while train jobs wait in its lane."""
         now = self._simulation.world.now
-        for lane in core.queue.lanes.values():
+        for lane in core.state.lanes.values():
             name = str(lane.key)
             leases = [lease for profile in lane.profiles for lease in profile.hidden[EARLY_VALIDATION]]
             if lane.n_ready[TRAIN] and leases:
-                since = max(self._early_since.setdefault(name, now), core.stalled_at)
+                since = max(self._early_since.setdefault(name, now), core.state.stalled_at)
                 want(now - since < PREEMPT_S, "a waiting train job stops hidden ones", name, leases[0].id)
             else:
                 self._early_since.pop(name, None)
 
     def _drained(self, core: Core) -> None:
-        for name in core.fleet.out_of_service:
-            worker = core.fleet.workers.get(name)
+        for name in core.state.out_of_service:
+            worker = core.state.workers.get(name)
             if worker is not None:
                 late = [
                     lease.id
@@ -407,7 +410,7 @@ class Checkers:
         want(core is not None, "the coordinator is there in the end")
         assert core is not None
         core.validate()
-        left = (len(core.groups), len(core.jobs), len(core.polls), len(core.runs))
+        left = (len(core.state.groups), len(core.state.jobs), len(core.state.polls), len(core.state.runs))
         want(left == (0, 0, 0, 0), "nothing is left in memory", left)
         if self._simulation.harmless:
             want(self.unreasoned == 0, "nothing is retried without a fault", self.unreasoned)

@@ -83,7 +83,9 @@ class Truth:
     def _look(self) -> None:
         finished = self._simulation.checkers.finished_runs
         core = self._simulation.coordinator.core
-        hidden = {group.run for group in core.groups.values() if group.hidden} if core is not None else set()
+        hidden = (
+            {group.run for group in core.state.groups.values() if group.hidden} if core is not None else set()
+        )
         for plan in self._simulation.plans:
             if plan.name not in self.kept_since:
                 continue

@@ -3,177 +3,173 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
 
-from .isolation import all_related, related
-from .jobs import N_PRIORITIES, TRAIN
+from .isolation.kernels import all_related, related
+from .model import N_PRIORITIES, TRAIN
 from .records import train_group
-from .story import InvariantError
-
-if TYPE_CHECKING:
-    from .machine import Core
+from .state import State
+from .structures.story import InvariantError
 
 
-def check(core: Core) -> None:
+def check(state: State) -> None:
     """Raise InvariantError, with the story of what is concerned, at the first thing that contradicts itself."""
-    _jobs(core)
-    _queue(core)
-    _workers(core)
-    _audits(core)
-    _isolation(core)
-    for run in core.runs.values():
+    _jobs(state)
+    _queue(state)
+    _workers(state)
+    _audits(state)
+    _isolation(state)
+    for run in state.runs.values():
         run.ledger.validate()
         want(
-            core,
+            state,
             run.id,
             (run.open is not None) == (run.ledger.reserved > 0),
             "a reservation is an open submit's",
         )
         if run.open is not None:
-            want(core, run.id, train_group(run.id, run.open) in core.groups, "an open submit has its group")
+            want(state, run.id, train_group(run.id, run.open) in state.groups, "an open submit has its group")
         settled = sum(
             len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
         )
-        want(core, run.id, settled == run.ledger.settled, "settled is what ended submits took")
+        want(state, run.id, settled == run.ledger.settled, "settled is what ended submits took")
 
 
-def _isolation(core: Core) -> None:
+def _isolation(state: State) -> None:
     """Hidden jobs, agents and train jobs of related runs are on different kernels; what is over is forgotten."""
-    isolation = core.isolation
-    for kernel in isolation.kernels.values() if isolation.on else ():
+    for kernel in state.kernels.values() if state.isolates else ():
         for stay in all_related(kernel.hidden, None):
             if stay.lease is None or not stay.lease.live:
                 continue
-            others = (kernel, isolation.everywhere)
+            others = (kernel, state.everywhere)
             beside = [each for there in others for each in all_related(there.train, stay.family)]
             # What a worker may have played besides, before it was heard, it has told when its lease was adopted.
             train = any(each.lease is not None or each.worker != stay.worker for each in beside)
             apart = not train and not any(related(there.permits, stay.family) for there in others)
-            want(core, stay.id, apart, "a hidden job is apart from related agents and train jobs")
-            want(core, stay.id, kernel is not isolation.everywhere, "a hidden job's kernel is known")
-    for worker in core.fleet.workers.values():
+            want(state, stay.id, apart, "a hidden job is apart from related agents and train jobs")
+            want(state, stay.id, kernel is not state.everywhere, "a hidden job's kernel is known")
+    for worker in state.workers.values():
         for lease in worker.leases.values():
             group = lease.job.group
             wanted = group.hidden or group.kind == "train"
-            want(core, lease.id, (lease.stay is not None) == wanted, "what a worker holds is on its kernel")
-    flows = {group.flow for group in core.groups.values()}
-    flows |= {run.flow for run in core.runs.values()} | {each.flow for each in core.evaluations.values()}
+            want(state, lease.id, (lease.stay is not None) == wanted, "what a worker holds is on its kernel")
+    flows = {group.flow for group in state.groups.values()}
+    flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
     users = Counter(flow.family for flow in flows if flow.family is not None)
-    for kernel in isolation.kernels.values():
+    for kernel in state.kernels.values():
         for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals):
             users.update({family: len(there) for family, there in index.items() if family is not None})
-    for family in isolation.families.known():
-        want(core, "", family.users == users[family], "a family is known as long as anything is of it")
-    for group in core.held:
-        want(core, group.id, group.held_since is not None and not group.closed, "an open submit is held")
+    for family in state.families.known():
+        want(state, "", family.users == users[family], "a family is known as long as anything is of it")
+    for group in state.held:
+        want(state, group.id, group.held_since is not None and not group.closed, "an open submit is held")
 
 
-def _audits(core: Core) -> None:
+def _audits(state: State) -> None:
     """What is open of a run's audits is with the shell, or waits for a worker."""
-    for run in core.runs.values():
+    for run in state.runs.values():
         for row in run.audits.values():
             n = len(row.replayed_by)
             waits = row.state == "open" and row.actions is not None and n == row.compared
-            playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in core.groups]
+            playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in state.groups]
             want(
-                core,
+                state,
                 row.audit,
                 playing == ([n + 1] if waits else []),
                 f"an audit is played when it is due: {playing}",
             )
-            want(core, row.audit, row.player not in row.replayed_by, "nobody audits himself")
+            want(state, row.audit, row.player not in row.replayed_by, "nobody audits himself")
 
 
-def want(core: Core, key: str, holds: bool, what: str) -> None:
+def want(state: State, key: str, holds: bool, what: str) -> None:
     """InvariantError with the story of `key` when something does not hold."""
     if not holds:
         lines = "\n".join(
-            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in core.story(key)
+            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in state.story.of(key)
         )
         raise InvariantError(f"{key}: violated: {what}\n{lines}")
 
 
-def _jobs(core: Core) -> None:
+def _jobs(state: State) -> None:
     live = 0
-    ends = not core.adopting or ("adopt", "") in core.timers
-    want(core, "", ends, "what waits to be adopted does not wait for ever")
-    for group in core.groups.values():
+    ends = not state.adopting or ("adopt", "") in state.timers
+    want(state, "", ends, "what waits to be adopted does not wait for ever")
+    for group in state.groups.values():
         left = sum(job.n for job in group.jobs.values())
-        want(core, group.id, left + group.done == group.n, "each episode is open or done")
+        want(state, group.id, left + group.done == group.n, "each episode is open or done")
         leased = sum(job.lease is not None for job in group.jobs.values())
-        want(core, group.id, leased == group.n_leased, "leased jobs are counted")
+        want(state, group.id, leased == group.n_leased, "leased jobs are counted")
         live += leased
         for job in group.jobs.values():
             key = job.job_id
-            want(core, key, core.jobs.get(key) is job, "an open job is known by its id")
-            waits = ("job", key) in core.timers
-            places = [job.queued, job.lease is not None, waits, job in core.adopting]
+            want(state, key, state.jobs.get(key) is job, "an open job is known by its id")
+            waits = ("job", key) in state.timers
+            places = [job.queued, job.lease is not None, waits, job in state.adopting]
             want(
-                core,
+                state,
                 key,
                 sum(places) == 1,
                 f"it is in one place (queued, leased, backing off, adopting): {places}",
             )
             if job.reserved is not None:
-                emptied = core.fleet.workers.get(job.reserved)
+                emptied = state.workers.get(job.reserved)
                 want(
-                    core, key, emptied is not None and emptied.reserved is job, "who is emptied for it knows"
+                    state, key, emptied is not None and emptied.reserved is job, "who is emptied for it knows"
                 )
             lease = job.lease
             if lease is not None:
-                worker = core.fleet.workers.get(lease.worker)
+                worker = state.workers.get(lease.worker)
                 held = worker is not None and worker.leases.get(lease.id) is lease
-                want(core, key, held and lease.live, "its lease is its worker's, and live")
-                want(core, key, lease.attempt in job.held_attempts, "its attempt is noted")
+                want(state, key, held and lease.live, "its lease is its worker's, and live")
+                want(state, key, lease.attempt in job.held_attempts, "its attempt is noted")
     want(
-        core,
+        state,
         "",
-        len(core.jobs) == sum(len(group.jobs) for group in core.groups.values()),
+        len(state.jobs) == sum(len(group.jobs) for group in state.groups.values()),
         "no job is left over",
     )
-    want(core, "", live == core.book.n_live, "live leases are counted")
+    want(state, "", live == state.n_live, "live leases are counted")
 
 
-def _queue(core: Core) -> None:
-    flows = {group.flow for group in core.groups.values()}
-    for job in core.queue.suspects:
-        want(core, job.job_id, job.queued and job.alone, "a suspect waits")
+def _queue(state: State) -> None:
+    flows = {group.flow for group in state.groups.values()}
+    for job in state.suspects:
+        want(state, job.job_id, job.queued and job.alone, "a suspect waits")
     for flow in flows:
-        leased = sum(group.n_leased for group in core.groups.values() if group.flow is flow)
-        want(core, flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
-        unpinned = core.unpinned.get(flow.id) is flow
-        want(core, flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
+        leased = sum(group.n_leased for group in state.groups.values() if group.flow is flow)
+        want(state, flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
+        unpinned = state.unpinned.get(flow.id) is flow
+        want(state, flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
         for priority in range(N_PRIORITIES):
             valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
-            want(core, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
+            want(state, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
             stray = [job for job in valid if not job.queued or job.priority != priority or job.alone]
-            want(core, flow.id, not stray, "only queued jobs of that priority wait there")
+            want(state, flow.id, not stray, "only queued jobs of that priority wait there")
             if flow.lane is not None and flow.n_ready[priority]:
-                want(core, flow.id, flow.in_heap[priority], "a flow with ready jobs gets its turn")
+                want(state, flow.id, flow.in_heap[priority], "a flow with ready jobs gets its step")
     stopping = Counter(
         lease.stopped_for.key
-        for worker in core.fleet.workers.values()
+        for worker in state.workers.values()
         for lease in worker.leases.values()
         if lease.stopped_for is not None
     )
-    for lane in core.queue.lanes.values():
-        want(core, str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
+    for lane in state.lanes.values():
+        want(state, str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
         hidden = any(any(profile.hidden) for profile in lane.profiles)
-        looked_at = ("lane", lane.key) in core.timers
+        looked_at = ("lane", lane.key) in state.timers
         want(
-            core,
+            state,
             str(lane.key),
             looked_at or not (lane.n_ready[TRAIN] and hidden),
             "train jobs that wait beside hidden ones are looked at again",
         )
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
-            want(core, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
-        waiting = [job for job in core.jobs.values() if job.queued and job.group.flow.lane is lane]
+            want(state, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
+        waiting = [job for job in state.jobs.values() if job.queued and job.group.flow.lane is lane]
         for priority in range(N_PRIORITIES):
             families = Counter(job.group.flow.family for job in waiting if job.priority == priority)
             want(
-                core,
+                state,
                 str(lane.key),
                 dict(families) == lane.waiting[priority],
                 "families that wait are counted",
@@ -181,30 +177,30 @@ def _queue(core: Core) -> None:
         backlog = Counter(
             job.group.flow.family for job in waiting if job.group.hidden and job.group.flow.closed
         )
-        want(core, str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
+        want(state, str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
         for profile in lane.profiles:
             want(
-                core,
+                state,
                 str(lane.key),
                 (lane in profile.busy) == any(lane.n_ready),
                 "profiles know where work waits",
             )
 
 
-def _workers(core: Core) -> None:
-    for profile in core.queue.profiles.values():
-        workers = [core.fleet.workers[name] for name in profile.workers]
+def _workers(state: State) -> None:
+    for profile in state.profiles.values():
+        workers = [state.workers[name] for name in profile.workers]
         want(
-            core,
+            state,
             profile.fingerprint_class,
             sum(w.slots for w in workers) == profile.slots,
             "slots are counted",
         )
         for name in profile.parked:
-            want(core, name, core.fleet.workers[name].poll is not None, "a parked worker has a poll")
+            want(state, name, state.workers[name].poll is not None, "a parked worker has a poll")
         for names in profile.warm.values():
             want(
-                core,
+                state,
                 profile.fingerprint_class,
                 names.keys() <= profile.parked.keys(),
                 "warm workers are parked",
@@ -212,28 +208,26 @@ def _workers(core: Core) -> None:
         for priority, hidden in enumerate(profile.hidden):
             for lease in hidden:
                 fits = lease.live and lease.job.priority == priority != TRAIN
-                want(core, lease.id, fits, "what may be preempted is live and hidden")
-    for worker in core.fleet.workers.values():
-        want(core, worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
-        timed = ("worker", worker.name) in core.timers or worker.state == "lost"
-        want(core, worker.name, timed, "a worker that is there is looked at")
+                want(state, lease.id, fits, "what may be preempted is live and hidden")
+    for worker in state.workers.values():
+        want(state, worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
+        timed = ("worker", worker.name) in state.timers or worker.state == "lost"
+        want(state, worker.name, timed, "a worker that is there is looked at")
         live = [lease.job.priority for lease in worker.leases.values() if lease.live]
         held = [live.count(priority) for priority in range(N_PRIORITIES)]
         want(
-            core,
+            state,
             worker.name,
             (len(live), held) == (worker.n_live, worker.held),
             "its live leases are counted",
         )
-        want(
-            core, worker.name, core.fleet.sessions.get(worker.session) == worker.name, "its session is known"
-        )
+        want(state, worker.name, state.sessions.get(worker.session) == worker.name, "its session is known")
         if worker.reserved is not None:
             want(
-                core,
+                state,
                 worker.name,
                 worker.reserved.reserved == worker.name,
                 "it is emptied for a suspect that knows",
             )
         if worker.alone is not None:
-            want(core, worker.name, worker.alone.id in worker.leases, "what it plays alone is leased to it")
+            want(state, worker.name, worker.alone.id in worker.leases, "what it plays alone is leased to it")

@@ -8,78 +8,75 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
-from . import audit, evaluations, finalisation, permits, runs
-from .evaluations import Ended
-from .jobs import JobGroup
+from .agents import permits, requests
+from .isolation import stays
+from .leasing import fleet, pins
+from .model import Ended, JobGroup, Run
 from .records import AuditRow, RunStateRow, Snapshot, SubmitRow, validation_group
-from .runs import Run
-from .turn import Turn
-
-if TYPE_CHECKING:
-    from .machine import Core
+from .runs import audits, evaluations, finalisation, runs, submits
+from .state import Loading, State
+from .step import EpisodesDone, Step
 
 
-def load(core: Core, snapshot: Snapshot, turn: Turn) -> None:
-    """Fill an empty core."""
-    core.loading = True
+def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, Step], None]) -> None:
+    """Fill an empty state; `drain` lets those above hear what a step told of."""
+    loading = state.loading = Loading()
     played: dict[str, dict[str, int]] = {}
     for head in snapshot.outcomes:
-        core.heads.setdefault(head.group, []).append(head)
+        loading.heads.setdefault(head.group, []).append(head)
         if "/audit-" not in head.group:
             of_run = played.setdefault(head.group.partition("/")[0], {})
             of_run[head.worker] = of_run.get(head.worker, 0) + 1
     for worker in snapshot.workers:
-        core.fleet.set_state(worker.worker, worker.state, worker.reason, worker.machine)
-    states = {state.run: state for state in snapshot.states}
-    core.isolation.load(
-        snapshot.permits, snapshot.kernels, {row.run: row for row in snapshot.runs}, states, turn
-    )
-    submits: dict[str, list[SubmitRow]] = {}
+        fleet.set_state(state, worker.worker, worker.state, worker.reason, worker.machine)
+    stored = {row.run: row for row in snapshot.states}
+    permits.load(state, snapshot.permits, {row.run: row for row in snapshot.runs}, stored, step)
+    stays.load(state, snapshot.kernels, step)
+    submits_of: dict[str, list[SubmitRow]] = {}
     for submit in snapshot.submits:
-        submits.setdefault(submit.run, []).append(submit)
-    audits: dict[str, list[AuditRow]] = {}
+        submits_of.setdefault(submit.run, []).append(submit)
+    audits_of: dict[str, list[AuditRow]] = {}
     for each_audit in snapshot.audits:
-        audits.setdefault(each_audit.run, []).append(each_audit)
+        audits_of.setdefault(each_audit.run, []).append(each_audit)
     for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
-        state = states.get(row.run, RunStateRow(run=row.run))
-        if state.phase == "finished":
-            core.run_keys[row.key] = row.run
-            core.capabilities[row.run] = row.capability
-            core.finished[row.run] = runs.last_state(state)
+        last = stored.get(row.run, RunStateRow(run=row.run))
+        if last.phase == "finished":
+            state.run_keys[row.key] = row.run
+            state.capabilities[row.run] = row.capability
+            state.finished[row.run] = runs.last_state(last)
         else:
-            run = runs.enter(core, row, state)
+            run = runs.enter(state, row, last)
             run.played = played.get(row.run, {})
-            run.audits.update((each.audit, each) for each in audits.get(row.run, ()))
-            permits.resume(core, run, turn)
-            _run(core, run, submits.get(row.run, []), turn)
+            run.audits.update((each.audit, each) for each in audits_of.get(row.run, ()))
+            requests.resume(state, run, step)
+            _run(state, run, submits_of.get(row.run, []), loading, step)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
         if each.finished:
-            core.evaluation_keys[each.key] = each.evaluation
-            core.ended_evaluations[each.evaluation] = Ended(len(each.cases))
+            state.evaluation_keys[each.key] = each.evaluation
+            state.ended_evaluations[each.evaluation] = Ended(len(each.cases))
             continue
-        evaluation = evaluations.enter(core, each)
+        evaluation = evaluations.enter(state, each)
         if each.fingerprint_class is not None:
-            core.place(evaluation.flow, each.fingerprint_class, turn)
-        evaluations.play(core, evaluation, turn)
-    while core.reloaded:
-        group = core.reloaded.pop(0)
+            pins.place(state, evaluation.flow, each.fingerprint_class, step)
+        evaluations.play(state, evaluation, step)
+    while loading.reloaded:
+        group = loading.reloaded.pop(0)
         if not group.closed:
-            _conclude(core, group, turn)
-    core.loading = False
-    core.heads.clear()
-    if core.adopting:
-        core.timers.arm(("adopt", ""), turn.now + core.settings.adoption_s)
-    turn.log("info", "core_loaded", incarnation=core.incarnation, runs=len(core.runs), jobs=len(core.jobs))
+            _conclude(state, group, step)
+            drain(state, step)
+    state.loading = None
+    if state.adopting:
+        state.timers.arm(("adopt", ""), step.now + state.settings.adoption_s)
+    step.log("info", "core_loaded", incarnation=state.incarnation, runs=len(state.runs), jobs=len(state.jobs))
 
 
-def _run(core: Core, run: Run, submits: list[SubmitRow], turn: Turn) -> None:
-    state = run.state
-    if state.fingerprint_class is not None:
-        core.place(run.flow, state.fingerprint_class, turn)
-        run.flow.description = state.description
-    for row in sorted(submits, key=lambda row: row.submit_index):
+def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: Step) -> None:
+    if run.state.fingerprint_class is not None:
+        pins.place(state, run.flow, run.state.fingerprint_class, step)
+        run.flow.description = run.state.description
+    for row in sorted(rows, key=lambda row: row.submit_index):
         run.submits.append(row)
         run.keys[row.key] = row.submit_index
         run.ledger.reserve(row.submit_index, len(row.env_instances))
@@ -90,15 +87,15 @@ def _run(core: Core, run: Run, submits: list[SubmitRow], turn: Turn) -> None:
             _spent(run, row)
         else:
             run.open = row.submit_index
-            runs.play(core, run, row, turn)
+            submits.play(state, run, row, step)
         if row.status == "ok" and row.val_mean is not None:
-            heads = core.heads.pop(validation_group(run.id, row.submit_index), [])
+            heads = loading.heads.pop(validation_group(run.id, row.submit_index), [])
             failed = sum(head.failure is not None for head in heads)
             run.hidden_failures[validation_group(run.id, row.submit_index)] = failed
         elif row.status == "ok" and row.ineligible is None:
-            finalisation.validate_early(core, run, row, turn)
-    audit.resume(core, run, turn)
-    finalisation.advance(core, run, turn)
+            finalisation.validate(state, run, row, step)
+    audits.resume(state, run, step)
+    finalisation.advance(state, run, step)
 
 
 def _spent(run: Run, row: SubmitRow) -> None:
@@ -109,6 +106,6 @@ def _spent(run: Run, row: SubmitRow) -> None:
         run.rollout_s += max(0.0, row.completed_at - started_at)
 
 
-def _conclude(core: Core, group: JobGroup, turn: Turn) -> None:
+def _conclude(state: State, group: JobGroup, step: Step) -> None:
     if group.done:
-        core.concluded(group, (), turn)
+        step.tell(EpisodesDone(group, None, ()))

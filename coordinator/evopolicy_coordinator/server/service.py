@@ -48,9 +48,9 @@ from evopolicy_coordinator.core.events import (
     LivenessLost,
 )
 from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.model import Worker
 from evopolicy_coordinator.core.records import latest_time
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.core.workers import Worker
 from evopolicy_coordinator.server.answers import Answers, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.intake import Intake, Parsed
@@ -217,7 +217,7 @@ class Service:
             self._answers.recorded(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
             offering = [
-                each for each in core.fleet.workers.values() if message.env in each.profile.descriptions
+                each for each in core.state.workers.values() if message.env in each.profile.descriptions
             ]
             fingerprints = tuple(
                 {repr(each.profile.fingerprint): each.profile.fingerprint for each in offering}.values()
@@ -320,7 +320,7 @@ class Service:
             _check_session(core, parsed.asker, message.token)
             most = codec.MAX_BLOB_BYTES
         elif parsed.room == "gw":
-            run = core.runs.get(parsed.asker)
+            run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 raise RefusedError(*core.over(parsed.asker))
         run_id = parsed.asker if parsed.room == "gw" else None
@@ -561,7 +561,7 @@ def _is_due(core: Core, now: float) -> bool:
 
 
 def _check_session(core: Core, name: str, session: str) -> Worker:
-    worker = core.fleet.workers.get(name)
+    worker = core.state.workers.get(name)
     if worker is None or not hmac.compare_digest(worker.session.encode(), session.encode()):
         raise RefusedError(
             Refusal.UNKNOWN_WORKER, f"worker {name[:64]!r} has no such session; register again"

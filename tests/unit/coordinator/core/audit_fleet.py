@@ -78,7 +78,7 @@ class Fleet:
         """Each of the workers plays what it gets at once; gives the number of jobs."""
         n = 0
         for name in names or tuple(self.sessions):
-            if name in self.rig.core.fleet.quarantined:
+            if name in self.rig.core.state.quarantined:
                 continue
             for lease in self.rig.poll(self.sessions[name]) or ():
                 self.hand_in(name, lease)

@@ -205,7 +205,7 @@ class Rig:
                 max_steps=max_steps,
             )
         )
-        if agent is not None and run in self.core.runs:
+        if agent is not None and run in self.core.state.runs:
             self.permit(run, agent)
         return reply
 

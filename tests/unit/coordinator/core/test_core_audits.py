@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import audit
-from evopolicy_coordinator.core.leases import lease_id
+from evopolicy_coordinator.core.leasing.leases import lease_id
+from evopolicy_coordinator.core.runs import audits
 
 # ---- who plays what again ----
 
@@ -48,7 +48,7 @@ def test_a_lone_worker_is_not_waited_for() -> None:
     fleet.rig.pass_time(20.0)
     fleet.work_off()
     found = told(fleet.rig.finished())
-    assert found.not_audited == {audit.ONE_WORKER: found.sampled}
+    assert found.not_audited == {audits.ONE_WORKER: found.sampled}
     assert not found.in_question
 
 
@@ -70,9 +70,9 @@ def test_a_run_waits_for_a_busy_second_worker_up_to_its_bound() -> None:
     waits = rig.tell(asked(operator.WaitRun, request="w", run="r1", wait_s=0.0))
     assert "audits" in waits.waits_for
     beat_for(WAIT_S - 10.0)
-    assert "r1" in rig.core.runs
+    assert "r1" in rig.core.state.runs
     beat_for(20.0)
-    assert told(rig.finished()).not_audited == {audit.TOO_LATE: 2 + 2 + 2 + 2}
+    assert told(rig.finished()).not_audited == {audits.TOO_LATE: 2 + 2 + 2 + 2}
 
 
 def test_a_lone_worker_after_a_restart_is_given_time_to_find_company() -> None:
@@ -83,7 +83,7 @@ def test_a_lone_worker_after_a_restart_is_given_time_to_find_company() -> None:
     fleet.work_off()
     fleet.rig.load()
     fleet.join("w1")
-    assert "r1" in fleet.rig.core.runs
+    assert "r1" in fleet.rig.core.state.runs
     fleet.join("w2")
     fleet.rig.pass_time(5.0)
     fleet.work_off()
@@ -104,7 +104,7 @@ def test_workers_that_may_honestly_come_to_other_bits_do_not_audit(other: str) -
     fleet.rig.close()
     fleet.work_off()
     fleet.rig.pass_time(30.0)
-    assert list(told(fleet.rig.finished()).not_audited) == [audit.OTHERS_DIFFER]
+    assert list(told(fleet.rig.finished()).not_audited) == [audits.OTHERS_DIFFER]
 
 
 def test_an_environment_that_does_not_repeat_itself_is_not_audited() -> None:
@@ -112,7 +112,7 @@ def test_an_environment_that_does_not_repeat_itself_is_not_audited() -> None:
     fleet.join("w1", deterministic=False)
     fleet.join("w2", deterministic=False)
     found = told(fleet.whole_run(0, 1))
-    assert found.not_audited == {audit.NOT_REPEATABLE: found.sampled}
+    assert found.not_audited == {audits.NOT_REPEATABLE: found.sampled}
     assert fleet.audits == []
 
 
@@ -121,8 +121,8 @@ def test_a_cancelled_run_plays_no_more_audits() -> None:
     fleet.train(0, 1)
     fleet.turn("w1")
     fleet.rig.tell(asked(operator.CancelRun, request="c", run="r1"))
-    assert told(fleet.rig.finished()).not_audited == {audit.CANCELLED: 2}
-    assert not fleet.rig.core.groups
+    assert told(fleet.rig.finished()).not_audited == {audits.CANCELLED: 2}
+    assert not fleet.rig.core.state.groups
 
 
 # ---- never in the way ----
@@ -162,7 +162,7 @@ def test_a_restart_at_any_point_changes_nothing_of_the_audits() -> None:
         fleet.rig.load()
         fleet.sessions.clear()
         for name in ("w1", "w2", "w3"):
-            if name not in fleet.rig.core.fleet.quarantined:
+            if name not in fleet.rig.core.state.quarantined:
                 fleet.join(name)
         fleet.rig.pass_time(5.0)
         fleet.work_off()
@@ -178,10 +178,10 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
     fleet = Fleet(w1=0.0)
     fleet.train(0)
     fleet.turn("w1")
-    (job,) = [job for job in fleet.rig.core.jobs.values() if job.group.kind == "audit"]
+    (job,) = [job for job in fleet.rig.core.state.jobs.values() if job.group.kind == "audit"]
     fleet.rig.load()
     fleet.join("w1")
-    name = lease_id(fleet.rig.core.secret_of(job.group), job.job_id, 1, "w1")
+    name = lease_id(job.group.flow.secret, job.job_id, 1, "w1")
     claimed = wire.HeldLease(lease_id=name, job_id=job.job_id, attempt=1, running=True)
     reply = fleet.rig.tell(
         asked(
@@ -198,7 +198,7 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
         lease_id=claimed.lease_id, job_id=job.job_id, attempt=1, kind="done", episodes=(outcome_of(0),)
     )
     fleet.rig.hand_in(fleet.sessions["w1"], forged)
-    assert job.job_id in fleet.rig.core.jobs, "it is still to be played"
+    assert job.job_id in fleet.rig.core.state.jobs, "it is still to be played"
 
 
 # ---- the draw ----
@@ -207,15 +207,15 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
 @given(st.integers(0, 10**6), st.floats(0, 1), st.floats(0, 1))
 def test_what_is_drawn_by_a_share_is_drawn_by_a_larger_one(index: int, one: float, other: float) -> None:
     small, large = sorted((one, other))
-    if audit.drawn(b"s" * 32, "r/s0/train", index, small):
-        assert audit.drawn(b"s" * 32, "r/s0/train", index, large)
-    assert audit.drawn(b"s" * 32, "r/s0/train", index, 1.0)
-    assert not audit.drawn(b"s" * 32, "r/s0/train", index, 0.0)
+    if audits.drawn(b"s" * 32, "r/s0/train", index, small):
+        assert audits.drawn(b"s" * 32, "r/s0/train", index, large)
+    assert audits.drawn(b"s" * 32, "r/s0/train", index, 1.0)
+    assert not audits.drawn(b"s" * 32, "r/s0/train", index, 0.0)
 
 
 def test_a_share_is_about_that_share_and_another_in_another_run() -> None:
     def draw(secret: bytes) -> list[bool]:
-        return [audit.drawn(secret, "r/s0/train", index, 0.05) for index in range(20_000)]
+        return [audits.drawn(secret, "r/s0/train", index, 0.05) for index in range(20_000)]
 
     one, other = (draw(hashlib.sha256(text).digest()) for text in (b"one", b"other"))
     assert 800 < sum(one) < 1200
@@ -226,6 +226,6 @@ def test_the_bundle_is_not_needed_for_an_audit() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
     fleet.train(0)
     fleet.turn("w1")
-    (job,) = [job for job in fleet.rig.core.jobs.values() if job.group.kind == "audit"]
+    (job,) = [job for job in fleet.rig.core.state.jobs.values() if job.group.kind == "audit"]
     assert job.names_blob("0.0")
     assert not job.names_blob(BUNDLE)

@@ -17,8 +17,8 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_coordinator.core.effects import ReadEvaluation
+from evopolicy_coordinator.core.leasing.seeds import policy_seed
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
-from evopolicy_coordinator.core.seeds import policy_seed
 
 
 def value_of(job: Job) -> float:
@@ -298,7 +298,7 @@ def test_an_evaluation_plays_cases_outside_any_run() -> None:
     assert rig.row(EvaluationRow, "ev-e").finished
     rig.load()
     assert page(rig, 0).finished
-    assert not rig.core.groups
+    assert not rig.core.state.groups
 
 
 def test_an_unknown_evaluation_is_refused() -> None:
@@ -349,7 +349,7 @@ def test_a_run_that_must_spend_its_budget_and_has_not_is_an_error_without_hidden
     assert finished.error is not None
     assert "1 of its 4 episodes left" in finished.error
     assert finished.budget_used == 3
-    assert not rig.core.groups
+    assert not rig.core.state.groups
 
 
 @pytest.mark.parametrize("left", [0, 2])

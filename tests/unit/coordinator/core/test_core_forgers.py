@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import audit, events
+from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.records import OutcomeRow, WorkerRow
+from evopolicy_coordinator.core.runs import audits
 
 
 def test_a_forger_among_three_is_named_and_gets_no_more_leases() -> None:
@@ -23,7 +24,7 @@ def test_a_forger_among_three_is_named_and_gets_no_more_leases() -> None:
     assert list(found.forgers) == ["w2"]
     assert found.in_question
     assert all(finding.forger == "w2" for finding in found.findings)
-    assert "w2" in fleet.rig.core.fleet.quarantined
+    assert "w2" in fleet.rig.core.state.quarantined
     assert fleet.rig.row(WorkerRow, "w2").state == "quarantined"
     answer = fleet.rig.poll(fleet.sessions["w2"])
     assert isinstance(answer, wire.Refused)
@@ -39,7 +40,7 @@ def test_what_a_forger_holds_when_it_is_named_is_played_by_others() -> None:
     held = fleet.rig.poll(fleet.sessions["w2"], 1)
     fleet.hand_in("w2", *held)
     kept = fleet.rig.poll(fleet.sessions["w2"], 1)
-    while "w2" not in fleet.rig.core.fleet.quarantined:
+    while "w2" not in fleet.rig.core.state.quarantined:
         assert fleet.turn("w1", "w3")
     late = fleet.rig.hand_in(fleet.sessions["w2"], fleet.done("w2", kept[0]))
     assert isinstance(late, wire.Refused)
@@ -62,7 +63,7 @@ def test_two_workers_that_disagree_are_both_in_dispute_and_nobody_is_named() -> 
     found = told(fleet.rig.finished())
     assert found.disputed == found.audited > 0
     assert found.forgers == {}
-    assert not fleet.rig.core.fleet.quarantined
+    assert not fleet.rig.core.state.quarantined
     assert {name for finding in found.findings for name in (finding.player, *finding.auditors)} == {
         "w1",
         "w2",
@@ -76,7 +77,7 @@ def test_a_third_worker_that_comes_later_decides() -> None:
     fleet.work_off()
     fleet.join("w3")
     fleet.work_off()
-    assert list(fleet.rig.core.fleet.quarantined) == ["w2"]
+    assert list(fleet.rig.core.state.quarantined) == ["w2"]
 
 
 def test_a_forging_auditor_is_named_and_the_player_confirmed() -> None:
@@ -131,7 +132,7 @@ def test_an_operator_takes_a_quarantined_worker_back() -> None:
         rig.tell(asked(operator.SetWorker, request="a", worker="w2", state="active")), operator.Done
     )
     fleet.join("w2")
-    assert rig.core.fleet.quarantined == {}
+    assert rig.core.state.quarantined == {}
 
 
 def test_a_run_whose_episodes_a_forger_played_is_in_question_though_another_run_caught_it() -> None:
@@ -161,7 +162,7 @@ def test_workers_of_one_machine_have_one_voice() -> None:
     fleet.adds |= {"f1": 5.0, "f2": 5.0}
     found = told(fleet.whole_run())
     assert set(found.forgers) == {"f1", "f2"}
-    assert set(fleet.rig.core.fleet.quarantined) == {"f1", "f2"}
+    assert set(fleet.rig.core.state.quarantined) == {"f1", "f2"}
     assert all({player[0], auditor[0]} != {"f"} for auditor, player in fleet.audits)
     with pytest.raises(RefusedError, match="of the same machine"):
         fleet.join("f3", machine="bad")
@@ -176,7 +177,7 @@ def test_two_workers_of_one_machine_audit_nothing() -> None:
     fleet.join("f1", machine="bad")
     fleet.join("f2", machine="bad")
     found = told(fleet.whole_run(0, 1))
-    assert found.not_audited == {audit.ONE_MACHINE: found.sampled}
+    assert found.not_audited == {audits.ONE_MACHINE: found.sampled}
 
 
 def test_a_machine_cannot_play_under_the_name_of_anothers_worker() -> None:
@@ -206,7 +207,7 @@ def test_no_honest_worker_is_ever_named_and_a_forger_among_three_always_is(
     found = finished.audit
     named = set() if found is None else set(found.forgers)
     assert named <= {"wf"}
-    assert set(fleet.rig.core.fleet.quarantined) <= {"wf"}
+    assert set(fleet.rig.core.state.quarantined) <= {"wf"}
     assert finished.status == "completed"
     assert finished.budget_used == episodes
     if found is not None:

@@ -12,7 +12,8 @@ from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.leases import FORGET_S, lease_id
+from evopolicy_coordinator.core.leasing.expiry import FORGET_S
+from evopolicy_coordinator.core.leasing.leases import lease_id
 from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
 
 GROUP = "r1/s0/train"
@@ -39,7 +40,7 @@ def keep(rig: Rig, seconds: float, *beats: tuple[str, tuple[wire.Lease, ...]]) -
 def test_a_lease_lives_as_long_as_heartbeats_name_it() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     keep(rig, 120.0, (first, (lease,)), (second, ()))
-    assert rig.core.jobs[f"{GROUP}/0"].lease is not None
+    assert rig.core.state.jobs[f"{GROUP}/0"].lease is not None
     assert rig.poll(second) == []
 
 
@@ -49,7 +50,7 @@ def test_a_lease_of_a_silent_worker_goes_to_another_under_the_next_attempt() -> 
     keep(rig, 18.0, (second, ()))
     (again,) = rig.poll(second, wait_s=5.0)
     assert (again.job, again.attempt) == (lease.job, lease.attempt + 1)
-    assert rig.core.jobs[f"{GROUP}/0"].failures == 1
+    assert rig.core.state.jobs[f"{GROUP}/0"].failures == 1
 
 
 def test_a_worker_that_was_frozen_is_told_that_its_lease_is_gone() -> None:
@@ -71,7 +72,7 @@ def test_a_late_limit_verdict_is_not_counted() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     keep(rig, 18.0, (second, ()))
     rig.play(first, lease, failure="act_timeout")
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0
     (again,) = rig.poll(second, wait_s=5.0)
     rig.play(second, again)
     assert rig.row(OutcomeRow, GROUP, 0).outcome.failure is None
@@ -98,7 +99,7 @@ def test_a_limit_verdict_after_a_silence_is_played_again() -> None:
         session,
         result(lease, "done", episodes=(wire.EpisodeOutcome(**{**fields(episode), "failure": used}),)),
     )
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0
     assert len(rig.poll(session, wait_s=1.0)) == 1
 
 
@@ -125,19 +126,19 @@ def test_a_different_result_of_a_done_episode_is_reported_as_nondeterminism() ->
     assert rig.row(SubmitRow, "r1", 0).status is None  # one of the two backs off
     (late,) = [lease for lease in leases if lease.job.job_id == again[0].job.job_id]
     rig.play(first, late, value=2.0)
-    assert rig.core.runs["r1"].state.nondeterministic_results == 0
+    assert rig.core.state.runs["r1"].state.nondeterministic_results == 0
     rig.play(first, late, value=3.0)
-    assert rig.core.runs["r1"].state.nondeterministic_results == 1
+    assert rig.core.state.runs["r1"].state.nondeterministic_results == 1
 
 
 def test_an_attempt_that_another_worker_was_given_is_ignored() -> None:
     rig, (_, second), lease = one_job("w1", "w2")
     rig.play(second, lease)
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0
     forged = result(lease, "done", episodes=(outcome_of(0),))
     invented = wire.JobResult(**{**fields(forged), "attempt": 7, "lease_id": f"{GROUP}/0#7"})
     rig.hand_in(second, invented)
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0
 
 
 def test_a_lease_that_never_arrived_is_given_to_another_soon() -> None:
@@ -153,7 +154,7 @@ def test_after_the_loop_stood_still_nothing_expires_for_one_time_to_live() -> No
     rig.now += 60.0
     rig._carry_out(rig.core.handle_deadline(rig.now))
     rig.pass_time(10.0)
-    assert rig.core.jobs[f"{GROUP}/0"].lease is not None
+    assert rig.core.state.jobs[f"{GROUP}/0"].lease is not None
     assert rig.beat(first, lease).cancelled == ()
 
 
@@ -165,10 +166,10 @@ def test_a_liveliness_hint_is_no_proof() -> None:
     rig.pass_time(2.0)
     rig.beat(first, lease)
     rig.pass_time(6.0)
-    assert rig.core.fleet.workers["w1"].state == "active"
+    assert rig.core.state.workers["w1"].state == "active"
     rig.tell(events.LivenessLost(worker="w1"))
     rig.pass_time(6.0)
-    assert rig.core.fleet.workers["w1"].state == "lost"
+    assert rig.core.state.workers["w1"].state == "lost"
 
 
 def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_not() -> None:
@@ -178,7 +179,7 @@ def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_n
     rig.submit(0)
     rig.play(first, *rig.poll(first, 1))
     rig.work_off(first)
-    rig.core.runs["r1"].flow.episode_s = 0.01
+    rig.core.state.runs["r1"].flow.episode_s = 0.01
     rig.submit(1, 2, 3, key="k1")
     leases = rig.poll(first, 1)
     assert len(leases) == 3  # short episodes come in a batch
@@ -201,7 +202,7 @@ def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_n
     )
     second = rig.register("w2", slots=4)
     keep(rig, 18.0, (second, ()))
-    alone = [job.job_id for job in rig.core.jobs.values() if job.alone]
+    alone = [job.job_id for job in rig.core.state.jobs.values() if job.alone]
     assert alone == [leases[0].job.job_id]
     got = rig.poll(second, 4, wait_s=5.0)
     assert [each.job.job_id for each in got] == alone
@@ -218,7 +219,7 @@ def test_a_busy_worker_is_emptied_for_a_suspect() -> None:
     others = rig.poll(second, 2)
     keep(rig, 18.0, (second, tuple(others)))
     assert rig.poll(second, 2) == []  # the rest of r2 waits: the suspect is next
-    assert rig.core.fleet.workers["w2"].reserved is not None
+    assert rig.core.state.workers["w2"].reserved is not None
     rig.play(second, others[0])
     assert rig.poll(second, 2) == []
     rig.play(second, others[1])
@@ -240,9 +241,9 @@ def test_a_worker_that_is_emptied_for_a_suspect_gets_work_again_when_the_suspect
     rig.beat(second, again)
     keep(rig, 18.0, (third, tuple(others)))
     assert rig.poll(third, 2) == []
-    assert rig.core.fleet.workers["w3"].reserved is not None
+    assert rig.core.state.workers["w3"].reserved is not None
     rig.beat(rig.register("w1"), lease)  # it had only been frozen
-    assert rig.core.fleet.workers["w3"].reserved is None
+    assert rig.core.state.workers["w3"].reserved is None
     rig.play(third, others[0])
     assert len(rig.poll(third, 1)) == 1
 
@@ -255,7 +256,7 @@ def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emp
     hidden = rig.poll(second, 2)
     rig.beat(first, lease)
     keep(rig, 18.0, (second, tuple(hidden)))
-    assert rig.core.fleet.workers["w1"].state == "lost"
+    assert rig.core.state.workers["w1"].state == "lost"
     assert rig.poll(second, 2) == []  # it is emptied for the suspect
     assert set(rig.beat(second, *hidden).cancelled) == {each.lease_id for each in hidden}
     rig.hand_in(second, *(result(each, "returned") for each in hidden))
@@ -268,8 +269,8 @@ def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_
     rig.pass_time(1.0)
     assert rig.poll(first) == []
     assert len(rig.poll(second)) == 1
-    assert rig.core.runs["r1"].state.infrastructure_retries == 1
-    assert rig.core.runs["r1"].ledger.reserved == 1
+    assert rig.core.state.runs["r1"].state.infrastructure_retries == 1
+    assert rig.core.state.runs["r1"].ledger.reserved == 1
 
 
 def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
@@ -282,7 +283,7 @@ def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
         if not got:
             break
         (lease,) = got
-    assert rig.core.fleet.workers["w1"].benched_until > rig.now
+    assert rig.core.state.workers["w1"].benched_until > rig.now
     (run,) = rig.core.status(rig.now).runs
     assert run.waits_for == "workers whose jobs kept failing to be tried again"
     for _ in range(4):
@@ -296,7 +297,7 @@ def test_a_job_given_back_is_no_failure() -> None:
     rig.hand_in(first, result(lease, "returned"))
     (again,) = rig.poll(first)
     assert again.attempt == 2
-    assert rig.core.runs["r1"].state.infrastructure_retries == 0
+    assert rig.core.state.runs["r1"].state.infrastructure_retries == 0
 
 
 def test_leases_are_adopted_after_a_restart_and_played_once() -> None:
@@ -360,7 +361,7 @@ def test_a_result_of_a_lease_that_was_never_granted_accuses_no_run_of_nondetermi
     other = rig.register("w2")
     rig.play(first, lease, value=6.0)
     rig.hand_in(other, done(lease, value=7.0))
-    assert rig.core.runs["r1"].state.nondeterministic_results == 0
+    assert rig.core.state.runs["r1"].state.nondeterministic_results == 0
 
 
 def test_a_result_of_another_job_under_ones_own_lease_gives_the_leased_job_back() -> None:
@@ -383,8 +384,8 @@ def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest()
     for _ in range(3):
         rig.beat(again, lease)
         rig.pass_time(2.0)
-    assert rig.core.jobs[lease.job.job_id].lease is not None
-    assert rig.core.jobs[other.job.job_id].lease is None
+    assert rig.core.state.jobs[lease.job.job_id].lease is not None
+    assert rig.core.state.jobs[other.job.job_id].lease is None
     assert rig.hand_in(first, done(lease)).status == "unknown_worker"
 
 
@@ -431,7 +432,7 @@ def test_a_limit_verdict_of_a_worker_that_was_silent_for_long_is_not_counted() -
     rig.beat(first, lease)
     rig.pass_time(rig.settings.silence_s + 1.0)
     rig.play(first, lease, failure="act_timeout")
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0
 
 
 def test_a_limit_verdict_of_a_job_during_which_the_loop_stood_still_is_not_counted() -> None:
@@ -442,4 +443,4 @@ def test_a_limit_verdict_of_a_job_during_which_the_loop_stood_still_is_not_count
     rig.now += rig.settings.standstill_s + 1.5
     rig.pass_time(0.0)
     rig.play(first, lease, failure="act_timeout")
-    assert rig.core.groups[GROUP].done == 0
+    assert rig.core.state.groups[GROUP].done == 0

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from evopolicy_coordinator.core.ledger import Ledger, refusal
-from evopolicy_coordinator.core.story import InvariantError
+from evopolicy_coordinator.core.structures.ledger import Ledger, refusal
+from evopolicy_coordinator.core.structures.story import InvariantError
 
 GRANTED = 40
 

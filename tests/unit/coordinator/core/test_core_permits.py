@@ -12,6 +12,8 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.operator import ELSEWHERE
 from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.isolation import kernels
 from evopolicy_coordinator.core.records import PermitRow
 
 HERE = "kernel-of-w1"
@@ -115,9 +117,9 @@ def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_l
     assert request not in rig.replies
     rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
     assert rig.replies[request] == gateway.Permit(granted=True)
-    jobs = [rig.core.jobs[lease.job.job_id] for lease in hidden]
+    jobs = [rig.core.state.jobs[lease.job.job_id] for lease in hidden]
     assert [(job.preemptions, job.failures) for job in jobs] == [(0, 0)] * len(jobs)
-    assert rig.core.runs["r0"].state.infrastructure_retries == 0
+    assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
 
 
 def test_a_permit_that_is_not_granted_in_time_says_what_it_waits_for_and_bars_hidden_jobs_until_it_is_asked_again() -> (
@@ -150,7 +152,7 @@ def test_a_request_that_is_never_sent_again_is_forgotten() -> None:
     rig.pass_time(11.0)
     rig.beat(session)
     assert splits(rig.poll(session, 8)) >= {"validation"}
-    assert rig.core.isolation.kernel(HERE).asks == {}
+    assert kernels.kernel(rig.core.state, HERE).asks == {}
 
 
 def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> None:
@@ -160,7 +162,7 @@ def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> N
     rig.poll(session, 8)
     rig.create("r1", agent=None)
     rig.pass_time(20.0)  # the worker is lost, its leases are given up
-    assert rig.core.fleet.workers["w1"].state == "lost"
+    assert rig.core.state.workers["w1"].state == "lost"
     assert not rig.permit("r1", HERE).granted
     assert rig.permit("r1", HERE, wait_s=60.0) is None
     request = rig._requests
@@ -266,7 +268,7 @@ def test_a_cancelled_runs_permit_ends_when_its_gateway_says_so_or_after_a_while(
         rig.beat(session)
     assert "validation" in splits(rig.poll(session, 8))
     rig.load()
-    assert rig.core.isolation.held("r1") == []
+    assert permits.held(rig.core.state, "r1") == []
 
 
 def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
@@ -348,21 +350,21 @@ def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:
     rig.create("r1", agent=None)
     opened = rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1", asks_permit=True))
     assert isinstance(opened, gateway.RunOpened)
-    assert rig.core.isolation.held("r1") == []
+    assert permits.held(rig.core.state, "r1") == []
 
 
 def test_where_a_remote_agent_is_said_to_be_counts_in_place_of_its_gateways_host() -> None:
     rig = Rig()
     rig.register()
     rig.create("r1", agent="gateway", agent_host="remote")
-    assert [row.boot_id for _, row in rig.core.isolation.held("r1")] == ["remote"]
+    assert [row.boot_id for _, row in permits.held(rig.core.state, "r1")] == ["remote"]
 
 
 def test_an_agent_that_the_operator_vouches_for_needs_no_permit_and_the_run_says_so() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     rig.create("r1", agent="", agent_host=ELSEWHERE)
-    assert rig.core.isolation.held("r1") == []
+    assert permits.held(rig.core.state, "r1") == []
     rig.submit(0)
     rig.work_off(session)
     rig.close()
@@ -422,5 +424,5 @@ def test_families_are_forgotten_with_the_last_that_is_of_them() -> None:
     for name in ("r1", "r2"):
         rig.close(name)
     rig.work_off(session)
-    families = rig.core.isolation.families
+    families = rig.core.state.families
     assert (families._known, families._of_case) == ({}, {})

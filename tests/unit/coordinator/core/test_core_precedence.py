@@ -11,6 +11,7 @@ from core_rig import Rig, split_of
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator.core.isolation import kernels
 
 HERE = "kernel-of-w1"
 WAIT_S = 60.0
@@ -81,7 +82,7 @@ def test_before_that_a_new_agent_stops_hidden_cases_as_often_as_it_takes() -> No
     for number in range(1, 8):
         run = f"r{number}"
         rig.create(run, agent=None)
-        held = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if lease.live]
+        held = [lease for lease in rig.core.state.workers["w1"].leases.values() if lease.live]
         assert held
         assert not rig.permit(run, HERE).granted
         for lease in held:
@@ -89,7 +90,7 @@ def test_before_that_a_new_agent_stops_hidden_cases_as_often_as_it_takes() -> No
         assert rig.permit(run, HERE).granted
         rig.close(run)
         rig.poll(session, 8)
-    assert rig.core.runs["r0"].state.infrastructure_retries == 0
+    assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
 
 
 def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
@@ -104,7 +105,7 @@ def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
         keep_alive(rig, session, 4.0, *leases)
         rig.play(session, *leases)
         story += [split_of(lease.job) for lease in leases]
-        if "r0" not in rig.core.runs:
+        if "r0" not in rig.core.state.runs:
             break
     hidden = [place for place, split in enumerate(story) if split in ("validation", "heldout")]
     assert len(hidden) == 5
@@ -119,7 +120,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     closed(rig, session, "r0")
     rig.create("r1", agent="remote")
     rig.play(session, *rig.poll(session, 1))
-    rig.core.queue.lanes[next(iter(rig.core.queue.lanes))].kept_s[rig.core.runs["r0"].family] = WAIT_S
+    rig.core.state.lanes[next(iter(rig.core.state.lanes))].kept_s[rig.core.state.runs["r0"].family] = WAIT_S
     # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
     rig.submit(0, 1, run="r1")
     (train,) = rig.poll(session, 1)
@@ -137,11 +138,11 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     assert state.held_s == state.in_flight.held_s
     page = rig.results(run="r1", cursor=1)
     assert page.held_s == state.held_s
-    while (leases := rig.poll(session, 1)) or rig.core.fleet.workers["w1"].leases:
+    while (leases := rig.poll(session, 1)) or rig.core.state.workers["w1"].leases:
         rig.play(session, *(leases or [hidden]))
         keep_alive(rig, session, 2.0)
-    assert rig.core.runs["r1"].submits[0].status == "ok"
-    held_s = rig.core.runs["r1"].submits[0].held_s
+    assert rig.core.state.runs["r1"].submits[0].status == "ok"
+    held_s = rig.core.state.runs["r1"].submits[0].held_s
     assert held_s >= 7.0
     rig.load()
     rig.register(slots=1)
@@ -154,19 +155,19 @@ def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() 
     rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
     closed(rig, session, "r0")
     rig.play(session, *rig.poll(session, 1))
-    lane = next(iter(rig.core.queue.lanes.values()))
+    lane = next(iter(rig.core.state.lanes.values()))
     rig.submit(0, 1, run="r1")
     (train,) = rig.poll(session, 1)
     while split_of(train.job) != "train":
         rig.play(session, train)
         (train,) = rig.poll(session, 1)
-    lane.kept_s[rig.core.runs["r0"].family] = WAIT_S
+    lane.kept_s[rig.core.state.runs["r0"].family] = WAIT_S
     keep_alive(rig, session, 4.0, train)
     rig.play(session, train)
     (hidden,) = rig.poll(session, 1)
     assert split_of(hidden.job) == "validation"
     keep_alive(rig, session, 30.0, hidden)  # longer than the limit
-    assert rig.core.runs["r1"].submits[0].status is None
+    assert rig.core.state.runs["r1"].submits[0].status is None
     rig.play(session, hidden)
     for _ in range(20):
         leases = rig.poll(session, 1)
@@ -175,7 +176,7 @@ def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() 
         rig.play(session, *leases)
         keep_alive(rig, session, 2.0)
     keep_alive(rig, session, 20.0, *leases)
-    assert rig.core.runs["r1"].submits[0].status == "rollout_timeout"
+    assert rig.core.state.runs["r1"].submits[0].status == "rollout_timeout"
 
 
 def test_early_validation_never_keeps_an_agent_away() -> None:
@@ -187,7 +188,7 @@ def test_early_validation_never_keeps_an_agent_away() -> None:
     keep_alive(rig, session, 3 * WAIT_S)
     rig.create("r1", agent=None)
     assert rig.permit("r1", HERE).granted
-    assert not rig.core.isolation.kernel(HERE).reversals
+    assert not kernels.kernel(rig.core.state, HERE).reversals
 
 
 @pytest.mark.parametrize("why", ["draining", "lost"])
@@ -195,7 +196,7 @@ def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
     rig = Rig()
     session = rig.register(slots=8)
     waiting(rig, session)
-    assert rig.core.isolation.kernel(HERE).reversals
+    assert kernels.kernel(rig.core.state, HERE).reversals
     if why == "draining":
         rig.tell(asked(operator.SetWorker, request=rig.request(), worker="w1", state="draining"))
         keep_alive(rig, session, 4.0)
@@ -217,7 +218,7 @@ def test_of_several_kernels_the_one_with_the_fewest_related_agents_is_turned_ove
         rig.pass_time(2.0)
         for session in sessions:
             rig.beat(session)
-    turned = [name for name, kernel in rig.core.isolation.kernels.items() if kernel.reversals]
+    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reversals]
     assert turned == ["kernel-of-w2"]
 
 
@@ -233,7 +234,7 @@ def test_hidden_cases_of_a_closed_run_go_before_train_jobs_of_others_on_their_ke
 
 def test_the_audits_clock_stands_still_while_their_kernels_are_barred() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
-    fleet.rig.settings = fleet.rig.core.settings = type(fleet.rig.settings)(
+    fleet.rig.settings = fleet.rig.core.state.settings = type(fleet.rig.settings)(
         audit_share=1.0, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=1e9
     )
     rig = fleet.rig
@@ -247,11 +248,11 @@ def test_the_audits_clock_stands_still_while_their_kernels_are_barred() -> None:
         rig.create(f"a{number}", agent=f"kernel-of-{name}")
     fleet.work_off()
     _beat_all(rig, fleet.sessions, 3 * AUDIT_WAIT_S)
-    assert "r0" in rig.core.runs
+    assert "r0" in rig.core.state.runs
     for number in range(2):
         rig.close(f"a{number}")
     _beat_all(rig, fleet.sessions, AUDIT_WAIT_S + 10.0)  # nobody plays them
-    assert "r0" not in rig.core.runs
+    assert "r0" not in rig.core.state.runs
     assert rig.finished("r0").audit is not None
 
 
@@ -271,7 +272,7 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
         for run in list(pending):
             if len(alive) == 4:
                 break
-            if run not in rig.core.runs:
+            if run not in rig.core.state.runs:
                 rig.create(run, agent=None)
             if not rig.permit(run, HERE).granted:
                 break
@@ -279,7 +280,7 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
             alive.append(run)
             left[run] = 3
         for run in list(alive):
-            if rig.core.runs[run].open is not None:
+            if rig.core.state.runs[run].open is not None:
                 continue
             if left[run]:
                 left[run] -= 1
@@ -291,9 +292,9 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
         rig.pass_time(1.0)
         rig.beat(session, *leases)
         rig.play(session, *leases)
-        stopped = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if not lease.live]
+        stopped = [lease for lease in rig.core.state.workers["w1"].leases.values() if not lease.live]
         assert not stopped, "one at a time: nothing is stopped that is not handed in"
-        if not rig.core.runs and not pending:
+        if not rig.core.state.runs and not pending:
             break
     assert [rig.finished(run).status for run in runs] == ["completed"] * 8
     assert {rig.finished(run).hidden_isolation for run in runs} == {"exclusive"}
@@ -304,7 +305,7 @@ def test_a_train_job_and_hidden_ones_of_related_runs_never_share_a_kernel() -> N
     first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
     closed(rig, first, "r0")
     rig.play(first, *[lease for lease in rig.poll(first, 8) if split_of(lease.job) == "random"])
-    hidden = [lease for lease in rig.core.fleet.workers["w1"].leases.values() if lease.live]
+    hidden = [lease for lease in rig.core.state.workers["w1"].leases.values() if lease.live]
     assert hidden
     rig.create("r1", agent="remote")
     rig.submit(0, 1, run="r1")

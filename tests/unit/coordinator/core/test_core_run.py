@@ -46,8 +46,8 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
     assert finished.heldout_returns == (7.0, 7.0, 7.0)
     assert finished.random_heldout_returns == (-1.0, -1.0, -1.0)
     assert (finished.final_score, finished.budget_used) == (7.0, 6)
-    assert not rig.core.groups
-    assert not rig.core.jobs
+    assert not rig.core.state.groups
+    assert not rig.core.state.jobs
 
 
 def test_a_request_of_an_unknown_run_is_refused() -> None:

@@ -11,7 +11,7 @@ from core_rig import BUNDLE, Rig, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import scheduler
+from evopolicy_coordinator.core.workers import scheduler
 
 
 def validating(rig: Rig, session: str, n: int = 1) -> None:
@@ -94,7 +94,7 @@ def test_short_episodes_come_in_batches_and_no_idle_worker_goes_without() -> Non
     rig = Rig()
     first, second = rig.register("w1", slots=1), rig.register("w2", slots=1)
     rig.create(budget=128, most=128)
-    rig.core.runs["r1"].flow.episode_s = 0.005
+    rig.core.state.runs["r1"].flow.episode_s = 0.005
     rig.submit(*range(20))
     assert len(rig.poll(first, 2)) == 10  # half of what waits, for half of the slots
     assert len(rig.poll(second, 2)) > 1
@@ -139,7 +139,7 @@ def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_bac
     assert split_of(train.job) == "train"
     rig.play(session, train)
     assert split_of(rig.poll(session, 1)[0].job) == "validation"
-    assert rig.core.runs["r1"].state.infrastructure_retries == 0
+    assert rig.core.state.runs["r1"].state.infrastructure_retries == 0
 
 
 def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
@@ -159,7 +159,7 @@ def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the
     rig = Rig()
     session = rig.register(slots=2)
     validating(rig, session)
-    rig.core.runs["r1"].flow.episode_s = 0.01
+    rig.core.state.runs["r1"].flow.episode_s = 0.01
     hidden = rig.poll(session, 2)
     assert {split_of(lease.job) for lease in hidden} == {"validation"}
     assert len(hidden) == 8
@@ -229,7 +229,7 @@ def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> No
         if hidden is None:
             break
     assert stopped >= 2
-    assert all(job.preemptions <= 2 for job in rig.core.jobs.values() if job.group.run == "r1")
+    assert all(job.preemptions <= 2 for job in rig.core.state.jobs.values() if job.group.run == "r1")
 
 
 def test_a_worker_gets_only_what_it_can_play() -> None:
@@ -322,7 +322,7 @@ def test_a_second_poll_answers_the_first_with_no_leases() -> None:
     rig.poll(session, wait_s=9.0)
     assert rig.replies[first].leases == ()
     rig.pass_time(10.0)
-    assert len(rig.core.timers) == 1  # the worker's own
+    assert len(rig.core.state.timers) == 1  # the worker's own
 
 
 def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:

@@ -93,7 +93,7 @@ def test_a_bundle_without_a_policy_ends_the_submit_with_its_verdict_and_is_charg
     row = rig.row(SubmitRow, "r1", 0)
     assert (row.status, row.released, row.n_kept, row.mean_return) == ("import_error", 0, 0, None)
     assert row.failure is not None
-    assert rig.core.runs["r1"].ledger.settled == 3
+    assert rig.core.state.runs["r1"].ledger.settled == 3
     reply = rig.beat(session, leases[2])
     assert reply.cancelled == (leases[2].lease_id,)
 
@@ -112,7 +112,11 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
     answer = rig.submit(0, 1, bundle=None, bundle_error=failure)
     assert answer.remaining_budget == 14
     row = rig.row(SubmitRow, "r1", 0)
-    assert (row.status, row.failure, rig.core.runs["r1"].ledger.settled) == ("missing_policy", failure, 2)
+    assert (row.status, row.failure, rig.core.state.runs["r1"].ledger.settled) == (
+        "missing_policy",
+        failure,
+        2,
+    )
     assert rig.results().upto == 0
     assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
 
@@ -178,8 +182,8 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
             rig.beat(session)
         (lease,) = rig.poll(session, 1, wait_s=0.5)
         rig.hand_in(session, result(lease, "done", episodes=episodes))
-        assert rig.core.groups["r1/s0/train"].done == 0
-    assert rig.core.runs["r1"].state.infrastructure_retries == len(bad)
+        assert rig.core.state.groups["r1/s0/train"].done == 0
+    assert rig.core.state.runs["r1"].state.infrastructure_retries == len(bad)
 
 
 def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hypothesis.strategies as st
 from hypothesis import given
 
-from evopolicy_coordinator.core.story import Story
-from evopolicy_coordinator.core.timers import TimerKey, Timers
+from evopolicy_coordinator.core.structures.story import Story
+from evopolicy_coordinator.core.structures.timers import TimerKey, Timers
 
 STEPS = st.lists(
     st.tuples(st.sampled_from(["arm", "once", "disarm", "due"]), st.integers(0, 8), st.integers(0, 50)),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from .settings import CoreSettings
+from evopolicy_coordinator.core.settings import CoreSettings
 
 Mishap = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
 """returned: given back unplayed. unlisted: its worker lives but does not know of it, the lease never arrived. failed: the

@@ -15,70 +15,65 @@ Rules that this module owns:
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
-
-from . import audit
-from .jobs import JobState, mark_of
-from .leases import Lease
-from .records import OutcomeRow
-from .retry import Mishap
-from .turn import Turn
-from .workers import Worker
-
-if TYPE_CHECKING:
-    from .machine import Core
+from evopolicy_coordinator.core.leasing import fleet, groups, leases
+from evopolicy_coordinator.core.leasing.retry import Mishap
+from evopolicy_coordinator.core.model import JobState, Lease, Worker, mark_of
+from evopolicy_coordinator.core.records import OutcomeRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import EpisodesDone, HandedIn, ResultsDiffered, Step
 
 
-def take(core: Core, worker: Worker, result: JobResult, turn: Turn) -> None:
+def take(state: State, news: HandedIn, step: Step) -> None:
     """Take in one result of a hand-in."""
-    job = core.jobs.get(result.job_id)
+    worker, result = news
+    job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
-    granted = core.book.granted(result.lease_id, result.job_id, result.attempt, worker)
+    granted = leases.granted(state, result.lease_id, result.job_id, result.attempt, worker)
     if job is None or not granted:
-        _closed(core, worker, lease, result, turn, granted=granted)
+        _closed(state, worker, lease, result, step, granted=granted)
         return
     if job.group.bars(worker):
-        turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
+        step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
-    silent = lease is None or _silent(core, lease, turn.now)
+    silent = lease is None or _silent(state, lease, step.now)
     if lease is not None:
-        core.book.release(worker, lease, turn, f"handed in: {result.kind}", sure=True)
+        leases.release(state, worker, lease, step, f"handed in: {result.kind}", sure=True)
     if result.kind == "done":
-        _done(core, worker, job, result, turn, live=live, silent=silent)
+        _done(state, worker, job, result, step, live=live, silent=silent)
     elif live:
         if result.kind != "returned":
-            core.fleet.failed(worker, turn)
+            fleet.failed(state, worker, step)
         mishap: Mishap = "returned" if result.kind == "returned" else "failed"
-        core.book.give_back(job, mishap, worker, turn, ran=True, error=result.error)
+        leases.give_back(state, job, mishap, worker, step, ran=True, error=result.error)
 
 
 def _closed(
-    core: Core, worker: Worker, lease: Lease | None, result: JobResult, turn: Turn, *, granted: bool
+    state: State, worker: Worker, lease: Lease | None, result: JobResult, step: Step, *, granted: bool
 ) -> None:
     """A result of a job that is done or was cancelled, or of a lease that this worker was not given."""
     if lease is not None:
         live = lease.live
-        core.book.release(worker, lease, turn, f"handed in late: {result.kind}", sure=True)
+        leases.release(state, worker, lease, step, f"handed in late: {result.kind}", sure=True)
         if live:
             error = f"its result is said to be of {result.job_id[:80]!r}, attempt {result.attempt}"
-            core.fleet.failed(worker, turn)
-            core.book.give_back(lease.job, "failed", worker, turn, ran=True, error=error)
-    group = core.groups.get(result.job_id.rpartition("/")[0])
+            fleet.failed(state, worker, step)
+            leases.give_back(state, lease.job, "failed", worker, step, ran=True, error=error)
+    group = state.groups.get(result.job_id.rpartition("/")[0])
     if group is None:
         return
     if not granted:
-        turn.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id[:200])
+        step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id[:200])
         return
     if result.kind != "done":
         return
     for outcome in result.episodes:
         mark = group.marks.get(outcome.index)
         if mark is not None and mark != mark_of(outcome) and not _limit_verdict(outcome):
-            turn.log(
+            step.log(
                 "warning",
                 "nondeterministic_result",
                 job=result.job_id,
@@ -87,15 +82,15 @@ def _closed(
                 first=tuple(mark),
                 later=tuple(mark_of(outcome)),
             )
-            core.nondeterministic(group, turn)
+            step.tell(ResultsDiffered(group))
 
 
-def _silent(core: Core, lease: Lease, now: float) -> bool:
+def _silent(state: State, lease: Lease, now: float) -> bool:
     """Whether the holder of a lease may have stood still during it."""
-    if lease.job.failures >= core.settings.doubts_max:
+    if lease.job.failures >= state.settings.doubts_max:
         return False
     unheard_s = now - lease.renewed
-    return lease.doubtful or lease.granted_at < core.stalled_at or unheard_s > core.settings.silence_s
+    return lease.doubtful or lease.granted_at < state.stalled_at or unheard_s > state.settings.silence_s
 
 
 def _limit_verdict(outcome: EpisodeOutcome) -> bool:
@@ -125,30 +120,30 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
 
 
 def _done(
-    core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn, *, live: bool, silent: bool
+    state: State, worker: Worker, job: JobState, result: JobResult, step: Step, *, live: bool, silent: bool
 ) -> None:
     fault = _fault(job, result.episodes)
     if fault is not None:
-        turn.log("error", "result_refused", job=job.job_id, worker=worker.name, fault=fault)
+        step.log("error", "result_refused", job=job.job_id, worker=worker.name, fault=fault)
         if live:
-            core.fleet.failed(worker, turn)
-            core.book.give_back(job, "failed", worker, turn, ran=True, error=fault)
+            fleet.failed(state, worker, step)
+            leases.give_back(state, job, "failed", worker, step, ran=True, error=fault)
         return
     if (silent or not live) and any(_limit_verdict(outcome) for outcome in result.episodes):
-        core.chronicle.tell(turn.now, turn.stimulus_id, result.lease_id, "late limit verdict, not counted")
+        state.story.tell(step.now, step.stimulus_id, result.lease_id, "late limit verdict, not counted")
         if live:
-            core.book.give_back(
-                job, "unlisted", worker, turn, ran=True, error="limit verdict after a silence"
+            leases.give_back(
+                state, job, "unlisted", worker, step, ran=True, error="limit verdict after a silence"
             )
         return
     worker.failures = 0
-    commit(core, worker, job, result, turn)
+    commit(state, worker, job, result, step)
 
 
-def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: Turn) -> None:
+def commit(state: State, worker: Worker, job: JobState, result: JobResult, step: Step) -> None:
     """Make the outcomes durable and the job done."""
     group = job.group
-    core.close_job(job, turn, "done by another attempt")
+    groups.close_job(state, job, step, "done by another attempt")
     for outcome in result.episodes:
         row = OutcomeRow(
             group=group.id,
@@ -159,18 +154,15 @@ def commit(core: Core, worker: Worker, job: JobState, result: JobResult, turn: T
             attempt=result.attempt,
             worker=worker.name,
             fingerprint_class=worker.profile.fingerprint_class,
-            at=turn.now,
+            at=step.now,
         )
         group.marks[outcome.index] = mark_of(outcome)
-        turn.persist(row)
+        step.persist(row)
         if group.kind != "audit":
             group.flow.observe(outcome.wall_s)
-    core.chronicle.tell(
-        turn.now, turn.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
+    state.story.tell(
+        step.now, step.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
     )
-    if group.kind == "audit":
-        audit.replayed(core, worker, group, turn)
-        return
-    core.count_done(len(result.episodes), turn.now)
-    audit.sample(core, worker, group, result.episodes, turn)
-    core.concluded(group, result.episodes, turn)
+    if group.kind != "audit":
+        state.rate.count(len(result.episodes), step.now)
+    step.tell(EpisodesDone(group, worker, result.episodes))

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from .events import RequestId
+from evopolicy_coordinator.core.events import RequestId
+
 from .timers import Timers
 
 PollKind = Literal["results", "evaluation", "run", "permit"]

@@ -10,16 +10,22 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from .isolation import EVERYWHERE, Family, Kernel, Reversal, all_related
-from .jobs import EARLY_VALIDATION, TRAIN, JobGroup
-from .queue import Lane
-from .records import train_group
-from .turn import Turn
-
-if TYPE_CHECKING:
-    from .machine import Core
+from evopolicy_coordinator.core.isolation import bars, kernels
+from evopolicy_coordinator.core.isolation.kernels import all_related
+from evopolicy_coordinator.core.leasing import leases
+from evopolicy_coordinator.core.model import (
+    EARLY_VALIDATION,
+    EVERYWHERE,
+    TRAIN,
+    Family,
+    Kernel,
+    Lane,
+    LaneKey,
+    Reversal,
+)
+from evopolicy_coordinator.core.records import train_group
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
 
 LOOK_S = 1.0
 """How often waiting hidden jobs, and train jobs that hidden ones may keep waiting, are looked at."""
@@ -28,28 +34,35 @@ DONE_LOOKS = 3
 """Nothing hidden was left for so many looks: then it is done. What follows from the last job may take a moment to queue."""
 
 
-def watch(core: Core, lane: Lane, turn: Turn) -> None:
+def watch(state: State, lane: Lane, step: Step) -> None:
     """Look at the lane in a while, if it has anything to look at."""
-    if core.isolation.on and (lane.backlog or lane.kept_s or lane.reversals or lane.waiting[TRAIN]):
-        core.timers.arm_once(("hidden", lane.key), turn.now + LOOK_S)
+    if state.isolates and (lane.backlog or lane.kept_s or lane.reversals or lane.waiting[TRAIN]):
+        state.timers.arm_once(("hidden", lane.key), step.now + LOOK_S)
 
 
-def look(core: Core, lane: Lane, turn: Turn) -> None:
+def look_at(state: State, key: LaneKey, step: Step) -> None:
+    """A lane's deadline."""
+    lane = state.lanes.get(key)
+    if lane is not None:
+        look(state, lane, step)
+
+
+def look(state: State, lane: Lane, step: Step) -> None:
     """Turn a kernel over to hidden jobs that have waited for long, and back; see which submits are held."""
-    passed_s = min(turn.now - lane.looked_at, 2 * LOOK_S)
-    lane.looked_at = turn.now
-    kernels = core.isolation.serving(lane)
+    passed_s = min(step.now - lane.looked_at, 2 * LOOK_S)
+    lane.looked_at = step.now
+    there = kernels.serving(state, lane)
     for family in {**lane.backlog, **lane.kept_s, **lane.reversals}:
-        _hidden(core, lane, family, kernels, passed_s, turn)
-    _train(core, lane, kernels, turn)
-    watch(core, lane, turn)
+        _hidden(state, lane, family, there, passed_s, step)
+    _train(state, lane, there, step)
+    watch(state, lane, step)
 
 
 def _hidden(
-    core: Core, lane: Lane, family: Family, kernels: dict[Kernel, None], passed_s: float, turn: Turn
+    state: State, lane: Lane, family: Family, there: dict[Kernel, None], passed_s: float, step: Step
 ) -> None:
-    isolation, reversal = core.isolation, lane.reversals.get(family)
-    played = _played(core, lane, family)
+    reversal = lane.reversals.get(family)
+    played = _played(state, lane, family)
     if played or lane.backlog.get(family):
         lane.done_looks.pop(family, None)
     else:
@@ -58,47 +71,47 @@ def _hidden(
             del lane.done_looks[family]
             lane.kept_s.pop(family, None)
             if reversal is not None:
-                turn_back(core, reversal, turn, "no hidden case of closed runs is left")
+                turn_back(state, reversal, step, "no hidden case of closed runs is left")
         return
     if reversal is not None:
-        if reversal.kernel not in kernels:
-            turn_back(core, reversal, turn, "its workers are gone")
+        if reversal.kernel not in there:
+            turn_back(state, reversal, step, "its workers are gone")
         return
-    known = [kernel for kernel in kernels if kernel.boot_id != EVERYWHERE]
-    if played or not known or not all(isolation.hidden_bar(family, kernel) for kernel in known):
+    known = [kernel for kernel in there if kernel.boot_id != EVERYWHERE]
+    if played or not known or not all(bars.hidden_bar(state, family, kernel) for kernel in known):
         return
     kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
-    if kept_s >= core.settings.hidden_wait_s:
-        _turn_over(core, lane, family, known, turn)
+    if kept_s >= state.settings.hidden_wait_s:
+        _turn_over(state, lane, family, known, step)
 
 
-def _played(core: Core, lane: Lane, family: Family) -> bool:
+def _played(state: State, lane: Lane, family: Family) -> bool:
     """Whether hidden jobs of the lane's closed runs are leased."""
     return any(
         stay.lease is not None and stay.lease.live and stay.lease.job.group.flow.closed
-        for kernel in core.isolation.kernels.values()
+        for kernel in state.kernels.values()
         for stay in kernel.hidden.get(family, {}).values()
         if stay.lease is not None and stay.lease.job.group.flow.lane is lane
     )
 
 
-def _turn_over(core: Core, lane: Lane, family: Family, kernels: list[Kernel], turn: Turn) -> None:
+def _turn_over(state: State, lane: Lane, family: Family, known: list[Kernel], step: Step) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
         return len(all_related(kernel.permits, family)), len(all_related(kernel.train, family))
 
-    kernel = min(kernels, key=in_the_way)
+    kernel = min(known, key=in_the_way)
     reversal = lane.reversals[family] = Reversal(kernel, lane, family)
     family.users += 1
     kernel.reversals.setdefault(family, {})[str(lane.key)] = reversal
     for stay in all_related(kernel.hidden, family):
         lease = stay.lease
         if lease is not None and lease.live and lease.job.priority == EARLY_VALIDATION:
-            core.scheduler.put_off(lease, "hidden jobs of closed runs go first there", turn)
-    turn.dirty[lane] = None
-    turn.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
+            leases.put_off(state, lease, "hidden jobs of closed runs go first there", step)
+    step.dirty[lane] = None
+    step.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
 
 
-def turn_back(core: Core, reversal: Reversal, turn: Turn, why: str) -> None:
+def turn_back(state: State, reversal: Reversal, step: Step, why: str) -> None:
     """Agents go first again on a kernel."""
     kernel, family = reversal.kernel, reversal.family
     del reversal.lane.reversals[family]
@@ -106,40 +119,32 @@ def turn_back(core: Core, reversal: Reversal, turn: Turn, why: str) -> None:
     del there[str(reversal.lane.key)]
     if not there:
         del kernel.reversals[family]
-    turn.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
-    core.isolation.freed(family, turn)
-    core.isolation.tidy(kernel)
-    core.isolation.families.leave(family)
+    step.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
+    kernels.freed(state, family, step)
+    kernels.tidy(state, kernel)
+    state.families.leave(family)
 
 
-def _train(core: Core, lane: Lane, kernels: dict[Kernel, None], turn: Turn) -> None:
+def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> None:
     """Begin or end to count the time for which submits are held."""
     barred = {
         family
         for family in lane.waiting[TRAIN]
-        if kernels and all(core.isolation.train_bar(family, kernel) for kernel in kernels)
+        if there and all(bars.train_bar(state, family, kernel) for kernel in there)
     }
-    for group in [group for group in core.held if group.flow.lane is lane]:
+    for group in [group for group in state.held if group.flow.lane is lane]:
         if group.flow.family not in barred:
-            let_go(core, group, turn.now)
+            leases.let_go(state, group, step.now)
     if not barred:
         return
     waiting = {flow.id: None for _, _, flow in lane.heaps[TRAIN]}
-    waiting |= {job.group.run: None for job in core.queue.suspects if job.priority == TRAIN}
+    waiting |= {job.group.run: None for job in state.suspects if job.priority == TRAIN}
     for name in waiting:
-        run = core.runs.get(name)
+        run = state.runs.get(name)
         open_group = "" if run is None or run.open is None else train_group(run.id, run.open)
-        found = core.groups.get(open_group)
+        found = state.groups.get(open_group)
         if found is None or found.n_leased or found.flow.lane is not lane or found.flow.family not in barred:
             continue
         if found.held_since is None:
-            found.held_since = turn.now
-            core.held[found] = None
-
-
-def let_go(core: Core, group: JobGroup, now: float) -> None:
-    """A submit is held no more."""
-    if group.held_since is not None:
-        group.held_s = group.held(now)
-        group.held_since = None
-        del core.held[group]
+            found.held_since = step.now
+            state.held[found] = None

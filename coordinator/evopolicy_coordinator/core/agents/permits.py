@@ -1,0 +1,224 @@
+"""Permits: an agent's right to be alive on a kernel.
+
+Rules that this module owns:
+- A permit ends with its run's closing, `CANCELLED_S` after its cancelling, by an operator's word, or with another boot id of
+  its machine; never by silence.
+- A permit that is asked for stops related hidden jobs, which are not blamed, unless the kernel is turned over to them
+  (`precedence`). It is granted once their workers have let go of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import msgspec
+
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.operator import ELSEWHERE
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.isolation import bars, kernels, stays
+from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
+from evopolicy_coordinator.core.leasing import leases
+from evopolicy_coordinator.core.model import Ask, Family, Kernel, Run
+from evopolicy_coordinator.core.records import PermitRow, RunRow, RunStateRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+CANCELLED_S = 30.0
+"""After a run was cancelled its agent has so long to be ended."""
+
+
+def place(run: Run, boot_id: str) -> str | None:
+    """The kernel that a run's agent is on when its gateway says `boot_id`; None: on none of the cluster."""
+    said = run.row.settings.agent_host
+    return None if said == ELSEWHERE else (said or boot_id)
+
+
+def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
+    """A run's permits."""
+    return [(kernel, row) for kernel, (row, _) in state.permits.get(run, {}).items()]
+
+
+# ---- asking ----
+
+
+def ask(state: State, run: Run, row: PermitRow, step: Step) -> str:
+    """Ask for a permit, again or for the first time; gives what it waits for, empty when it is granted."""
+    kernel, family = kernels.kernel(state, row.boot_id), run.family
+    if run.id in kernel.permits.get(family, ()):
+        return ""
+    if run.id not in kernel.asks.get(family, ()):
+        family.users += 1
+        ask = state.asks[run.id, kernel.boot_id] = Ask(row, family, kernel)
+        put(kernel.asks, family, run.id, ask)
+    _preempt(state, family, kernel, step)
+    return _grant(state, run.id, kernel, family, step)
+
+
+def _preempt(state: State, family: Family, kernel: Kernel, step: Step) -> None:
+    """Stop related hidden jobs for a permit, unless it is their turn."""
+    if not state.isolates:
+        return
+    there = list(state.kernels.values()) if kernel is state.everywhere else [kernel]
+    if any(related(each.reversals, family) for each in there):
+        return
+    for each in there:
+        for stay in all_related(each.hidden, family):
+            if stay.lease is not None and stay.lease.live:
+                leases.put_off(state, stay.lease, "an agent is to start there", step)
+
+
+def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -> str:
+    waits_for = bars.permit_bar(state, family, kernel)
+    if waits_for:
+        return waits_for
+    ask = _withdraw(state, run, kernel, family)
+    assert ask is not None
+    row = msgspec.structs.replace(ask.row, granted_at=step.now)
+    restore(state, row, family)
+    step.persist(row)
+    step.log("info", "permit_granted", run=run, host=row.host, boot_id=row.boot_id)
+    for poll in state.polls.take_all(poll_target(run, row.boot_id)):
+        step.reply(poll.request, gateway.Permit(granted=True))
+    return ""
+
+
+def restore(state: State, row: PermitRow, family: Family) -> None:
+    """A permit is there."""
+    family.users += 1
+    kernel = kernels.kernel(state, row.boot_id)
+    put(kernel.permits, family, row.run, row)
+    state.permits.setdefault(row.run, {})[kernel] = row, family
+
+
+def _withdraw(state: State, run: str, kernel: Kernel, family: Family) -> Ask | None:
+    """A permit is asked for no more."""
+    ask = take(kernel.asks, family, run)
+    state.asks.pop((run, kernel.boot_id), None)
+    if ask is not None:
+        state.timers.disarm(("ask", (run, kernel.boot_id)))
+        state.families.leave(family)
+    return ask
+
+
+def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
+    """A permit was not asked for again."""
+    ask = state.asks.get((run, boot_id))
+    if ask is not None:
+        kernels.freed(state, ask.family, step, train_too=False)
+        _withdraw(state, run, ask.kernel, ask.family)
+        kernels.tidy(state, ask.kernel)
+
+
+def ask_ended(state: State, key: tuple[str, str], step: Step) -> None:
+    """A permit was not asked for again."""
+    forget_ask(state, *key, step)
+
+
+def settle(state: State, step: Step) -> None:
+    """At the end of a step: grant what has become possible."""
+    if not state.grantable:
+        return
+    state.grantable = False
+    for ask in list(state.asks.values()):
+        _preempt(state, ask.family, ask.kernel, step)
+        _grant(state, ask.row.run, ask.kernel, ask.family, step)
+
+
+def drop_asks(state: State, run: str, refusal: Refusal, text: str, step: Step) -> None:
+    """Nothing more is granted to a run."""
+    for name, boot_id in [key for key in state.asks if key[0] == run]:
+        forget_ask(state, name, boot_id, step)
+        for poll in state.polls.take_all(poll_target(name, boot_id)):
+            step.refuse(poll.request, refusal, text)
+
+
+# ---- the end ----
+
+
+def end(state: State, run: str, step: Step, why: str) -> None:
+    """A run's agent is gone, wherever it was."""
+    state.timers.disarm(("cancelled", run))
+    for kernel, row in held(state, run):
+        _end(state, kernel, row, step, why)
+
+
+def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:
+    there = state.permits[row.run]
+    _, family = there.pop(kernel)
+    if not there:
+        del state.permits[row.run]
+    take(kernel.permits, family, row.run)
+    step.persist(msgspec.structs.replace(row, ended_at=step.now))
+    step.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)
+    kernels.freed(state, family, step)
+    kernels.tidy(state, kernel)
+    state.families.leave(family)
+
+
+def agent_ended(state: State, run: str, step: Step) -> None:
+    """The agent of a cancelled run has had its time to be ended."""
+    end(state, run, step, "its run was cancelled")
+
+
+def booted(state: State, machine_id: str, boot_id: str, step: Step) -> None:
+    """A machine has this boot id now: whatever was on it under another one has ended."""
+    if not machine_id or not boot_id:
+        return
+    before, state.boots[machine_id] = state.boots.get(machine_id, {}), {boot_id: None}
+    for old in before:
+        kernel = state.kernels.get(old)
+        if kernel is None or old == boot_id:
+            continue
+        for row in all_related(kernel.permits, None):
+            if row.machine_id == machine_id:
+                _end(state, kernel, row, step, "its machine was started anew")
+        for stay in (*all_related(kernel.hidden, None), *all_related(kernel.train, None)):
+            if stay.machine_id == machine_id and stay.lease is None:
+                stays.forget(state, stay, step)
+
+
+def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:
+    """A run was cancelled: its agent is being ended."""
+    if held(state, run):
+        state.timers.arm(("cancelled", run), (step.now if at is None else at) + CANCELLED_S)
+
+
+def load(
+    state: State,
+    rows: Iterable[PermitRow],
+    runs: dict[str, RunRow],
+    states: dict[str, RunStateRow],
+    step: Step,
+) -> None:
+    """Take in the permits that are stored, before anything is played."""
+    for row in rows:
+        run = runs.get(row.run)
+        if run is None or row.ended_at is not None:
+            continue
+        family = state.families.join(run.settings.env, (*run.validation, *run.heldout))
+        restore(state, row, family)
+        state.families.leave(family)
+        state.boots.setdefault(row.machine_id, {})[row.boot_id] = None
+        stored = states.get(row.run)
+        if stored is not None and stored.phase == "finished":
+            at = step.now if stored.closed_at is None else min(stored.closed_at, step.now)
+            state.timers.arm_once(("cancelled", row.run), at + CANCELLED_S)
+
+
+# ---- what is told ----
+
+
+def agents(state: State, run: str) -> str:
+    """Where a run's agent may be alive, in words; empty for nowhere."""
+    return ", ".join(sorted(place_of(row) for _, row in held(state, run)))
+
+
+def place_of(row: PermitRow) -> str:
+    """Where a permit is for, for people."""
+    return row.host or row.boot_id or "everywhere"
+
+
+def poll_target(run: str, boot_id: str) -> str:
+    """What who waits for a permit waits for."""
+    return f"permit {run} {boot_id}"

@@ -1,0 +1,100 @@
+"""How gateways ask for permits, and what an operator says of them."""
+
+from __future__ import annotations
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages.operator import ELSEWHERE, HiddenIsolation
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.isolation import bars, kernels
+from evopolicy_coordinator.core.model import EVERYWHERE, Run
+from evopolicy_coordinator.core.records import PermitRow, RunRow
+from evopolicy_coordinator.core.runs.known import over
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.structures.polls import Poll
+
+from . import permits
+
+ASK_AGAIN_S = 10.0
+"""A request for a permit that was answered with none is kept for so long, until it is sent again."""
+
+
+def requested(state: State, event: events.Asked[gateway.RequestPermit], step: Step) -> None:
+    """A gateway asks that its agent may be alive on a kernel."""
+    message = event.message
+    run = state.runs.get(message.run)
+    if run is None or run.state.phase != "open":
+        step.refuse(event.request, *over(state, message.run))
+        return
+    permits.booted(state, message.machine_id, message.boot_id, step)
+    kernel = permits.place(run, message.boot_id)
+    if kernel is None:
+        step.reply(event.request, gateway.Permit(granted=True))
+        return
+    same = kernel == message.boot_id
+    row = PermitRow(
+        run=run.id,
+        boot_id=kernel,
+        machine_id=message.machine_id if same else "",
+        host=message.host if same else "",
+    )
+    waits_for = permits.ask(state, run, row, step)
+    if not waits_for:
+        step.reply(event.request, gateway.Permit(granted=True))
+        return
+    state.timers.arm(("ask", (run.id, kernel)), step.now + max(0.0, message.wait_s) + ASK_AGAIN_S)
+    poll = Poll(event.request, "permit", permits.poll_target(run.id, kernel))
+    if not state.polls.wait(poll, message.wait_s, step.now):
+        step.reply(event.request, gateway.Permit(granted=False, waits_for=waits_for))
+
+
+def answer(state: State, poll: Poll, step: Step) -> None:
+    """A gateway has waited for a permit in vain."""
+    _, run, boot_id = poll.target.split(" ", 2)
+    waits_for = bars.permit_bar(state, state.runs[run].family, kernels.kernel(state, boot_id))
+    step.reply(poll.request, gateway.Permit(granted=False, waits_for=waits_for))
+
+
+def implied(state: State, run: Run, step: Step) -> str:
+    """The permit of an agent whose gateway asks for none, so it may be anywhere; gives what it waits for, empty when the
+    run has one."""
+    kernel = permits.place(run, EVERYWHERE)
+    if kernel is None or permits.held(state, run.id):
+        return ""
+    waits_for = permits.ask(state, run, PermitRow(run=run.id, boot_id=kernel), step)
+    if waits_for:
+        state.timers.arm(("ask", (run.id, kernel)), step.now + ASK_AGAIN_S)
+    return waits_for
+
+
+def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step) -> None:
+    """An operator vouches that a run's agent is not alive any more."""
+    message = event.message
+    if message.run not in state.capabilities:
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        return
+    permits.end(state, message.run, step, "by an operator's word")
+    step.reply(event.request, operator.Done())
+
+
+def stamp(state: State, row: RunRow) -> HiddenIsolation:
+    """What a new run is stamped with."""
+    if not state.isolates:
+        return "shared"
+    return "waived" if row.settings.agent_host == ELSEWHERE else "exclusive"
+
+
+def resume(state: State, run: Run, step: Step) -> None:
+    """An unfinished run, in a core that was just loaded."""
+    before = run.state.isolation
+    if before == "unknown":
+        if run.state.phase == "open" and not permits.held(state, run.id):
+            # Played so far by a gateway that asked for no permit.
+            kernel = permits.place(run, EVERYWHERE)
+            if kernel is not None:
+                row = PermitRow(run=run.id, boot_id=kernel, granted_at=step.now)
+                permits.restore(state, row, run.family)
+                step.persist(row)
+    elif before != "shared" and not state.isolates:
+        step.change_run(run, isolation="shared")

@@ -1,0 +1,94 @@
+"""What is on which kernel, and where nothing is any more.
+
+Rules that this module owns:
+- A kernel is a boot id; an unknown one counts as every kernel.
+- What came free somewhere is looked at for whoever may have waited for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+from evopolicy_coordinator.core.model import Family, Kernel, Lane
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+T = TypeVar("T")
+
+
+def kernel(state: State, boot_id: str) -> Kernel:
+    """What is known of a kernel."""
+    found = state.kernels.get(boot_id)
+    if found is None:
+        found = state.kernels[boot_id] = Kernel(boot_id)
+    return found
+
+
+def tidy(state: State, kernel: Kernel) -> None:
+    """Forget a kernel on which nothing is."""
+    parts = (
+        kernel.workers,
+        kernel.permits,
+        kernel.asks,
+        kernel.hidden,
+        kernel.train,
+        kernel.reversals,
+    )
+    if kernel is not state.everywhere and not any(parts):
+        state.kernels.pop(kernel.boot_id, None)
+
+
+def serving(state: State, lane: Lane) -> dict[Kernel, None]:
+    """The kernels of the active workers that may serve a lane."""
+    workers = state.workers
+    return {workers[name].kernel: None for profile in lane.profiles for name in profile.workers}
+
+
+def freed(state: State, family: Family | None, step: Step, *, train_too: bool = True) -> None:
+    """Something of a family is barred no more, somewhere: hidden jobs, or train jobs and permits too."""
+    state.grantable = state.grantable or train_too
+    lanes: Iterable[Lane] = state.lanes.values()
+    if family is not None:
+        lanes = [lane for each in family.relatives for lane in each.lanes]
+    for lane in lanes:
+        if lane not in step.dirty and lane.waits_of(family, train_too=train_too):
+            step.dirty[lane] = None
+
+
+# ---- what is on a kernel, by family ----
+
+
+def related(index: dict[Family | None, dict[str, T]], family: Family | None) -> dict[str, T] | None:
+    """What `index` holds of one of the family's relatives; None for nothing."""
+    if not index:
+        return None
+    if family is None:
+        return next(iter(index.values()))
+    for each in family.relatives:
+        there = index.get(each)
+        if there is not None:
+            return there
+    return index.get(None)
+
+
+def all_related(index: dict[Family | None, dict[str, T]], family: Family | None) -> list[T]:
+    """All that `index` holds of the family's relatives."""
+    if not index:
+        return []
+    families = index if family is None else (*family.relatives, None)
+    return [each for member in families for each in index.get(member, {}).values()]
+
+
+def put(index: dict[Family | None, dict[str, T]], family: Family | None, name: str, what: T) -> None:
+    """Enter `what` under its family and name."""
+    index.setdefault(family, {})[name] = what
+
+
+def take(index: dict[Family | None, dict[str, T]], family: Family | None, name: str) -> T | None:
+    """Take out what stands under a family and a name; None when nothing does."""
+    there = index.get(family)
+    taken = None if there is None else there.pop(name, None)
+    if there is not None and not there:
+        del index[family]
+    return taken

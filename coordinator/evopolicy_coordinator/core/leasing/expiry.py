@@ -1,0 +1,95 @@
+"""When a lease expires: its worker fell silent, does not name it, holds it for too long, or is trusted no more.
+
+Rules that this module owns:
+- One that no heartbeat names for a time to live is given up. While the loop's own lateness is in doubt nothing expires.
+- A worker that was not heard for a time to live is lost, with all that it holds.
+"""
+
+from __future__ import annotations
+
+from evopolicy_coordinator.core.model import JobState, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+from . import fleet, leases
+from .retry import Mishap
+
+FORGET_S = 3600.0
+"""A lost worker is listed for so long."""
+
+
+def look_at(state: State, name: str, step: Step) -> None:
+    """A worker's deadline."""
+    worker = state.workers.get(name)
+    if worker is not None:
+        look(state, worker, step)
+
+
+def look(state: State, worker: Worker, step: Step) -> None:
+    """A worker's deadline: give up what expired, declare it lost when it was silent, and set the next deadline."""
+    settings, now = state.settings, step.now
+    if now < state.hold_until:
+        state.timers.arm(("worker", worker.name), state.hold_until)
+        return
+    silent_at = worker.last_seen + settings.lease_ttl_s
+    if worker.doubted_at is not None:
+        silent_at = min(silent_at, worker.doubted_at + settings.liveness_grace_s)
+    if worker.state != "lost" and now >= silent_at:
+        lose(state, worker, step)
+        return
+    running = {lease.id for lease in worker.running()}
+    deadlines = [] if worker.state == "lost" else [silent_at]
+    for lease in list(worker.leases.values()):
+        due = lease.renewed + settings.lease_ttl_s if lease.orphan_until is None else lease.orphan_until
+        overdue = (lease.started_at or lease.granted_at) + _longest_s(state, lease.job)
+        if now >= overdue and lease.live:
+            leases.stop(state, lease, step, "overdue")
+            leases.give_back(state, lease.job, "overdue", worker, step, ran=True)
+        elif now >= due:
+            live, orphan = lease.live, lease.orphan_until is not None
+            leases.release(state, worker, lease, step, "no heartbeat names it")
+            if live:
+                mishap: Mishap = "worker_lost" if orphan else "unlisted"
+                leases.give_back(state, lease.job, mishap, worker, step, ran=orphan and lease.id in running)
+        else:
+            deadlines.append(min(due, overdue) if lease.live else due)
+    if deadlines:
+        state.timers.arm(("worker", worker.name), min(deadlines))
+
+
+def _longest_s(state: State, job: JobState) -> float:
+    """Longest that a job may be held, seconds: our own bound over the policy's limits, with its wait in a batch."""
+    limits = job.group.template.limits
+    each = limits.episode_wall_s + limits.init_wall_s + state.settings.job_deadline_s
+    return job.n * each
+
+
+def lose(state: State, worker: Worker, step: Step) -> None:
+    """A worker went silent: all it holds goes back, what it was playing under suspicion."""
+    running = {lease.id for lease in worker.running()}
+    fleet.count_out(worker)
+    step.log("warning", "worker_lost", worker=worker.name, held=len(worker.leases), running=len(running))
+    fleet.drop_poll(state, worker, step)
+    if worker.beat is not None:
+        fleet.answer_beat(state, worker, (), step)
+    for lease in list(worker.leases.values()):
+        live = lease.live
+        leases.release(state, worker, lease, step, "worker lost")
+        if live:
+            leases.give_back(state, lease.job, "worker_lost", worker, step, ran=lease.id in running)
+    state.timers.arm(("forget", worker.name), step.now + FORGET_S)
+
+
+def take_away(state: State, name: str, step: Step) -> None:
+    """A worker is trusted no more: all it holds goes back, under no suspicion, and its polls end."""
+    worker = state.workers.get(name)
+    if worker is None:
+        return
+    fleet.drop_poll(state, worker, step)
+    if worker.beat is not None:
+        fleet.answer_beat(state, worker, tuple(worker.leases), step)
+    for lease in list(worker.leases.values()):
+        live = lease.live
+        leases.release(state, worker, lease, step, "its worker is quarantined")
+        if live:
+            leases.give_back(state, lease.job, "returned", worker, step, ran=False)

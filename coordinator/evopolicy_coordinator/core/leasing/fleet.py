@@ -1,0 +1,265 @@
+"""The fleet: who registered, what each can do, whether it is there.
+
+Rules that this module owns:
+- A worker is named; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of the
+  new one may claim them for a short while, then they are lost like a lost worker's.
+- Workers of one profile (environments, tiers, fingerprint class) are interchangeable but for what they have warm.
+- A worker that is paused, draining, lost, quarantined, benched or taken by a suspect gets no more work. One that is
+  draining is told to end once what it plays is done; one that is paused stays, and is as before when it is taken back.
+- A worker whose jobs keep failing through its own fault is benched for a growing time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_coordinator.core.events import WorkerRegistered
+from evopolicy_coordinator.core.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+from . import queue
+
+BENCH_AFTER = 3
+"""Failures in a row, with nothing played in between, after which a worker is benched."""
+
+
+def fingerprint_class(fingerprint: Fingerprint, *, cpu: bool) -> str:
+    """12 hex digits, equal for workers whose results may stand in one run.
+
+    Covers the code's version, Python's and every environment package's, and with `cpu` the CPU's features.
+    """
+    parts = [fingerprint.code_version, fingerprint.python, sorted(fingerprint.packages.items())]
+    if cpu:
+        parts.append(fingerprint.cpu)
+    return hashlib.sha256(msgspec.json.encode(parts)).hexdigest()[:12]
+
+
+def of_session(state: State, name: str, session: str, now: float) -> Worker | None:
+    """The worker if the session is its present one; it has been heard from then."""
+    worker = state.workers.get(name)
+    if worker is None or worker.session != session:
+        return None
+    worker.last_seen = now
+    worker.doubted_at = None
+    if worker.state == "lost":
+        count_in(state, worker)
+    return worker
+
+
+def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) -> Worker:
+    """Take a worker in, or take it in again under a new session."""
+    message = event.message
+    profile = _profile(state, event)
+    old = state.workers.get(message.worker)
+    worker = Worker(
+        name=message.worker,
+        session=event.session,
+        slots=max(1, message.slots),
+        host=message.host,
+        profile=profile,
+        last_seen=step.now,
+        kernel=kernel,
+        machine_id=message.machine_id,
+        machine=event.machine,
+        numerics=fingerprint_class(message.fingerprint, cpu=True),
+        state="lost",
+    )
+    if old is not None:
+        count_out(old)
+        worker.leases, worker.held, worker.n_live = old.leases, old.held, old.n_live
+        worker.alone = old.alone
+        worker.failures, worker.benched_until = old.failures, old.benched_until
+        for lease in worker.leases.values():
+            lease.orphan_until = step.now + state.settings.adoption_s
+        state.sessions.pop(old.session, None)
+    state.workers[message.worker] = worker
+    state.sessions[worker.session] = worker.name
+    count_in(state, worker)
+    if worker.benched_until > step.now:
+        state.timers.arm(("bench", worker.name), worker.benched_until)
+    state.timers.arm(("worker", worker.name), step.now + state.settings.adoption_s)
+    return worker
+
+
+def _profile(state: State, event: WorkerRegistered) -> Profile:
+    message = event.message
+    name = fingerprint_class(message.fingerprint, cpu=state.settings.fingerprint_cpu)
+    key = (
+        frozenset(description.env for description in message.environments),
+        frozenset[Tier](message.tiers),
+        name,
+    )
+    profile = state.profiles.get(key)
+    if profile is None:
+        descriptions = {description.env: description for description in message.environments}
+        profile = Profile(key, message.fingerprint, descriptions)
+        queue.add_profile(state, profile)
+    return profile
+
+
+def count_in(state: State, worker: Worker) -> None:
+    """It may have work again, unless an operator said otherwise."""
+    worker.state = state.out_of_service.get(worker.name, "active")
+    if worker.state == "active":
+        worker.profile.workers[worker.name] = None
+        worker.profile.slots += worker.slots
+
+
+def count_out(worker: Worker, state: Literal[OutOfService, "lost", "quarantined"] = "lost") -> None:
+    """No more work for it."""
+    if worker.state == "active":
+        del worker.profile.workers[worker.name]
+        worker.profile.slots -= worker.slots
+    worker.state = state
+    unpark(worker)
+    if worker.reserved is not None:
+        worker.reserved.reserved = None
+        worker.reserved = None
+
+
+def set_state(
+    state: State,
+    name: str,
+    to: Literal["active", OutOfService, "quarantined"],
+    reason: str = "",
+    machine: str = "",
+) -> None:
+    """An operator's word, or an audit's; holds for a worker that is not there yet, too."""
+    state.out_of_service.pop(name, None)
+    if state.quarantined.pop(name, None) is not None:
+        machines = state.quarantined_machines
+        state.quarantined_machines = {each: of for each, of in machines.items() if of != name}
+    if to == "draining" or to == "paused":
+        state.out_of_service[name] = to
+    elif to == "quarantined":
+        state.quarantined[name] = reason
+        if machine:
+            state.quarantined_machines[machine] = name
+    worker = state.workers.get(name)
+    if worker is None or worker.state in ("lost", to):
+        return
+    if to == "active":
+        count_in(state, worker)
+    else:
+        count_out(worker, to)
+
+
+def forget(state: State, worker: Worker) -> None:
+    """A worker that was lost long ago is known no more."""
+    del state.workers[worker.name]
+    state.sessions.pop(worker.session, None)
+
+
+def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:
+    """Answer the heartbeat that a worker has waiting."""
+    request, worker.beat = worker.beat, None
+    state.timers.disarm(("beat", worker.name))
+    assert request is not None
+    drain = state.out_of_service.get(worker.name) == "draining"
+    step.reply(request, wire.HeartbeatReply(cancelled=stop, drain=drain))
+
+
+def drop_poll(state: State, worker: Worker, step: Step) -> None:
+    """Answer a worker's waiting poll with no leases."""
+    if worker.poll is not None:
+        answer_poll(state, worker, (), step)
+
+
+def answer_poll(
+    state: State, worker: Worker, leases: tuple[wire.Lease, ...], step: Step, cancelled: tuple[str, ...] = ()
+) -> None:
+    poll = worker.poll
+    assert poll is not None
+    unpark(worker)
+    state.timers.disarm(("lease", worker.name))
+    worker.poll = None
+    step.reply(poll.request, wire.Leases(leases=leases, cancelled=cancelled))
+
+
+def poll_ended(state: State, name: str, step: Step) -> None:
+    """A lease poll's time is up."""
+    worker = state.workers.get(name)
+    if worker is not None:
+        drop_poll(state, worker, step)
+
+
+def beat_ended(state: State, name: str, step: Step) -> None:
+    """A heartbeat's answer has been held back for long enough."""
+    worker = state.workers.get(name)
+    if worker is not None and worker.beat is not None:
+        answer_beat(state, worker, (), step)
+
+
+# ---- availability ----
+
+
+def available(worker: Worker, now: float) -> bool:
+    """Whether it may be given more."""
+    return worker.state == "active" and worker.alone is None and worker.benched_until <= now
+
+
+def park(worker: Worker) -> None:
+    """Its poll waits and could be answered now."""
+    profile = worker.profile
+    if worker.poll is None or worker.name in profile.parked:
+        return
+    profile.parked[worker.name] = None
+    for item in worker.poll.warm:
+        profile.warm.setdefault(item, {})[worker.name] = None
+
+
+def unpark(worker: Worker) -> None:
+    """Its poll waits no more, or cannot be answered now."""
+    profile = worker.profile
+    if worker.name not in profile.parked:
+        return
+    assert worker.poll is not None
+    del profile.parked[worker.name]
+    for item in worker.poll.warm:
+        there = profile.warm[item]
+        there.pop(worker.name, None)
+        if not there:
+            del profile.warm[item]
+
+
+def failed(state: State, worker: Worker, step: Step) -> None:
+    """One more job failed through its own fault."""
+    worker.failures += 1
+    if worker.failures >= BENCH_AFTER:
+        settings = state.settings
+        pause_s = min(settings.retry_max_s, settings.retry_base_s * 2.0 ** min(worker.failures, 30))
+        worker.benched_until = step.now + pause_s
+        unpark(worker)
+        state.timers.arm(("bench", worker.name), worker.benched_until)
+        step.log("warning", "worker_benched", worker=worker.name, failures=worker.failures, pause_s=pause_s)
+
+
+def unreserve(state: State, job: JobState) -> None:
+    """No worker is emptied for a suspect any more; the one that was may get other work."""
+    if job.reserved is not None:
+        worker = state.workers[job.reserved]
+        worker.reserved = job.reserved = None
+        state.freed[worker.name] = None
+
+
+# ---- pins ----
+
+
+def offer(state: State, flow: Flow) -> Profile | None:
+    """Of the profiles that can serve an unpinned flow the one with most slots; None when there is none."""
+    able = [
+        profile
+        for profile in state.profiles.values()
+        if profile.workers and flow.env in profile.key[0] and flow.tier in profile.key[1]
+    ]
+    slots: dict[str, int] = {}
+    for profile in able:
+        slots[profile.fingerprint_class] = slots.get(profile.fingerprint_class, 0) + profile.slots
+    return max(able, key=lambda profile: slots[profile.fingerprint_class], default=None)

@@ -1,0 +1,275 @@
+"""Leases: who plays which job, and what becomes of a job whose lease ends. When a lease expires is `expiry`'s.
+
+Rules that this module owns:
+- A job has at most one lease that counts. Every lease has the job's next attempt number; attempts that were given up are
+  fenced off: what goes wrong in them is nothing to the job any more, and their holders are told to stop. (An outcome is
+  taken from any attempt, as `handin` says: it is the same whoever plays it.)
+- A lease lives by heartbeats that name it. One that its worker never came to know of is given up.
+- A lease that this incarnation has not heard of is adopted from its holder's heartbeat when its job waits.
+- Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Iterable
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_coordinator.core.isolation import bars, stays
+from evopolicy_coordinator.core.model import TRAIN, JobGroup, JobState, Lease, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import JobRetried, Step
+
+from . import fleet, queue
+from .jobs import build
+from .retry import Mishap, decide
+
+MISSING_BEATS = 3
+"""A lease that its worker has not named for so many heartbeats since it was granted never arrived."""
+
+
+def lease_id(secret: bytes, job_id: str, attempt: int, worker: str) -> str:
+    """Names a lease by what it is of: equal in every incarnation.
+
+    Only who knows the run's secret can make it: it proves to a later incarnation, which has no list of what earlier ones
+    granted, that this worker was given this attempt.
+    """
+    proof = hmac.digest(secret, f"lease|{job_id}|{attempt}|{worker}".encode(), hashlib.sha256)
+    return f"{job_id}#{attempt}#{proof[:12].hex()}"
+
+
+def granted(state: State, name: str, job_id: str, attempt: int, worker: Worker) -> bool:
+    """Whether a lease of that name was granted to the worker, by this incarnation or an earlier one."""
+    group = state.groups.get(job_id.rpartition("/")[0])
+    if group is None:
+        return False
+    return hmac.compare_digest(
+        name.encode(), lease_id(group.flow.secret, job_id, attempt, worker.name).encode()
+    )
+
+
+# ---- getting ----
+
+
+def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+    """Lease a job that has just left the queue."""
+    job.attempts += 1
+    serial = 0 if worker.poll is None else worker.poll.serial
+    lease = _enter(state, job, worker, job.attempts, step, serial=serial)
+    job.held_attempts.add(lease.attempt)
+    group = job.group
+    description = group.flow.description or worker.profile.descriptions[group.template.env]
+    state.story.tell(step.now, step.stimulus_id, lease.id, f"granted to {worker.name}")
+    return wire.Lease(
+        lease_id=lease.id,
+        attempt=lease.attempt,
+        stimulus_id=group.stimulus_id,
+        job=build(job, description),
+        stop_in_silence=group.hidden and state.isolates,
+    )
+
+
+def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step, *, serial: int) -> Lease:
+    now = step.now
+    name = lease_id(job.group.flow.secret, job.job_id, attempt, worker.name)
+    lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
+    job.lease = lease
+    job.move("leased")
+    worker.leases[name] = lease
+    worker.n_live += 1
+    worker.held[job.priority] += 1
+    group = job.group
+    group.n_leased += 1
+    group.flow.n_leased += 1
+    state.n_live += 1
+    stays.leased(state, lease, worker, serial, step)
+    let_go(state, group, now)
+    list_hidden(state, lease, worker, step)
+    if group.first_leased_at is None:
+        group.first_leased_at = now
+        _started(state, group, step)
+    if job.alone:
+        worker.alone = lease
+    state.timers.arm_once(("worker", worker.name), now + state.settings.lease_ttl_s)
+    return lease
+
+
+def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
+    """List a live lease among those that train jobs may preempt, by its job's priority."""
+    if lease.hidden_in is not None:
+        lease.hidden_in.pop(lease, None)
+        lease.hidden_in = None
+    if lease.job.priority != TRAIN:
+        lease.hidden_in = worker.profile.hidden[lease.job.priority]
+        lease.hidden_in[lease] = None
+        _look_again(state, worker, step)
+
+
+def _look_again(state: State, worker: Worker, step: Step) -> None:
+    """A worker has a hidden job: train jobs that wait already (they avoided it, or the hidden job was adopted from
+    its heartbeat) may stop it with nothing else happening."""
+    for lane in worker.profile.busy:
+        if lane.n_ready[TRAIN]:
+            state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+
+
+def _started(state: State, group: JobGroup, step: Step) -> None:
+    """The first lease of a group was granted."""
+    limit_s = group.template.limits.submit_wall_s
+    if group.kind == "train" and limit_s is not None:
+        state.timers.arm(("submit", group.id), step.now + limit_s)
+
+
+def let_go(state: State, group: JobGroup, now: float) -> None:
+    """A submit is held no more."""
+    if group.held_since is not None:
+        group.held_s = group.held(now)
+        group.held_since = None
+        del state.held[group]
+
+
+# ---- hearing ----
+
+
+def hear(
+    state: State, worker: Worker, held: Iterable[wire.HeldLease], step: Step, *, settled: int
+) -> tuple[str, ...]:
+    """A heartbeat: renew what it names, adopt what is unknown and waits; gives what the worker is to stop."""
+    now = step.now
+    stop: list[str] = []
+    named: set[str] = set()
+    for item in held:
+        named.add(item.lease_id)
+        lease = worker.leases.get(item.lease_id) or _adopt(state, worker, item, step)
+        if lease is None or not lease.live:
+            stop.append(item.lease_id)
+            if lease is None:
+                stays.unknown(state, worker, item, step)
+            continue
+        lease.doubtful = lease.doubtful or now - lease.renewed > state.settings.silence_s
+        lease.renewed = now
+        lease.named = True
+        lease.orphan_until = None
+        lease.running = item.running
+        if item.running and lease.started_at is None:
+            lease.started_at = now
+        if (item.episodes_done, item.steps) != (lease.episodes_done, lease.steps):
+            lease.episodes_done, lease.steps, lease.progress_at = item.episodes_done, item.steps, now
+    missing_since = now - MISSING_BEATS * state.settings.heartbeat_s
+    for lease in [each for each in worker.leases.values() if each.id not in named]:
+        if not lease.live:
+            sure = stays.surely(worker, lease.stay, settled)
+            _leave(state, worker, lease, step, sure=sure)
+        elif not lease.named and lease.granted_at < missing_since and now >= state.hold_until:
+            sure = stays.surely(worker, lease.stay, settled)
+            release(state, worker, lease, step, "it never arrived", sure=sure)
+            give_back(state, lease.job, "unlisted", worker, step, ran=False)
+    stays.heard(state, worker, named, settled, step)
+    return tuple(stop)
+
+
+def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Lease | None:
+    """The lease of an earlier incarnation that a worker still holds; None when it is not to go on."""
+    job = state.jobs.get(item.job_id)
+    if (
+        job is None
+        or job.lease is not None
+        or item.attempt in job.held_attempts
+        or not granted(state, item.lease_id, item.job_id, item.attempt, worker)
+        or job.group.bars(worker)
+        or not bars.adoptable(state, job, worker)
+    ):
+        return None
+    fleet.unreserve(state, job)
+    queue.withdraw(state, job)
+    state.timers.disarm(("job", job.job_id))
+    state.adopting.pop(job, None)
+    job.held_attempts.add(item.attempt)
+    state.story.tell(step.now, step.stimulus_id, item.lease_id, f"adopted from {worker.name}")
+    lease = _enter(state, job, worker, item.attempt, step, serial=0)
+    lease.doubtful = True
+    return lease
+
+
+# ---- giving up ----
+
+
+def end(state: State, lease: Lease, step: Step, why: str) -> None:
+    """The lease counts no more; its worker is told to stop at its next heartbeat, or at once if one waits."""
+    if not lease.live:
+        return
+    lease.live = False
+    job = lease.job
+    job.lease = None
+    job.group.n_leased -= 1
+    job.group.flow.n_leased -= 1
+    state.n_live -= 1
+    worker = state.workers[lease.worker]
+    worker.n_live -= 1
+    worker.held[job.priority] -= 1
+    if lease.hidden_in is not None:
+        lease.hidden_in.pop(lease, None)
+    state.story.tell(step.now, step.stimulus_id, lease.id, why)
+
+
+def stop(state: State, lease: Lease, step: Step, why: str) -> None:
+    """End a lease that its worker holds on to; it is told at the end of this step if it waits for any answer."""
+    end(state, lease, step, why)
+    step.stops.setdefault(lease.worker, []).append(lease.id)
+
+
+def release(state: State, worker: Worker, lease: Lease, step: Step, why: str, *, sure: bool = False) -> None:
+    """End a lease that its worker has let go of: surely, as it said, or as far as we know."""
+    end(state, lease, step, why)
+    _leave(state, worker, lease, step, sure=sure)
+
+
+def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool) -> None:
+    worker.leases.pop(lease.id, None)
+    stays.left(state, lease, worker, step, sure=sure)
+    if lease.stopped_for is not None:
+        lease.stopped_for.stopping -= 1
+        lease.stopped_for = None
+    if worker.alone is lease:
+        worker.alone = None
+    state.freed[worker.name] = None
+
+
+def give_back(
+    state: State, job: JobState, mishap: Mishap, worker: Worker, step: Step, *, ran: bool, error: str = ""
+) -> None:
+    """Put a job whose lease has ended back into the queue, as `retry` decides."""
+    retry = decide(state.settings, mishap, failures=job.failures + 1, ran=ran)
+    job.since = step.now
+    if retry.counted:
+        job.failures += 1
+        job.last_failure = f"{mishap} on {worker.name}" + (f": {error[:200]}" if error else "")
+        step.tell(JobRetried(job))
+        step.log(
+            "warning",
+            "job_retried",
+            job=job.job_id,
+            worker=worker.name,
+            mishap=mishap,
+            failures=job.failures,
+            delay_s=retry.delay_s,
+            alone=retry.alone,
+            error=error[:2000],
+        )
+    state.story.tell(step.now, step.stimulus_id, job.job_id, f"{mishap} on {worker.name}: {retry}")
+    job.alone = job.alone or retry.alone
+    if retry.avoid:
+        job.avoid, job.avoid_until = worker.name, step.now + retry.delay_s + state.settings.avoid_s
+    if retry.delay_s > 0.0:
+        job.move("backing_off")
+        state.timers.arm(("job", job.job_id), step.now + retry.delay_s)
+    else:
+        queue.put(state, job, step, front=True)
+
+
+def put_off(state: State, lease: Lease, why: str, step: Step) -> None:
+    """Stop a hidden job, through nobody's fault; it goes back into the queue."""
+    worker = state.workers[lease.worker]
+    stop(state, lease, step, why)
+    give_back(state, lease.job, "returned", worker, step, ran=False)

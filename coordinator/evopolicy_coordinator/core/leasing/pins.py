@@ -1,0 +1,107 @@
+"""Which class of workers plays a run or an evaluation, from its first episode to its last.
+
+Rules that this module owns:
+- A flow is pinned to the fingerprint class that serves it best when it begins, or once there is one.
+- Whoever the flow is of hears of it (`FlowPinned`) and stores the class.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_coordinator.core.model import Family, Flow, Profile, Run, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import FlowPinned, Step
+
+from . import fleet, queue
+
+
+def add_flow(
+    state: State,
+    name: str,
+    of: Literal["run", "evaluation"],
+    env: str,
+    tier: Tier,
+    secret: bytes,
+    family: Family | None,
+    *,
+    closed: bool,
+) -> Flow:
+    """A new flow for a run or an evaluation, not pinned to workers yet; `closed`: no agent is at work for it."""
+    state.n_flows += 1
+    flow = Flow(name, env, tier, of, secret, state.n_flows, family, closed=closed)
+    state.unpinned[name] = flow
+    return flow
+
+
+def drop_flow(state: State, flow: Flow) -> None:
+    """A run or evaluation is over: nothing of it waits any more."""
+    state.unpinned.pop(flow.id, None)
+    flow.lane = None
+    state.families.leave(flow.family)
+
+
+def pin(state: State, flow: Flow, step: Step) -> None:
+    """Pin a flow to the fingerprint class that serves it best now, if there is one."""
+    profile = fleet.offer(state, flow) if flow.pin is None else None
+    if profile is None:
+        return
+    place(state, flow, profile.fingerprint_class, step)
+    flow.description = profile.descriptions[flow.env]
+    step.tell(FlowPinned(flow, profile))
+
+
+def place(state: State, flow: Flow, fingerprint_class: str, step: Step) -> None:
+    """Pin a flow to a class of workers: what of it waits, waits for them."""
+    state.unpinned.pop(flow.id, None)
+    step.dirty[queue.place(state, flow, fingerprint_class)] = None
+
+
+def pin_waiting(state: State, worker: Worker, step: Step) -> None:
+    """A worker may have work again: runs that nobody could serve when they were opened are pinned now."""
+    for flow in list(state.unpinned.values()):
+        if flow.env in worker.profile.key[0] and flow.tier in worker.profile.key[1]:
+            pin(state, flow, step)
+
+
+# ---- in words ----
+
+
+def refused_runs(state: State, worker: Worker) -> dict[str, str]:
+    """Runs of its environments that a worker gets no work of, and why."""
+    profile = worker.profile
+    refused = {
+        run.id: _mismatch(run, profile)
+        for run in state.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.pin not in (None, profile.fingerprint_class)
+    }
+    return refused | {
+        run.id: f"the run demands sandbox tier {run.flow.tier}; the worker has {', '.join(sorted(profile.key[1]))}"
+        for run in state.runs.values()
+        if run.flow.env in profile.descriptions and run.flow.tier not in profile.key[1]
+    }
+
+
+def _mismatch(run: Run, profile: Profile) -> str:
+    text = (
+        f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class"
+        f" {profile.fingerprint_class}"
+    )
+    began, here = run.state.fingerprint, profile.fingerprint
+    if began is None:
+        return text
+    theirs, ours = versions(began), versions(here)
+    differing = [
+        f"{name} {theirs.get(name, 'none')} there, {ours.get(name, 'none')} here"
+        for name in sorted(theirs.keys() | ours.keys())
+        if theirs.get(name) != ours.get(name)
+    ]
+    return f"{text} ({'; '.join(differing)})" if differing else text
+
+
+def versions(fingerprint: Fingerprint) -> dict[str, str]:
+    """What a fingerprint class is made of, by name."""
+    own = {"evopolicy-worker": fingerprint.code_version, "python": fingerprint.python}
+    return {**own, **fingerprint.packages}

@@ -1,0 +1,342 @@
+"""Jobs that wait: in lanes by what a worker must be able to do, by priority, and by fair share between runs.
+
+Rules that this module owns:
+- A lane is (environment, sandbox tier, fingerprint class); a flow (a run, or an evaluation) is in one lane, or in none
+  until it is pinned to a class.
+- A lower priority number goes first, whatever the shares say.
+- Between flows of one priority the one that got the least play time goes first (start-time fair queueing: each priority
+  has a virtual clock; a flow that was idle starts at the clock, so idleness earns nothing). A worker that has the
+  environment or the bundle warm may bend this by a bounded amount.
+- Within a flow jobs go in order; what goes back after a mishap goes to the front.
+- A job is not given to a worker it avoids, as long as its lane has another; never to one that its group bars.
+- No operation looks at all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection
+
+from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.model import (
+    HIDDEN,
+    HIDDEN_FIRST,
+    N_PRIORITIES,
+    RANKS,
+    TRAIN,
+    Flow,
+    JobState,
+    Lane,
+    Profile,
+    Worker,
+    add,
+)
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+LOOK_AGAIN_S = 1.0
+"""What waits although someone waits for it (they avoid each other) is looked at again after so long."""
+
+SKIPS_MAX = 16
+"""So many jobs of a flow that avoid the asking worker are looked past; more, and it waits."""
+
+PASSES_MAX = 4
+"""So many flows with nothing but such jobs are looked past."""
+
+BARRED_MAX = 64
+"""So many flows, or families of a lane, that the asking worker's kernel is barred to are looked past."""
+
+
+_RANK = tuple(next(n for n, rank in enumerate(RANKS) if each in rank) for each in range(N_PRIORITIES))
+
+
+# ---- shape ----
+
+
+def add_profile(state: State, profile: Profile) -> None:
+    """Let workers of a new profile serve the lanes that they can."""
+    state.profiles[profile.key] = profile
+    for lane in state.lanes.values():
+        _join(profile, lane)
+
+
+def place(state: State, flow: Flow, pin: str) -> Lane:
+    """Put a flow into the lane of class `pin`, with whatever of it waits."""
+    old = flow.lane
+    suspects = [job.priority for job in state.suspects if job.group.flow is flow]
+    if old is not None:
+        for priority in range(N_PRIORITIES):
+            old.n_ready[priority] -= flow.n_ready[priority]
+            old.count(priority, flow, -flow.n_ready[priority] - suspects.count(priority))
+        _settle(old)
+    key = (flow.env, flow.tier, pin)
+    lane = state.lanes.get(key)
+    if lane is None:
+        lane = state.lanes[key] = Lane(key)
+        for profile in state.profiles.values():
+            _join(profile, lane)
+    flow.pin, flow.lane = pin, lane
+    if flow.family is not None:
+        flow.family.lanes[lane] = None
+    for priority in range(N_PRIORITIES):
+        flow.in_heap[priority] = False
+        lane.count(priority, flow, flow.n_ready[priority] + suspects.count(priority))
+        if flow.n_ready[priority]:
+            lane.n_ready[priority] += flow.n_ready[priority]
+            _enter(flow, lane, priority)
+    _settle(lane)
+    return lane
+
+
+def close(state: State, flow: Flow) -> None:
+    """A flow's agent is gone."""
+    waiting = {
+        priority: flow.n_ready[priority]
+        + sum(job.group.flow is flow and job.priority == priority for job in state.suspects)
+        for priority in HIDDEN
+    }
+    flow.closed = True
+    if flow.lane is not None and flow.family is not None:
+        add(flow.lane.backlog, flow.family, sum(waiting.values()))
+
+
+def _join(profile: Profile, lane: Lane) -> None:
+    if profile.serves(lane.key):
+        profile.lanes[lane.key] = lane
+        lane.profiles[profile] = None
+        if any(lane.n_ready):
+            profile.busy[lane] = None
+
+
+def _enter(flow: Flow, lane: Lane, priority: int) -> None:
+    if not flow.in_heap[priority]:
+        flow.in_heap[priority] = True
+        heapq.heappush(lane.heaps[priority], (flow.served[priority], flow.seq, flow))
+
+
+def _settle(lane: Lane) -> None:
+    """Let the profiles know whether anything waits in the lane."""
+    if any(lane.n_ready):
+        for profile in lane.profiles:
+            profile.busy[lane] = None
+    else:
+        for profile in lane.profiles:
+            profile.busy.pop(lane, None)
+
+
+# ---- jobs ----
+
+
+def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None:
+    """Let a job wait, and see at the end of the step whether someone waits for it."""
+    lane = _push(state, job, front=front)
+    if lane is not None:
+        step.dirty[lane] = None
+
+
+def _push(state: State, job: JobState, *, front: bool = False) -> Lane | None:
+    """Let a job wait; gives its lane, None while its flow is not pinned."""
+    flow, priority = job.group.flow, job.priority
+    job.move("queued")
+    job.ticket += 1
+    if flow.lane is not None:
+        flow.lane.count(priority, flow, 1)
+    if job.alone:
+        state.suspects[job] = None
+        return flow.lane
+    ready = flow.ready[priority]
+    (ready.appendleft if front else ready.append)((job.ticket, job))
+    if flow.n_ready[priority] == 0:
+        flow.served[priority] = max(flow.served[priority], state.clock[_RANK[priority]])
+    flow.n_ready[priority] += 1
+    lane = flow.lane
+    if lane is not None:
+        lane.n_ready[priority] += 1
+        _enter(flow, lane, priority)
+        if lane.n_ready[priority] == 1:
+            _settle(lane)
+    return lane
+
+
+def withdraw(state: State, job: JobState) -> None:
+    """Take a waiting job out, wherever it stands, to be leased or closed at once."""
+    if not job.queued:
+        return
+    flow, priority = job.group.flow, job.priority
+    job.ticket += 1
+    if flow.lane is not None:
+        flow.lane.count(priority, flow, -1)
+    if job.alone:
+        state.suspects.pop(job, None)
+        return
+    flow.n_ready[priority] -= 1
+    if flow.n_ready[priority] == 0:
+        flow.ready[priority].clear()
+    lane = flow.lane
+    if lane is not None:
+        lane.n_ready[priority] -= 1
+        if lane.n_ready[priority] == 0:
+            _settle(lane)
+
+
+def take(state: State, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
+    """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
+    for rank in _ranks(worker):
+        passed: list[tuple[Flow, int]] = []
+        barred = 0
+        job: JobState | None = None
+        while job is None and len(passed) - barred < PASSES_MAX and barred < BARRED_MAX:
+            found = _best(state, worker, rank, warm)
+            if found is None or found[0].lane is None:
+                break
+            flow, priority = found
+            lane = found[0].lane
+            if bars.bar(state, priority, flow.family, worker):
+                barred += 1
+            else:
+                job = _first(flow, priority, worker, now, sole=lane.workers() <= 1)
+            if job is None:
+                heapq.heappop(lane.heaps[priority])
+                flow.in_heap[priority] = False
+                passed.append(found)
+        for flow, priority in passed:
+            if flow.lane is not None:
+                _enter(flow, flow.lane, priority)
+        if job is not None:
+            _serve(state, job)
+            return job
+    return None
+
+
+def leading(state: State, worker: Worker) -> tuple[Flow, int] | None:
+    """The flow that goes first of what the worker may be leased, and at which priority; None when nothing waits."""
+    for rank in _ranks(worker):
+        found = _best(state, worker, rank, ())
+        if found is not None:
+            return found
+    return None
+
+
+def may_serve(state: State, lane: Lane, worker: Worker) -> bool:
+    """Whether anything that waits in the lane may be leased on the worker's kernel."""
+    return any(
+        lane.n_ready[priority] and _open(state, lane, priority, worker) for priority in range(N_PRIORITIES)
+    )
+
+
+def may_train(state: State, lane: Lane, worker: Worker) -> bool:
+    """Whether train jobs that wait in the lane may be leased to the worker."""
+    return _open(state, lane, TRAIN, worker)
+
+
+def _open(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
+    """Whether some family that waits in the lane may be leased on the worker's kernel."""
+    there = lane.waiting[priority]
+    if not there:
+        return False
+    if len(there) > BARRED_MAX or not bars.concerns(state, priority, worker):
+        return True
+    return any(not bars.bar(state, priority, family, worker) for family in there)
+
+
+def _serve(state: State, job: JobState) -> None:
+    flow, priority = job.group.flow, job.priority
+    withdraw(state, job)
+    state.clock[_RANK[priority]] = max(state.clock[_RANK[priority]], flow.served[priority])
+    flow.served[priority] += flow.cost_s(job)
+
+
+def _best(
+    state: State, worker: Worker, rank: tuple[int, ...], warm: Collection[str]
+) -> tuple[Flow, int] | None:
+    best: tuple[Flow, int] | None = None
+    best_score = 0.0
+    concerned = [priority for priority in rank if bars.concerns(state, priority, worker)]
+    for lane in worker.profile.busy:
+        for priority in rank:
+            heap = lane.heaps[priority]
+            if not heap or not lane.n_ready[priority]:
+                continue
+            if priority in concerned and not _open(state, lane, priority, worker):
+                continue
+            score, _, flow = heap[0]
+            if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
+                found = lane.top(priority)
+                if found is None:
+                    continue
+                flow, score = found, found.served[priority]
+            if warm and (flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm):
+                score -= state.settings.warm_bonus_s
+            if best is None or score < best_score or (score == best_score and flow.seq < best[0].seq):
+                best, best_score = (flow, priority), score
+    return best
+
+
+def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool) -> JobState | None:
+    """The flow's first job that may go to `worker` and does not avoid it; void entries on the way are dropped."""
+    ready = flow.ready[priority]
+    skipped: list[tuple[int, JobState]] = []
+    found: JobState | None = None
+    while ready and len(skipped) < SKIPS_MAX:
+        ticket, job = ready[0]
+        if job.ticket != ticket:
+            ready.popleft()
+        elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.bars(worker):
+            skipped.append(ready.popleft())
+        else:
+            found = job
+            break
+    ready.extendleft(reversed(skipped))
+    return found
+
+
+def head(lane: Lane, priority: int) -> JobState | None:
+    """What goes first in the lane at one priority, whoever asks; None when nothing waits."""
+    flow = lane.top(priority) if lane.n_ready[priority] else None
+    if flow is None:
+        return None
+    return _next(flow, priority)
+
+
+def avoided(lane: Lane, priority: int, now: float) -> str | None:
+    """The worker that the lane's next job is kept from."""
+    job = head(lane, priority)
+    return job.avoid if job is not None and now < job.avoid_until and lane.workers() > 1 else None
+
+
+def next_bundle(lane: Lane) -> tuple[str | None, str] | None:
+    """Bundle and environment of what goes next in the lane; None when nothing waits."""
+    for priority in range(N_PRIORITIES):
+        job = head(lane, priority)
+        if job is not None:
+            return job.group.template.bundle, job.group.template.env
+    return None
+
+
+def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
+    return HIDDEN_FIRST if worker.kernel.reversals else RANKS
+
+
+def _next(flow: Flow, priority: int) -> JobState:
+    """The first of a flow's ready jobs; there must be one. Void entries ahead of it are dropped."""
+    ready = flow.ready[priority]
+    while ready[0][1].ticket != ready[0][0]:
+        ready.popleft()
+    return ready[0][1]
+
+
+# ---- jobs that come back ----
+
+
+def backed_off(state: State, job_id: str, step: Step) -> None:
+    """A job that failed through our own fault has waited long enough."""
+    job = state.jobs.get(job_id)
+    if job is not None and job.place == "backing_off":
+        put(state, job, step, front=True)
+
+
+def give_up_adopting(state: State, _what: str, step: Step) -> None:
+    """No heartbeat has claimed these jobs since the core was loaded: they are played again."""
+    for job in list(state.adopting):
+        del state.adopting[job]
+        put(state, job, step)

@@ -1,0 +1,623 @@
+"""Plain records of what is open: jobs and their groups, leases, workers, queues, kernels, runs. They know no rule.
+
+A method here tells what follows from its own record's fields, or keeps counts in step with each other; it decides nothing.
+All in one module, as they name each other: a lease its job, a job its lease.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, TypeVar
+
+from evopolicy_common.messages.environment import Case, EnvironmentDescription, ObservationForm, PolicyScope
+from evopolicy_common.messages.episode import (
+    BlobRef,
+    EpisodeOutcome,
+    FailureCategory,
+    Record,
+    ResourceLimits,
+    Tier,
+)
+from evopolicy_common.messages.gateway import VideoOption
+from evopolicy_common.messages.worker import Fingerprint
+
+from .events import RequestId
+from .records import AuditRow, EvaluationRow, PermitRow, RunRow, RunStateRow, SubmitRow
+from .structures.ledger import Ledger
+from .transitions import JOB, Place, check
+
+T = TypeVar("T")
+
+
+# ---- jobs ----
+
+
+TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION, AUDIT, HIDDEN_AUDIT = range(6)
+"""Priorities. Validation of a closed run and evaluations on hidden cases are `HELDOUT`'s, the random reference and other
+evaluations `REFERENCE`'s, audits of what `HIDDEN` has `HIDDEN_AUDIT`'s."""
+N_PRIORITIES = 6
+RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUDIT))
+"""Priorities that get fair shares of what those before them leave."""
+HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,), (AUDIT,))
+"""The same on a kernel that is turned over to hidden jobs (`precedence`)."""
+HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
+"""What a policy does, or did, on hidden cases: never on a kernel with an agent who could learn of it (`isolation`)."""
+
+GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
+
+
+class Mark(NamedTuple):
+    """What is kept of a finished episode while its group is open; equal for attempts that went the same way."""
+
+    episode_return: float
+    length: int
+    failure: FailureCategory | None
+    trajectory: str | None
+
+
+def mark_of(outcome: EpisodeOutcome) -> Mark:
+    """The mark of an outcome."""
+    return Mark(
+        outcome.episode_return,
+        outcome.length,
+        None if outcome.failure is None else outcome.failure.category,
+        None if outcome.trajectory is None else outcome.trajectory.digest,
+    )
+
+
+@dataclass(slots=True, frozen=True, kw_only=True)
+class Template:
+    """What all jobs of a group have in common."""
+
+    env: str
+    bundle: str | None
+    cases: tuple[Case, ...]
+    """One for each index."""
+    case_ids: tuple[int, ...]
+    occurrences: tuple[int, ...]
+    secret: bytes | None
+    """What policy seeds are derived from; None for the random reference, whose actions follow from split and case."""
+    split: str
+    submit_index: int
+    modulo: int
+    """`episode_index` is the index modulo this."""
+    per_job: int
+    """Episodes in a job: 1, or with policy scope `submit` as many as share one Policy."""
+    scope: PolicyScope
+    env_meta: dict[str, Any]
+    observations: ObservationForm
+    record: Record
+    video: VideoOption
+    tier: Tier
+    limits: ResourceLimits
+    max_steps: int
+    """As in `Job`."""
+    replays: tuple[BlobRef, ...] = ()
+    """Recorded actions for each index, in place of a policy; empty for none."""
+    indexes: tuple[int, ...] = ()
+    """For each index the one that it had in the list it was taken from; empty where it is the same."""
+
+
+@dataclass(slots=True, eq=False)
+class JobState:
+    """An open job: where it stands."""
+
+    job_id: str
+    group: JobGroup
+    first: int
+    """Index of its first episode."""
+    n: int
+    """Episodes in it."""
+    attempts: int
+    """Number of the last attempt."""
+    priority: int
+    ticket: int = 0
+    """Grows whenever it enters or leaves the queue: older queue entries are void."""
+    place: Place = "new"
+    """Where it is; `transitions.JOB` says what may follow."""
+    lease: Lease | None = None
+    failures: int = 0
+    """Infrastructure failures so far, in this incarnation."""
+    last_failure: str = ""
+    """What the last of them was and where, for an operator."""
+    avoid: str | None = None
+    """The worker that it last failed on: not given to it before `avoid_until`, while there is another."""
+    avoid_until: float = 0.0
+    alone: bool = False
+    """It is a suspect: played with nothing beside it."""
+    reserved: str | None = None
+    """The worker that is being emptied for it (of a suspect)."""
+    preemptions: int = 0
+    since: float = 0.0
+    """When it last began to wait."""
+    held_attempts: set[int] = field(default_factory=set)
+    """Attempts that this incarnation granted or adopted: none is adopted twice."""
+
+    @property
+    def queued(self) -> bool:
+        """Whether it waits in the queue."""
+        return self.place == "queued"
+
+    def move(self, place: Place) -> None:
+        """It is somewhere else now."""
+        check(JOB, self.job_id, self.place, place)
+        self.place = place
+
+    def names_blob(self, digest: str) -> bool:
+        """Whether its worker needs the blob: the bundle, or a recording that it plays."""
+        template = self.group.template
+        recordings = template.replays[self.first : self.first + self.n]
+        return digest == template.bundle or any(ref.digest == digest for ref in recordings)
+
+
+@dataclass(slots=True, eq=False)
+class JobGroup:
+    """A list of episodes that are played, stored and concluded together."""
+
+    id: str
+    kind: GroupKind
+    run: str
+    """Run or evaluation that it belongs to."""
+    submit_index: int
+    flow: Flow
+    template: Template
+    stimulus_id: str
+    priority: int
+    created_at: float
+    marks: dict[int, Mark] = field(default_factory=dict)
+    jobs: dict[int, JobState] = field(default_factory=dict)
+    """Open jobs, by their first index."""
+    first_leased_at: float | None = None
+    n_leased: int = 0
+    held_since: float | None = None
+    """Since when none of its episodes runs because hidden ones have its kernels; None while that is not so."""
+    held_s: float = 0.0
+    """How long that was before."""
+    held_counted_s: float = 0.0
+    """How much of it the submit's limit has been put off by."""
+    closed: bool = False
+    not_on: frozenset[str] = frozenset()
+    """Workers that never get it."""
+    not_of: frozenset[str] = frozenset()
+    """Machines whose workers never get it."""
+    numerics: str | None = None
+    """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
+
+    def held(self, now: float) -> float:
+        """Seconds for which none of its episodes ran because hidden ones had its kernels."""
+        return self.held_s + (0.0 if self.held_since is None else max(0.0, now - self.held_since))
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it is hidden work."""
+        return self.priority in HIDDEN
+
+    def bars(self, worker: Worker) -> bool:
+        """Whether a worker must not play it."""
+        if worker.name in self.not_on or worker.machine in self.not_of:
+            return True
+        return self.numerics not in (None, worker.numerics)
+
+    @property
+    def n(self) -> int:
+        """Episodes in all."""
+        return len(self.template.cases)
+
+    @property
+    def done(self) -> int:
+        """Episodes that have their outcome."""
+        return len(self.marks)
+
+    def returns(self) -> tuple[float, ...]:
+        """Returns in order of index; every episode must be done."""
+        return tuple(self.marks[index].episode_return for index in range(self.n))
+
+    def mean_return(self) -> float:
+        """Mean of the returns, summed exactly, so that order of arrival cannot show."""
+        return math.fsum(self.returns()) / self.n
+
+    def failed(self) -> int:
+        """Episodes whose policy failed."""
+        return sum(mark.failure is not None for mark in self.marks.values())
+
+    def first_unfinished(self) -> int:
+        """Smallest index without an outcome; `n` when all are done."""
+        return next((index for index in range(self.n) if index not in self.marks), self.n)
+
+
+@dataclass(slots=True, eq=False)
+class Lease:
+    """The right to play one attempt of a job."""
+
+    id: str
+    job: JobState
+    worker: str
+    attempt: int
+    granted_at: float
+    renewed: float
+    """When its holder last named it, or was given it."""
+    named: bool = False
+    """Whether its holder ever named it: if not, it may never have arrived."""
+    running: bool = False
+    started_at: float | None = None
+    """When it was first said to run."""
+    episodes_done: int = 0
+    steps: int = 0
+    progress_at: float = 0.0
+    live: bool = True
+    """False once it was given up: preempted, cancelled, expired, or its job is done."""
+    orphan_until: float | None = None
+    """Its session ended; a heartbeat may claim it until then."""
+    doubtful: bool = False
+    """Its holder was silent for long, or this incarnation did not grant it: a verdict about a limit may be the
+    silence's fault, and does not count."""
+    hidden_in: dict[Lease, None] | None = None
+    """Where it is listed as one that may be preempted."""
+    stopped_for: Lane | None = None
+    """Whose train jobs it was preempted for."""
+    stay: Stay | None = None
+    """Where it is, if it is hidden or train: as long as it is its worker's."""
+
+
+# ---- queues ----
+
+
+LaneKey = tuple[str, Tier, str]
+"""Environment, sandbox tier, fingerprint class."""
+
+ProfileKey = tuple[frozenset[str], frozenset[Tier], str]
+"""Environments, sandbox tiers, fingerprint class."""
+
+
+@dataclass(slots=True, eq=False)
+class Flow:
+    """A run or an evaluation, as something that gets its share."""
+
+    id: str
+    env: str
+    tier: Tier
+    of: Literal["run", "evaluation"]
+    secret: bytes
+    """Of the run or evaluation: its leases are named by it."""
+    seq: int
+    """Order of creation: breaks ties."""
+    family: Family | None = None
+    """Those that share its hidden cases; None where it has none."""
+    closed: bool = False
+    """No agent is at work for it: its hidden jobs wait for agents so long and no longer (`precedence`)."""
+    pin: str | None = None
+    """Fingerprint class; None until there is a worker for it."""
+    description: EnvironmentDescription | None = None
+    lane: Lane | None = None
+    served: list[float] = field(default_factory=lambda: [0.0] * N_PRIORITIES)
+    """Virtual time by priority: slot seconds handed out, counted from the clock it started at."""
+    ready: tuple[deque[tuple[int, JobState]], ...] = field(
+        default_factory=lambda: tuple(deque() for _ in range(N_PRIORITIES))
+    )
+    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    in_heap: list[bool] = field(default_factory=lambda: [False] * N_PRIORITIES)
+    n_leased: int = 0
+    episode_s: float | None = None
+    """Moving average of an episode's wall time; None before the first."""
+
+    def cost_s(self, job: JobState) -> float:
+        """What a job is expected to take, seconds of a slot; one second while nothing is known."""
+        return (1.0 if self.episode_s is None else self.episode_s) * job.n
+
+    def observe(self, wall_s: float) -> None:
+        """Learn from an episode that took `wall_s` seconds."""
+        self.episode_s = wall_s if self.episode_s is None else 0.8 * self.episode_s + 0.2 * wall_s
+
+
+@dataclass(slots=True, eq=False)
+class Lane:
+    """Flows that the same workers can serve."""
+
+    key: LaneKey
+    heaps: tuple[list[tuple[float, int, Flow]], ...] = field(
+        default_factory=lambda: tuple([] for _ in range(N_PRIORITIES))
+    )
+    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    waiting: tuple[dict[Family | None, int], ...] = field(
+        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
+    )
+    """Jobs that wait, suspects too, by priority and family."""
+    backlog: dict[Family, int] = field(default_factory=dict)
+    """Hidden ones of them that are of closed flows."""
+    kept_s: dict[Family, float] = field(default_factory=dict)
+    """How long such jobs were kept from all kernels, since there were last none."""
+    done_looks: dict[Family, int] = field(default_factory=dict)
+    reversals: dict[Family, Reversal] = field(default_factory=dict)
+    looked_at: float = 0.0
+    profiles: dict[Profile, None] = field(default_factory=dict)
+    stopping: int = 0
+    """Hidden jobs that were stopped for this lane's sake and whose workers have not let go of them yet."""
+
+    def count(self, priority: int, flow: Flow, n: int) -> None:
+        """So many more jobs of a flow wait."""
+        add(self.waiting[priority], flow.family, n)
+        if flow.closed and priority in HIDDEN and flow.family is not None:
+            add(self.backlog, flow.family, n)
+
+    def waits_of(self, family: Family | None, *, train_too: bool) -> bool:
+        """Whether hidden jobs wait of the family's relatives, or of any for None, and no train jobs that they leave the
+        kernel to; with `train_too` whether any of both do."""
+        if _of(self.waiting[TRAIN], family):
+            return train_too
+        return any(_of(self.waiting[priority], family) for priority in HIDDEN)
+
+    def slots(self) -> int:
+        """Slots of the workers that may serve it."""
+        return sum(profile.slots for profile in self.profiles)
+
+    def workers(self) -> int:
+        """How many active workers may serve it."""
+        return sum(len(profile.workers) for profile in self.profiles)
+
+    def top(self, priority: int) -> Flow | None:
+        """The flow to serve first; None when none waits."""
+        heap = self.heaps[priority]
+        while heap:
+            served, seq, flow = heap[0]
+            if flow.lane is not self or flow.n_ready[priority] == 0:
+                heapq.heappop(heap)
+                if flow.lane is self or flow.lane is None:
+                    flow.in_heap[priority] = False
+            elif served < flow.served[priority]:
+                heapq.heapreplace(heap, (flow.served[priority], seq, flow))
+            else:
+                return flow
+        return None
+
+
+@dataclass(slots=True, eq=False)
+class Profile:
+    """Workers that can do the same: environments, tiers and fingerprint class."""
+
+    key: ProfileKey
+    fingerprint: Fingerprint
+    descriptions: dict[str, EnvironmentDescription]
+    lanes: dict[LaneKey, Lane] = field(default_factory=dict)
+    busy: dict[Lane, None] = field(default_factory=dict)
+    """Its lanes in which something waits."""
+    workers: dict[str, None] = field(default_factory=dict)
+    """Those that are active: not lost, not draining."""
+    slots: int = 0
+    """Of the active ones."""
+    parked: dict[str, None] = field(default_factory=dict)
+    """Workers whose lease poll waits and could be answered now, oldest first."""
+    warm: dict[str, dict[str, None]] = field(default_factory=dict)
+    """Warm environment or bundle digest to those of `parked` that have it."""
+    hidden: tuple[dict[Lease, None], ...] = field(
+        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
+    )
+    """Live leases of its workers that may be preempted, by priority, oldest first."""
+
+    @property
+    def fingerprint_class(self) -> str:
+        """What runs are pinned to; see `Fingerprint`."""
+        return self.key[2]
+
+    def serves(self, key: LaneKey) -> bool:
+        """Whether these workers may play what waits in a lane of that key."""
+        env, tier, fingerprint_class = key
+        return env in self.key[0] and tier in self.key[1] and fingerprint_class == self.key[2]
+
+
+def _of(there: dict[Family | None, int], family: Family | None) -> bool:
+    return bool(there) and (family is None or not family.relatives.keys().isdisjoint(there))
+
+
+def add(counts: dict[T, int], key: T, n: int) -> None:
+    left = counts.get(key, 0) + n
+    if left:
+        counts[key] = left
+    else:
+        counts.pop(key, None)
+
+
+# ---- kernels ----
+
+
+CaseKey = tuple[str, int, str]
+"""Environment, seed, options."""
+
+EVERYWHERE = ""
+"""The kernel of whoever does not say: it may be any."""
+
+
+@dataclass(slots=True, eq=False)
+class Family:
+    """All runs and evaluations that have the same hidden cases."""
+
+    cases: frozenset[CaseKey]
+    relatives: dict[Family, None] = field(default_factory=dict)
+    """Those that share a case with it, itself included."""
+    users: int = 0
+    hidden_on: dict[Kernel, int] = field(default_factory=dict)
+    """Kernels to how many of its hidden jobs are there."""
+    lanes: dict[Lane, None] = field(default_factory=dict)
+    """Where its jobs wait, or have waited."""
+
+
+@dataclass(slots=True, eq=False)
+class Stay:
+    """A hidden or train lease on the kernel of its worker, as long as it may be played there."""
+
+    id: str
+    worker: str
+    kernel: Kernel
+    machine_id: str
+    family: Family | None
+    """None: not known, so related to all."""
+    hidden: bool
+    lease: Lease | None
+    """None once the coordinator has given it up, or never granted it."""
+    serial: int = 0
+    """Number of the poll that it was granted to; 0: it had arrived before its worker was first heard."""
+    until: float | None = None
+    """When it has surely ended, once its lease was given up."""
+
+    @property
+    def key(self) -> str:
+        """One lease may be in the hands of several workers, when it was given up."""
+        return f"{self.worker} {self.id}"
+
+
+Stays = dict[Family | None, dict[str, Stay]]
+
+
+@dataclass(slots=True, eq=False)
+class Ask:
+    """A permit that is asked for."""
+
+    row: PermitRow
+    family: Family
+    kernel: Kernel
+
+
+@dataclass(slots=True, eq=False)
+class Reversal:
+    """Hidden jobs of a family go first on a kernel."""
+
+    kernel: Kernel
+    lane: Lane
+    family: Family
+
+
+@dataclass(slots=True, eq=False)
+class Kernel:
+    """What is, or may be, on one kernel."""
+
+    boot_id: str
+    workers: dict[str, None] = field(default_factory=dict)
+    permits: dict[Family | None, dict[str, PermitRow]] = field(default_factory=dict)
+    """By run."""
+    asks: dict[Family | None, dict[str, Ask]] = field(default_factory=dict)
+    hidden: Stays = field(default_factory=dict)
+    train: Stays = field(default_factory=dict)
+    reversals: dict[Family | None, dict[str, Reversal]] = field(default_factory=dict)
+
+
+# ---- workers ----
+
+
+OutOfService = Literal["draining", "paused"]
+
+
+@dataclass(slots=True, eq=False)
+class LeasePoll:
+    """A worker's long poll for leases."""
+
+    request: RequestId
+    n: int
+    warm: frozenset[str]
+    until: float
+    """When it is answered with what there is."""
+    serial: int = 0
+    """The worker's own number of it."""
+
+
+@dataclass(slots=True, eq=False)
+class Worker:
+    """One worker as the core knows it."""
+
+    name: str
+    session: str
+    slots: int
+    host: str
+    profile: Profile
+    last_seen: float
+    kernel: Kernel
+    machine_id: str = ""
+    first_serial: int | None = None
+    """Number of the session's first poll."""
+    machine: str = ""
+    """Whose credentials it joined with; empty for those that the state folder hands out."""
+    numerics: str = ""
+    """What its numbers depend on: equal for workers that come to the same bits, the processor's features included."""
+    state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
+    leases: dict[str, Lease] = field(default_factory=dict)
+    """By id, oldest first; given-up ones too, until the worker no longer names them."""
+    held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    """Live leases by priority."""
+    n_live: int = 0
+    """Live leases in all."""
+    poll: LeasePoll | None = None
+    beat: RequestId | None = None
+    """A heartbeat whose answer is held back."""
+    doubted_at: float | None = None
+    """When its liveliness token went; None while it is there, or since it was heard from."""
+    reserved: JobState | None = None
+    """The suspect it is being emptied for."""
+    alone: Lease | None = None
+    """The suspect it plays, with nothing beside it."""
+    failures: int = 0
+    """Jobs in a row that failed through its own fault."""
+    benched_until: float = 0.0
+
+    def running(self) -> list[Lease]:
+        """Leases it plays now: as it said, or the oldest, one a slot, as long as it has not said."""
+        told = [lease for lease in self.leases.values() if lease.running]
+        return told or list(self.leases.values())[: self.slots]
+
+
+# ---- runs ----
+
+
+@dataclass(slots=True, eq=False)
+class Run:
+    """An unfinished run."""
+
+    row: RunRow
+    state: RunStateRow
+    ledger: Ledger
+    flow: Flow
+    submits: list[SubmitRow] = field(default_factory=list)
+    keys: dict[str, int] = field(default_factory=dict)
+    """Idempotency key to submit index."""
+    open: int | None = None
+    """The submit in flight."""
+    hidden_failures: dict[str, int] = field(default_factory=dict)
+    """Group id to hidden episodes in which the policy failed, of finished groups."""
+    hidden_returns: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Held-out and random group id to returns, of finished groups."""
+    rollout_s: float = 0.0
+    queue_s: float = 0.0
+    played: dict[str, int] = field(default_factory=dict)
+    """Worker to the run's episodes that it has played."""
+    audits: dict[str, AuditRow] = field(default_factory=dict)
+    """All that were drawn, by id."""
+    audits_waited_s: float = 0.0
+    """How long the run, done otherwise, has waited for audits that could be played."""
+    audits_looked_at: float | None = None
+    """When that was last counted; None before."""
+
+    @property
+    def id(self) -> str:
+        return self.row.run
+
+    @property
+    def family(self) -> Family:
+        """The runs that share its hidden cases."""
+        assert self.flow.family is not None
+        return self.flow.family
+
+
+@dataclass(slots=True, eq=False)
+class Evaluation:
+    """An unfinished evaluation."""
+
+    row: EvaluationRow
+    flow: Flow
+
+
+@dataclass(slots=True, frozen=True)
+class Ended:
+    """What stays known of a finished one."""
+
+    total: int
+    """Outcomes that are stored."""

@@ -1,0 +1,156 @@
+"""The end of a run's audits: how long the run waits for them, who could still play them, what its record tells of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from evopolicy_common.messages.audit import AuditFinding, AuditRecord
+from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.model import Run, Worker
+from evopolicy_coordinator.core.records import AuditRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+from .audits import dispute, settle, words
+from .templates import HIDDEN_SPLITS
+
+LOOK_AGAIN_S = 5.0
+"""A run that waits for its audits sees so often whether anyone can still play them."""
+
+FINDINGS_MAX = 100
+"""Findings that a run's record keeps."""
+
+ONE_WORKER = "one worker only"
+ONE_MACHINE = "one machine only"
+OTHERS_DIFFER = "the other workers have other versions or processors"
+UNKNOWN_KERNEL = "the other workers' kernels are not known"
+NOT_REPEATABLE = "the environment is marked as not deterministic"
+NO_STEPS = "no step was played"
+TOO_LATE = "nobody played it again in time"
+CANCELLED = "the run was cancelled"
+FORGING_AUDITOR = "only a forger had played it again"
+
+
+def holds_up(state: State, run: Run, step: Step) -> bool:
+    """Whether a run that is done otherwise still waits for audits; gives up those that are waited for no more."""
+    waiting = [row for row in run.audits.values() if row.state == "open"]
+    if not waiting:
+        state.timers.disarm(("audits", run.id))
+        return False
+    if run.audits_looked_at is not None and all(_playable(state, run, row) for row in waiting):
+        run.audits_waited_s += step.now - run.audits_looked_at
+    run.audits_looked_at = step.now
+    left_s = state.settings.audit_wait_s - run.audits_waited_s
+    # After a start or a standstill workers may not have come back yet.
+    in_vain = step.now >= state.hold_until and all(_obstacle(state, run, row) for row in waiting)
+    if left_s > 0.0 and not in_vain:
+        state.timers.arm(("audits", run.id), step.now + min(left_s, LOOK_AGAIN_S))
+        return True
+    state.timers.disarm(("audits", run.id))
+    for row in waiting:
+        _give_up(state, run, row, _obstacle(state, run, row) or TOO_LATE, step)
+    return False
+
+
+def _give_up(state: State, run: Run, row: AuditRow, reason: str, step: Step) -> None:
+    if not row.difference:
+        settle(state, run, row, step, verdict="not_audited", reason=reason)
+    elif row.replayed_by[0] in state.quarantined:
+        settle(state, run, row, step, verdict="not_audited", reason=FORGING_AUDITOR)
+    else:
+        settle(state, run, row, step, verdict="disputed", reason="no third worker to decide")
+        dispute(state, words(row), step)
+
+
+def _obstacle(state: State, run: Run, row: AuditRow) -> str:
+    """Why no worker that is known can play the audit's next replay; empty when one can, or the shell is at it."""
+    if row.actions is None or len(row.replayed_by) > row.compared:
+        return ""
+    reason = ONE_WORKER
+    for _, why in _auditors(state, run, row):
+        if not why:
+            return ""
+        reason = why if reason == ONE_WORKER or why != ONE_MACHINE else reason
+    return reason
+
+
+def _playable(state: State, run: Run, row: AuditRow) -> bool:
+    """Whether some worker may play the audit's next replay now, or nobody can, or the shell is at it: waiting counts."""
+    if row.actions is None or len(row.replayed_by) > row.compared or row.kind not in HIDDEN_SPLITS:
+        return True
+    able = [worker for worker, why in _auditors(state, run, row) if not why]
+    return (
+        not able
+        or not state.isolates
+        or any(bars.hidden_bar(state, run.family, worker.kernel) is None for worker in able)
+    )
+
+
+def _auditors(state: State, run: Run, row: AuditRow) -> Iterator[tuple[Worker, str]]:
+    """Workers that have not had to do with the episode, each with why it cannot play it again; empty when it can."""
+    for worker in state.workers.values():
+        had = worker.name == row.player or worker.name in row.replayed_by
+        shut_out = worker.name in state.quarantined or worker.machine in state.quarantined_machines
+        if had or shut_out or run.flow.env not in worker.profile.descriptions:
+            continue
+        if worker.machine in row.machines:
+            yield worker, ONE_MACHINE
+        elif worker.numerics != row.numerics:
+            yield worker, OTHERS_DIFFER
+        elif state.isolates and row.kind in HIDDEN_SPLITS and worker.kernel is state.everywhere:
+            yield worker, UNKNOWN_KERNEL
+        else:
+            yield worker, ""
+
+
+def cancel(state: State, run: Run, step: Step) -> None:
+    """The run is cancelled: what is open of its audits is played no more."""
+    for row in list(run.audits.values()):
+        if row.state == "open":
+            _give_up(state, run, row, CANCELLED, step)
+
+
+def waits_for(run: Run) -> str:
+    """What a run that is otherwise done waits for."""
+    n = sum(row.state == "open" for row in run.audits.values())
+    return f"{n} audits of its episodes on other workers" if n else ""
+
+
+def record(state: State, run: Run) -> AuditRecord | None:
+    """What a finished run's audits came to; None where nothing was to be audited and no forger played in it."""
+    rows = list(run.audits.values())
+    named = {row.replayed_by[0] if row.state == "agreed" else row.forger for row in rows if _told(row)} - {""}
+    named |= {name for name in run.played if name in state.quarantined}
+    if not run.row.audit_share and not named:
+        return None
+    why: dict[str, int] = {}
+    for row in rows:
+        if row.state == "not_audited":
+            why[row.reason] = why.get(row.reason, 0) + 1
+    states = [row.state for row in rows]
+    return AuditRecord(
+        share=run.row.audit_share,
+        sampled=len(rows),
+        audited=states.count("agreed") + states.count("disputed"),
+        agreed=states.count("agreed"),
+        disputed=states.count("disputed"),
+        not_audited=dict(sorted(why.items())),
+        forgers={name: run.played.get(name, 0) for name in sorted(named)},
+        findings=tuple(_finding(row) for row in rows if _told(row))[:FINDINGS_MAX],
+    )
+
+
+def _told(row: AuditRow) -> bool:
+    return row.state == "disputed" or (row.state == "agreed" and bool(row.difference))
+
+
+def _finding(row: AuditRow) -> AuditFinding:
+    return AuditFinding(
+        split=row.kind,
+        submit_index=row.submit_index,
+        episode=row.index,
+        player=row.player,
+        auditors=row.replayed_by,
+        difference=row.difference or row.reason,
+        forger=row.replayed_by[0] if row.state == "agreed" else row.forger,
+    )

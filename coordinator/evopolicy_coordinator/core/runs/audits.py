@@ -1,0 +1,258 @@
+"""Audits: of a sampled share of the episodes that workers hand in, the recorded actions are played again elsewhere.
+
+Rules that this module owns:
+- Which episodes are drawn follows from the run's secret, so no worker can tell which of its own they will be.
+- An episode is never audited by its player, and only by workers of the same versions and processor features: others may
+  honestly come to other bits. Environments that do not repeat themselves are not audited.
+- Recorded actions are played, no policy: what a policy reads from a clock changes nothing. Who plays them again is told
+  the actions alone, so it cannot echo what it should confirm.
+- Where machines have credentials of their own, player and auditors are of as many machines, and a forger's machine goes
+  with it: whoever brings several workers has one voice.
+- Two workers that disagree are in dispute; a third opinion decides. Who stands alone against two is named and gets no
+  more leases. What is settled stays, once and for all; the run says that it is in question.
+- Audits come last in the queue and are stopped for any train job. A run that is otherwise done waits for them
+  `CoreSettings.audit_wait_s` at most, and not at all for what no other worker can play. Time in which a hidden one is kept
+  from all workers that could play it (`isolation`) does not count.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from typing import Any
+
+import msgspec
+
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.leasing import expiry, fleet, groups
+from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.records import AuditRow, WorkerRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step
+
+from . import templates
+
+LOOK_AGAIN_S = 5.0
+"""A run that waits for its audits sees so often whether anyone can still play them."""
+
+FINDINGS_MAX = 100
+"""Findings that a run's record keeps."""
+
+ONE_WORKER = "one worker only"
+ONE_MACHINE = "one machine only"
+OTHERS_DIFFER = "the other workers have other versions or processors"
+UNKNOWN_KERNEL = "the other workers' kernels are not known"
+NOT_REPEATABLE = "the environment is marked as not deterministic"
+NO_STEPS = "no step was played"
+TOO_LATE = "nobody played it again in time"
+CANCELLED = "the run was cancelled"
+FORGING_AUDITOR = "only a forger had played it again"
+
+
+def drawn(secret: bytes, group: str, index: int, share: float) -> bool:
+    """Whether the episode at `index` of a group is among the sampled `share`."""
+    digest = hmac.digest(secret, f"audit|{group}|{index}".encode(), hashlib.sha256)
+    return int.from_bytes(digest[:8], "big") < share * 2.0**64
+
+
+def audit_id(group: str, index: int) -> str:
+    """What an audit is called; the group of its k-th replay (from 1) is `id.k`."""
+    return f"{group}/audit-{index}"
+
+
+# ---- how an audit goes ----
+
+
+def sample(state: State, news: EpisodesDone, step: Step) -> None:
+    """Draw from the episodes that a worker has handed in."""
+    group, worker = news.group, news.worker
+    run, kind = state.runs.get(group.run), group.kind
+    if run is None or worker is None or kind == "evaluation" or kind == "audit":
+        return
+    run.played[worker.name] = run.played.get(worker.name, 0) + len(news.outcomes)
+    if not run.row.audit_share:
+        return
+    description = run.state.description
+    for outcome in news.outcomes:
+        if not drawn(run.row.secret, group.id, outcome.index, run.row.audit_share):
+            continue
+        reason = ""
+        if description is not None and not description.deterministic:
+            reason = NOT_REPEATABLE
+        elif outcome.trajectory is None or not outcome.length:
+            reason = NO_STEPS
+        row = AuditRow(
+            run=run.id,
+            audit=audit_id(group.id, outcome.index),
+            group=group.id,
+            index=outcome.index,
+            kind=kind,
+            submit_index=group.submit_index,
+            player=worker.name,
+            machines=(worker.machine,) if worker.machine else (),
+            numerics=worker.numerics,
+            state="not_audited" if reason else "open",
+            reason=reason,
+        )
+        step.put_audit(run, row)
+        if row.state == "open":
+            step.add(_prepare(row, step))
+
+
+def _prepare(row: AuditRow, step: Step) -> PrepareAudit:
+    return PrepareAudit(
+        run=row.run, audit=row.audit, group=row.group, index=row.index, stimulus_id=step.stimulus_id
+    )
+
+
+def prepared(state: State, event: events.AuditPrepared, step: Step) -> None:
+    """The actions of an audited episode are stored by themselves, or could not be read."""
+    run, row = _open(state, event.run, event.audit)
+    if run is None or row is None or row.actions is not None:
+        return
+    if event.actions is None:
+        settle(
+            state, run, row, step, verdict="disputed" if event.at_fault else "not_audited", reason=event.error
+        )
+        if event.at_fault:
+            dispute(state, f"{row.player} handed in {row.group}, episode {row.index}: {event.error}", step)
+    else:
+        _play(state, run, step.put_audit(run, msgspec.structs.replace(row, actions=event.actions)), step)
+    step.tell(AuditsMoved(run))
+
+
+def replayed(state: State, news: EpisodesDone, step: Step) -> None:
+    """A worker has played an audited episode again."""
+    group, worker = news.group, news.worker
+    if worker is None:
+        return  # it was stored with its audit's row
+    run, row = _open(state, group.run, group.id.rpartition(".")[0])
+    groups.close_group(state, group, step, "played again")
+    if run is not None and row is not None:
+        machines = (*row.machines, worker.machine) if worker.machine else row.machines
+        row = msgspec.structs.replace(row, replayed_by=(*row.replayed_by, worker.name), machines=machines)
+        step.add(_compare(step.put_audit(run, row), step))
+
+
+def _compare(row: AuditRow, step: Step) -> CompareAudit:
+    return CompareAudit(
+        run=row.run,
+        audit=row.audit,
+        group=row.group,
+        index=row.index,
+        replays=tuple(f"{row.audit}.{n + 1}" for n in range(len(row.replayed_by))),
+        stimulus_id=step.stimulus_id,
+    )
+
+
+def compared(state: State, event: events.AuditCompared, step: Step) -> None:
+    """The last replay was compared with what its player had handed in, and with the replay before it."""
+    run, row = _open(state, event.run, event.audit)
+    if run is None or row is None or event.replay != len(row.replayed_by) or row.compared >= event.replay:
+        return
+    row = msgspec.structs.replace(row, compared=event.replay)
+    if event.error:
+        settle(state, run, row, step, verdict="not_audited", reason=event.error)
+    elif event.with_player is None:
+        settle(state, run, row, step, verdict="agreed")
+        if row.difference:
+            _name(state, row.replayed_by[0], row, step)
+    elif event.replay == 1:
+        row = step.put_audit(run, msgspec.structs.replace(row, difference=event.with_player))
+        step.log("warning", "audit_differs", player=row.player, auditor=row.replayed_by[0], audit=row.audit,
+                 difference=row.difference)  # fmt: skip
+        if row.player in state.quarantined:
+            _refuted(state, run, row, step)
+        else:
+            _play(state, run, row, step)
+    elif event.with_first is None:
+        _refuted(state, run, row, step)
+        _name(state, row.player, row, step)
+    else:
+        settle(state, run, row, step, verdict="disputed", reason="three workers, three results")
+        dispute(state, words(row), step)
+    step.tell(AuditsMoved(run))
+
+
+def _refuted(state: State, run: Run, row: AuditRow, step: Step) -> None:
+    settle(state, run, row, step, verdict="disputed", reason="refuted", forger=row.player)
+
+
+def _open(state: State, run_id: str, audit: str) -> tuple[Run | None, AuditRow | None]:
+    """The run and its audit, as long as that is open."""
+    run = state.runs.get(run_id)
+    row = None if run is None else run.audits.get(audit)
+    return run, row if row is not None and row.state == "open" else None
+
+
+def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, **fields: Any) -> None:
+    """The audit is over; nothing more is played for it."""
+    for n in range(1, len(row.replayed_by) + 2):
+        group = state.groups.get(f"{row.audit}.{n}")
+        if group is not None:
+            groups.close_group(state, group, step, "its audit is over")
+    row = step.put_audit(run, msgspec.structs.replace(row, actions=None, state=verdict, **fields))
+    state.story.tell(step.now, step.stimulus_id, row.audit, f"audit: {row.state} {row.reason}")
+
+
+def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:
+    """Queue the next replay of an audit, for a worker that has not had to do with the episode."""
+    groups.open_group(state, templates.build("audit", run, row, step.now, step.stimulus_id), step)
+
+
+def resume(state: State, run: Run, step: Step) -> None:
+    """Go on, in a state that was just loaded, with what is open of a run's audits."""
+    for row in list(run.audits.values()):
+        if row.state != "open":
+            continue
+        if row.actions is None:
+            step.add(_prepare(row, step))
+        elif len(row.replayed_by) > row.compared:
+            step.add(_compare(row, step))
+        else:
+            _play(state, run, row, step)
+
+
+# ---- forgers ----
+
+
+def words(row: AuditRow) -> str:
+    """Who disagrees about what."""
+    others = " and ".join(row.replayed_by)
+    return f"{row.player} and {others} disagree about {row.group}, episode {row.index}: {row.difference}"
+
+
+def undecided(state: State) -> list[str]:
+    """Disputes of unfinished runs that wait for a third worker, in words."""
+    rows = [row for run in state.runs.values() for row in run.audits.values()]
+    return [f"{words(row)}; a third is to decide" for row in rows if row.state == "open" and row.difference]
+
+
+def dispute(state: State, text: str, step: Step) -> None:
+    """Tell operators of a dispute."""
+    state.disputes.append(text)
+    step.log("error", "audit_disputed", what=text)
+
+
+def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
+    """A worker was found to have handed in what two others refute: it gets no more leases."""
+    said = "handed in" if name == row.player else "played again"
+    text = f"forged results: what it {said} as {row.group}, episode {row.index}, two other workers refute ({row.difference})"
+    if name in state.quarantined:
+        return
+    workers = state.workers
+    machine = workers[name].machine if name in workers else ""
+    step.log("error", "forger_named", worker=name, machine=machine, why=text)
+    beside = [
+        each.name for each in workers.values() if machine and each.machine == machine and each.name != name
+    ]
+    for each, why in (*((other, f"its machine's {name} {text}") for other in beside), (name, text)):
+        step.persist(WorkerRow(worker=each, state="quarantined", reason=why, machine=machine))
+        fleet.set_state(state, each, "quarantined", why, machine)
+        expiry.take_away(state, each, step)
+    for run in list(state.runs.values()):
+        for other in list(run.audits.values()):
+            if other.state == "open" and other.player == name and other.difference:
+                _refuted(state, run, other, step)
+        step.tell(AuditsMoved(run))

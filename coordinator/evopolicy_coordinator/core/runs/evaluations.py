@@ -1,0 +1,157 @@
+"""Evaluations: cases that an operator has played outside any run (`try`, `random`), or again (`verify`).
+
+Rules that this module owns: no budget is concerned; the same key gives the same evaluation; a bundle that brings its slots
+down too often ends its evaluation with that word.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from evopolicy_common.messages import operator
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import ReadEvaluation
+from evopolicy_coordinator.core.leasing import groups, pins
+from evopolicy_coordinator.core.model import Ended, Evaluation, JobGroup
+from evopolicy_coordinator.core.records import EvaluationRow, evaluation_group
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import EpisodesDone, FlowPinned, Step
+from evopolicy_coordinator.core.structures.polls import Poll
+
+from . import templates, waits
+
+
+def request(state: State, event: events.EvaluationRequested, step: Step) -> None:
+    """Queue an operator's cases, once for each key."""
+    message = event.message
+    known = state.evaluation_keys.get(message.key)
+    if known is not None:
+        step.reply(event.request, operator.EvaluationStarted(evaluation=known))
+        return
+    if not event.cases or len(event.cases) != len(event.case_ids):
+        step.refuse(event.request, Refusal.BAD_REQUEST, "an evaluation needs at least one case")
+        return
+    row = EvaluationRow(
+        evaluation=event.evaluation,
+        key=message.key,
+        env=message.env,
+        bundle=message.bundle,
+        split=message.split,
+        case_ids=event.case_ids,
+        cases=event.cases,
+        secret=event.secret,
+        record=message.record,
+        tier=message.sandbox_tier,
+        limits=message.limits,
+        replays=message.replays,
+        as_in=message.as_in,
+        max_steps=event.max_steps,
+        created_at=step.now,
+        stimulus_id=step.stimulus_id,
+    )
+    step.persist(row)
+    evaluation = enter(state, row)
+    pins.pin(state, evaluation.flow, step)
+    play(state, evaluation, step)
+    step.reply(event.request, operator.EvaluationStarted(evaluation=row.evaluation))
+
+
+def enter(state: State, row: EvaluationRow) -> Evaluation:
+    """Take an evaluation into the core, with nothing of it queued yet."""
+    family = state.families.join(row.env, row.cases) if templates.hidden_evaluation(row) else None
+    name = row.evaluation
+    flow = pins.add_flow(state, name, "evaluation", row.env, row.tier, row.secret, family, closed=True)
+    evaluation = state.evaluations[name] = Evaluation(row, flow)
+    state.evaluation_keys[row.key] = name
+    return evaluation
+
+
+def play(state: State, evaluation: Evaluation, step: Step) -> None:
+    """Queue the episodes of an evaluation."""
+    group = templates.build("evaluation", evaluation, evaluation.row, step.now, step.stimulus_id)
+    groups.open_group(state, group, step)
+
+
+def pinned(state: State, news: FlowPinned, step: Step) -> None:
+    """Keep the class of workers that an evaluation is played by."""
+    evaluation = state.evaluations[news.flow.id]
+    evaluation.row = msgspec.structs.replace(evaluation.row, fingerprint_class=news.profile.fingerprint_class)
+    step.persist(evaluation.row)
+
+
+def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+    """Episodes of an evaluation are done: tell those who wait, and end it with its last."""
+    group = news.group
+    if group.done == group.n:
+        end(state, group, "", step)
+    else:
+        _answer_polls(state, group, step, finished=False)
+
+
+def cancel(state: State, name: str, step: Step) -> bool:
+    """End an evaluation that runs; False when there is none."""
+    if name not in state.evaluations:
+        return name in state.ended_evaluations
+    end(state, state.groups[evaluation_group(name)], "cancelled by the operator", step)
+    return True
+
+
+def end(state: State, group: JobGroup, error: str, step: Step) -> None:
+    """Nothing more of an evaluation is played; `error` says why it ended early."""
+    evaluation = state.evaluations.pop(group.run)
+    step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
+    state.ended_evaluations[group.run] = Ended(group.done)
+    groups.close_group(state, group, step, error or "all done")
+    pins.drop_flow(state, evaluation.flow)
+    _answer_polls(state, group, step, finished=True)
+
+
+def _answer_polls(state: State, group: JobGroup, step: Step, *, finished: bool) -> None:
+    for poll in state.polls.take_all(group.id):
+        step.add(_page(state, poll, group, step, finished=finished))
+
+
+def polled(state: State, event: events.Asked[operator.EvaluationPoll], step: Step) -> None:
+    """An operator asks for outcomes: answered at once, or when there are more than it has."""
+    message = event.message
+    poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)
+    ended = state.ended_evaluations.get(message.evaluation)
+    if ended is not None:
+        step.add(
+            ReadEvaluation(
+                request=event.request,
+                evaluation=message.evaluation,
+                cursor=max(0, message.cursor),
+                upto=ended.total,
+                total=ended.total,
+                finished=True,
+                stimulus_id=step.stimulus_id,
+            )
+        )
+        return
+    group = state.groups.get(poll.target)
+    if group is None:
+        step.refuse(
+            event.request, Refusal.UNKNOWN_EVALUATION, f"there is no evaluation {message.evaluation!r}"
+        )
+    elif group.done > message.cursor or not state.polls.wait(poll, message.wait_s, step.now):
+        step.add(_page(state, poll, group, step, finished=False))
+
+
+def answer(state: State, poll: Poll, step: Step) -> None:
+    """Answer a poll whose time is up."""
+    step.add(_page(state, poll, state.groups[poll.target], step, finished=False))
+
+
+def _page(state: State, poll: Poll, group: JobGroup, step: Step, *, finished: bool) -> ReadEvaluation:
+    return ReadEvaluation(
+        request=poll.request,
+        evaluation=group.run,
+        cursor=max(0, poll.cursor),
+        upto=group.done,
+        total=group.done if finished else group.n,
+        finished=finished,
+        waits_for="" if finished else waits.waits_for(state, group),
+        stimulus_id=step.stimulus_id,
+    )

@@ -1,0 +1,176 @@
+"""What follows once a run takes no more submits: validation, selection, held-out, the random reference.
+
+Rules that this module owns:
+- Every ok checkpoint is validated on all hidden validation cases. That begins as soon as it is ok, in idle slots, and is
+  never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle, env_meta, case, scope and
+  policy seed, in a run that is pinned to one fingerprint class.
+- Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later submit.
+- A checkpoint that an earlier version found ineligible stays so, and only the finished run says it.
+- The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
+  split and case (`seeds.reference_seed`), except in a run that was created when they followed from its secret.
+- Each stage is found again from the store: `advance` may be called any number of times.
+"""
+
+from __future__ import annotations
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.leasing import groups, queue
+from evopolicy_coordinator.core.model import HELDOUT, JobGroup, Run
+from evopolicy_coordinator.core.records import (
+    FinishedRow,
+    SubmitRow,
+    heldout_group,
+    random_group,
+    train_group,
+    validation_group,
+)
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step, SubmitEnded
+
+from . import audit_end, evaluations, finished, results, runs, templates
+
+# ---- hidden groups ----
+
+
+def validate(state: State, run: Run, row: SubmitRow, step: Step) -> None:
+    """Queue the validation of an ok checkpoint; in idle slots only as long as the run is open."""
+    if validation_group(run.id, row.submit_index) not in state.groups:
+        _open(state, templates.build("validation", run, row, step.now, step.stimulus_id), step)
+
+
+def _open(state: State, group: JobGroup, step: Step) -> None:
+    if group.id not in state.groups:
+        groups.open_group(state, group, step)
+
+
+def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+    """Some hidden episodes are done."""
+    group = news.group
+    if group.done < group.n:
+        return
+    run = state.runs[group.run]
+    run.hidden_failures[group.id] = group.failed()
+    if group.kind == "validation":
+        step.change_submit(run, group.submit_index, val_mean=group.mean_return())
+    else:
+        run.hidden_returns[group.id] = group.returns()
+    groups.close_group(state, group, step, "all done")
+    advance(state, run, step)
+
+
+def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
+    """A submit has its verdict: its hidden validation may begin, and a closed run may go on."""
+    if news.row.status == "ok":
+        validate(state, news.run, news.row, step)
+    advance(state, news.run, step)
+
+
+def audits_moved(state: State, news: AuditsMoved, step: Step) -> None:
+    """An audit of a run is over: the run may have waited for it."""
+    advance(state, news.run, step)
+
+
+def look_at_audits(state: State, name: str, step: Step) -> None:
+    """A run that waits for its audits sees whether anyone can still play them."""
+    run = state.runs.get(name)
+    if run is not None:
+        advance(state, run, step)
+
+
+# ---- stages ----
+
+
+def close(state: State, event: events.Asked[gateway.CloseRun], step: Step) -> None:
+    """The agent is gone: no more submits, and the hidden cases are played. Closing twice is closing once."""
+    message = event.message
+    run = state.runs.get(message.run)
+    if run is None and message.run not in state.capabilities:
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        return
+    permits.end(state, message.run, step, "its run was closed")
+    permits.drop_asks(state, message.run, Refusal.RUN_CLOSED, f"run {message.run!r} is closed", step)
+    if run is not None and run.state.phase == "open":
+        step.change_run(
+            run, phase="closed", closed_at=step.now, close_reason=message.reason, agent=message.agent
+        )
+        queue.close(state, run.flow)
+        step.log("info", "run_closed", run=run.id, reason=message.reason, submits=len(run.submits))
+        advance(state, run, step)
+    step.reply(event.request, gateway.RunClosed())
+
+
+def advance(state: State, run: Run, step: Step) -> None:
+    """Take a closed run as far as it can go now."""
+    if run.state.phase != "closed" or run.open is not None:
+        return
+    if finished.unspent(run):
+        _finish(state, run, None, step, unplayed=True)
+        return
+    if random_group(run.id) not in run.hidden_returns:
+        _open(state, templates.build("random", run, None, step.now, step.stimulus_id), step)
+    waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
+    for row in waiting:
+        validate(state, run, row, step)
+        groups.promote(state, state.groups[validation_group(run.id, row.submit_index)], HELDOUT, step)
+    if waiting:
+        return
+    best = finished.select(run)
+    if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
+        _open(state, templates.build("heldout", run, best, step.now, step.stimulus_id), step)
+        return
+    if finished.unspent(run):
+        _finish(state, run, None, step, unplayed=True)
+        return
+    if random_group(run.id) in run.hidden_returns and not audit_end.holds_up(state, run, step):
+        _finish(state, run, best, step)
+
+
+def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) -> None:
+    """An operator ends a run here and now: nothing of it is scored."""
+    message = event.message
+    run = state.runs.get(message.run)
+    if run is None:
+        if evaluations.cancel(state, message.run, step) or message.run in state.capabilities:
+            step.reply(event.request, operator.Done())
+        else:
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        return
+    if run.open is not None:
+        index, run.open = run.open, None
+        run.ledger.refund(index)
+        step.change_submit(run, index, status="cancelled", completed_at=step.now, refunded=True)
+        group = state.groups[train_group(run.id, index)]
+        groups.close_group(state, group, step, "run cancelled")
+        results.answer_polls(state, group, step)
+    if run.state.phase == "open":
+        step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
+        permits.cancelled(state, run.id, step)
+    permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, f"run {run.id!r} was cancelled", step)
+    _finish(state, run, None, step, cancelled=True, unplayed=True)
+    step.reply(event.request, operator.Done())
+
+
+def _finish(
+    state: State,
+    run: Run,
+    best: SubmitRow | None,
+    step: Step,
+    *,
+    cancelled: bool = False,
+    unplayed: bool = False,
+) -> None:
+    """The run is over: its result becomes durable, and all that the core holds of it goes. `unplayed`: as far as it got."""
+    audit_end.cancel(state, run, step)
+    state.timers.disarm(("audits", run.id))
+    for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
+        groups.close_group(state, group, step, "run cancelled" if cancelled else "budget not spent")
+    result = finished.result(state, run, best, step.now, cancelled=cancelled)
+    step.persist(FinishedRow(run=run.id, result=result))
+    step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
+    runs.forget(state, run)
+    for poll in state.polls.take_all(run.id):
+        step.add(results.finished_effect(poll.request, run.id, step))
+    step.log("info", "run_finished", run=run.id, status=result.status, best=result.best_submit_index)

@@ -1,0 +1,191 @@
+"""What a run came to, and where an unfinished one stands: for its operator and for `run.json`."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from evopolicy_common.messages import operator
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.records import (
+    SubmitRow,
+    heldout_group,
+    random_group,
+    submit_done,
+    train_group,
+    validation_group,
+)
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.structures.polls import Poll
+
+from . import audit_end, results, waits
+
+
+def unspent(run: Run) -> int:
+    """Episodes of its budget that the agent of a run which must spend it has left; what no submit can have does not count."""
+    left = run.ledger.available
+    return left if run.row.settings.finish == "budget" and left >= run.row.min_episodes_per_submit else 0
+
+
+def ok_submits(run: Run) -> list[SubmitRow]:
+    return [row for row in run.submits if row.status == "ok"]
+
+
+def select(run: Run) -> SubmitRow | None:
+    """The eligible checkpoint with the highest validation mean, the later of equals; None when there is none."""
+    best: SubmitRow | None = None
+    best_mean = 0.0
+    for row in ok_submits(run):
+        if (
+            row.ineligible is None
+            and row.val_mean is not None
+            and (best is None or row.val_mean >= best_mean)
+        ):
+            best, best_mean = row, row.val_mean
+    return best
+
+
+def result(
+    state: State, run: Run, best: SubmitRow | None, now: float, *, cancelled: bool
+) -> operator.RunFinished:
+    """All that is recorded of a run that is over; `best` is its selected submit."""
+    row, stored, ok = run.row, run.state, ok_submits(run)
+    status: Literal["completed", "no_ok_submit", "error", "cancelled"] = "completed"
+    error = None
+    if cancelled:
+        status = "cancelled"
+    elif left := unspent(run):
+        status = "error"
+        error = (
+            f"the run ended ({stored.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left, and"
+            " must spend them (finish = budget)"
+        )
+    elif not ok:
+        status = "no_ok_submit"
+    elif best is None:
+        status, error = "error", "no ok checkpoint is eligible: each brought its slots down while hidden"
+    heldout: tuple[float, ...] = ()
+    failures: dict[str, int] = {}
+    final_score = None
+    if best is not None:
+        index = best.submit_index
+        heldout = run.hidden_returns[heldout_group(run.id, index)]
+        final_score = mean(heldout)
+        failures = {
+            "validation": run.hidden_failures.get(validation_group(run.id, index), 0),
+            "heldout": run.hidden_failures.get(heldout_group(run.id, index), 0),
+        }
+    description = stored.description
+    closed_at = now if stored.closed_at is None else stored.closed_at
+    return operator.RunFinished(
+        run=run.id,
+        settings=row.settings,
+        status=status,
+        error=error,
+        close_reason=stored.close_reason,
+        agent=stored.agent,
+        final_score=final_score,
+        best_submit_index=None if best is None else best.submit_index,
+        val_scores={each.submit_index: each.val_mean for each in ok if each.val_mean is not None},
+        heldout_returns=heldout,
+        validation_ineligible={
+            each.submit_index: each.ineligible for each in ok if each.ineligible is not None
+        },
+        policy_failures=failures,
+        random_heldout_returns=run.hidden_returns.get(random_group(run.id), ()),
+        reference_by_case=row.reference_by_case,
+        episode_budget=row.budget,
+        budget_used=run.ledger.settled,
+        split_hashes=row.split_hashes,
+        split_secret=row.split_secret,
+        env_version="" if description is None else description.env_version,
+        deterministic=True if description is None else description.deterministic,
+        fingerprint=stored.fingerprint,
+        created_at=row.created_at,
+        closed_at=closed_at,
+        finished_at=now,
+        submits=tuple(_submit_record(each) for each in run.submits if not each.refunded),
+        wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
+        infrastructure_retries=stored.infrastructure_retries,
+        nondeterministic_results=stored.nondeterministic_results,
+        audit=audit_end.record(state, run),
+        hidden_isolation=stored.isolation,
+        fingerprint_overrides=stored.overrides,
+    )
+
+
+def mean(returns: tuple[float, ...]) -> float:
+    """Mean, summed exactly."""
+    return math.fsum(returns) / len(returns)
+
+
+def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
+    done = submit_done(row)
+    assert done is not None
+    return operator.SubmitRecord(
+        submit_index=row.submit_index,
+        status=done.status,
+        bundle=row.bundle,
+        env_instances=row.env_instances,
+        remaining_budget=row.remaining_budget,
+        mean_return=row.mean_return,
+        val_mean=row.val_mean,
+        started_at=row.accepted_at,
+        completed_at=done.completed_at,
+    )
+
+
+# ---- waiting for the end ----
+
+
+def waited(state: State, event: events.Asked[operator.WaitRun], step: Step) -> None:
+    """An operator waits for the end of a run."""
+    message = event.message
+    run = state.runs.get(message.run)
+    if run is None:
+        if message.run in state.capabilities:
+            step.add(results.finished_effect(event.request, message.run, step))
+        else:
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        return
+    poll = Poll(event.request, "run", run.id)
+    if not state.polls.wait(poll, message.wait_s, step.now):
+        step.reply(event.request, progress(state, run))
+
+
+def answer(state: State, poll: Poll, step: Step) -> None:
+    """An operator has waited in vain for the end of a run."""
+    step.reply(poll.request, progress(state, state.runs[poll.target]))
+
+
+def progress(state: State, run: Run) -> operator.RunProgress:
+    """Where an unfinished run stands, for its operator."""
+    if run.state.phase == "open" or run.open is not None:
+        group = None if run.open is None else state.groups[train_group(run.id, run.open)]
+        done = run.ledger.settled + (0 if group is None else group.done)
+        waits_for = "" if group is None else waits.waits_for(state, group)
+        if run.state.description is None:  # its gateway cannot serve yet
+            waits_for = waits.waits_for_workers(state, run.flow)
+        return operator.RunProgress(phase="open", done=done, total=run.row.budget, waits_for=waits_for)
+    ok = [row for row in ok_submits(run) if row.ineligible is None]
+    n = len(run.row.validation)
+    groups = [state.groups.get(validation_group(run.id, row.submit_index)) for row in ok]
+    done = sum(n if group is None else group.done for group in groups)
+    playing = [group for group in groups if group is not None]
+    if playing:
+        waits_for = waits.waits_for(state, playing[0])
+        return operator.RunProgress(phase="validation", done=done, total=n * len(ok), waits_for=waits_for)
+    best = select(run)
+    group = None if best is None else state.groups.get(heldout_group(run.id, best.submit_index))
+    phase: Literal["heldout", "random"] = "heldout"
+    if group is None:
+        phase, group = "random", state.groups.get(random_group(run.id))
+    total = len(run.row.heldout)
+    if group is None:
+        return operator.RunProgress(phase=phase, done=total, total=total, waits_for=audit_end.waits_for(run))
+    return operator.RunProgress(
+        phase=phase, done=group.done, total=total, waits_for=waits.waits_for(state, group)
+    )

@@ -1,0 +1,228 @@
+"""Runs: how they are created, what their gateways are told of them, what is kept of them when they are finished.
+
+Rules that this module owns:
+- One run per key, with its whole budget available.
+- Nothing that a gateway is answered with depends on hidden work.
+"""
+
+from __future__ import annotations
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents import requests
+from evopolicy_coordinator.core.leasing import pins
+from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.records import RunRow, RunStateRow, train_group
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import FlowPinned, JobRetried, ResultsDiffered, Step
+from evopolicy_coordinator.core.structures.ledger import Ledger
+
+from . import waits
+from .known import live
+
+
+def create(state: State, event: events.RunCreated, step: Step) -> None:
+    """Make a run, once for each key."""
+    message = event.message
+    known = state.run_keys.get(message.key)
+    if known is not None:
+        step.reply(event.request, operator.RunCreated(run=known, capability=state.capabilities[known]))
+        return
+    fault = _fault(event)
+    if fault is None and event.run in state.capabilities:
+        fault = f"there is a run {event.run!r} already"
+    if fault is not None:
+        step.refuse(event.request, Refusal.BAD_SETTINGS, fault)
+        return
+    row = RunRow(
+        run=event.run,
+        key=message.key,
+        capability=event.capability,
+        secret=event.secret,
+        settings=message.settings,
+        budget=event.budget,
+        min_episodes_per_submit=event.min_episodes_per_submit,
+        max_episodes_per_submit=event.max_episodes_per_submit,
+        train=event.train,
+        validation=event.validation,
+        heldout=event.heldout,
+        split_hashes=event.split_hashes,
+        split_secret=event.split_secret,
+        allowed_imports=event.allowed_imports,
+        denied_imports=event.denied_imports,
+        max_steps=event.max_steps,
+        audit_share=state.settings.audit_share,
+        reference_by_case=True,
+        created_at=step.now,
+        stimulus_id=step.stimulus_id,
+    )
+    stored = RunStateRow(run=event.run, isolation=requests.stamp(state, row))
+    step.persist(row)
+    run = enter(state, row, stored)
+    step.persist(stored)
+    pins.pin(state, run.flow, step)
+    step.reply(event.request, operator.RunCreated(run=event.run, capability=event.capability))
+    step.log("info", "run_created", run=event.run, env=message.settings.env, budget=event.budget)
+
+
+def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
+    """Take a run into the core, with its whole budget available."""
+    env, tier = row.settings.env, row.settings.sandbox_tier
+    family = state.families.join(env, (*row.validation, *row.heldout))
+    closed = stored.phase != "open"
+    flow = pins.add_flow(state, row.run, "run", env, tier, row.secret, family, closed=closed)
+    run = Run(row, stored, Ledger(row.budget), flow)
+    state.runs[row.run] = run
+    state.run_keys[row.key] = row.run
+    state.capabilities[row.run] = row.capability
+    return run
+
+
+def forget(state: State, run: Run) -> None:
+    """A run is finished: of it only the last state that its gateway may ask for stays."""
+    del state.runs[run.id]
+    state.finished[run.id] = last_state(run.state)
+    pins.drop_flow(state, run.flow)
+
+
+def _fault(event: events.RunCreated) -> str | None:
+    least, most = event.min_episodes_per_submit, event.max_episodes_per_submit
+    if event.budget < 1:
+        return f"a budget of {event.budget} episodes; at least 1 is needed"
+    if not 1 <= least <= most:
+        return f"a submit of {least} to {most} episodes; wanted is 1 ≤ minimum ≤ maximum"
+    if least > event.budget:
+        return f"a submit takes at least {least} episodes, the budget is {event.budget}"
+    for name, cases in (("train", event.train), ("validation", event.validation), ("heldout", event.heldout)):
+        if not cases:
+            return f"the {name} split has no cases"
+    return None
+
+
+# ---- what a gateway asks ----
+
+
+def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> None:
+    """Tell a gateway all that is fixed of its run; refused until some worker has offered the environment."""
+    run = live(state, event.request, event.message.run, step)
+    if run is None:
+        return
+    if run.flow.pin is None:
+        pins.pin(state, run.flow, step)
+    description = run.flow.description
+    row, settings = run.row, run.row.settings
+    if description is None:
+        text = f"the run waits for {waits.waits_for_workers(state, run.flow)}"
+        step.refuse(event.request, Refusal.NO_WORKER, text)
+        return
+    if not event.message.asks_permit and without_permit(state, event.request, run, step):
+        return
+    step.reply(
+        event.request,
+        gateway.RunOpened(
+            env=description,
+            n_env_instances=len(row.train),
+            episode_budget=row.budget,
+            min_episodes_per_submit=row.min_episodes_per_submit,
+            max_episodes_per_submit=row.max_episodes_per_submit,
+            policy_scope=settings.policy_scope,
+            observations=settings.observations,
+            sandbox_tier=settings.sandbox_tier,
+            video=settings.video,
+            limits=settings.limits,
+            allowed_imports=row.allowed_imports,
+            denied_imports=row.denied_imports,
+            simulation=settings.simulation,
+            max_steps=row.max_steps,
+            state=run_state(state, run, step.now),
+        ),
+    )
+
+
+def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
+    """Refuse, for now, what an agent asks that may be on any machine, until it may."""
+    waits_for = requests.implied(state, run, step) if run.state.phase == "open" else ""
+    if waits_for:
+        step.refuse(
+            request, Refusal.UNAVAILABLE, f"the run's agent may not start yet; it waits for {waits_for}"
+        )
+    return bool(waits_for)
+
+
+def state_requested(state: State, event: events.Asked[gateway.StateRequest], step: Step) -> None:
+    """Tell a gateway how its run stands, also after it is finished."""
+    last = state.finished.get(event.message.run)
+    if last is not None:
+        step.reply(event.request, gateway.StateReply(state=last))
+        return
+    run = live(state, event.request, event.message.run, step)
+    if run is not None:
+        step.reply(event.request, gateway.StateReply(state=run_state(state, run, step.now)))
+
+
+def last_state(row: RunStateRow) -> gateway.RunState:
+    """What the gateway of a finished run is told of it."""
+    return gateway.RunState(
+        remaining_budget=row.remaining_budget,
+        n_submits=row.n_submits,
+        is_finalized=True,
+        cancelled=row.close_reason == CANCELLED,
+    )
+
+
+def held_s(state: State, run: Run, now: float) -> float:
+    """Seconds for which hidden jobs held a run's submits."""
+    group = None if run.open is None else state.groups.get(train_group(run.id, run.open))
+    return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held(now))
+
+
+def run_state(state: State, run: Run, now: float) -> gateway.RunState:
+    """What the gateway of an unfinished run is told of it."""
+    in_flight = None
+    if run.open is not None:
+        group = state.groups[train_group(run.id, run.open)]
+        in_flight = gateway.SubmitInFlight(
+            submit_index=run.open,
+            n_episodes=group.n,
+            n_done=group.done,
+            waits_for=waits.waits_for(state, group),
+            held_s=group.held(now),
+        )
+    return gateway.RunState(
+        remaining_budget=run.ledger.available,
+        n_submits=len(run.submits),
+        is_finalized=run.state.phase != "open",
+        in_flight=in_flight,
+        held_s=held_s(state, run, now),
+    )
+
+
+# ---- what those below have to tell ----
+
+
+def pinned(state: State, news: FlowPinned, step: Step) -> None:
+    """Keep the class of workers that a run is played by."""
+    run, profile = state.runs[news.flow.id], news.profile
+    step.change_run(
+        run,
+        fingerprint_class=profile.fingerprint_class,
+        description=profile.descriptions[news.flow.env],
+        fingerprint=profile.fingerprint,
+    )
+    step.log("info", "run_pinned", run=run.id, fingerprint_class=profile.fingerprint_class)
+
+
+def retried(state: State, news: JobRetried, step: Step) -> None:
+    """A job is played again for our own failure; `run.json` tells how often."""
+    run = state.runs.get(news.job.group.run)
+    if run is not None:
+        step.change_run(run, infrastructure_retries=run.state.infrastructure_retries + 1)
+
+
+def differed(state: State, news: ResultsDiffered, step: Step) -> None:
+    """Two results of one episode differed; `run.json` tells how often."""
+    run = state.runs.get(news.group.run)
+    if run is not None:
+        step.change_run(run, nondeterministic_results=run.state.nondeterministic_results + 1)

@@ -1,0 +1,194 @@
+"""A run's submits: taken or refused, played, ended and charged.
+
+Rules that this module owns:
+- A submit is reserved, durable, then answered; one submit per key; one open submit per run; refused ones change nothing.
+- The episode at index 0 gates: until its outcome shows that the bundle yields a Policy no episode is released, and when it
+  shows the contrary that is the whole submit's verdict.
+- A submit's end settles its reservation, once, whatever the verdict (`end`). Only a cancelled run's open submit is refunded.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
+from evopolicy_common.messages.gateway import SubmitStatus
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.leasing import groups
+from evopolicy_coordinator.core.model import JobGroup, Run
+from evopolicy_coordinator.core.records import SubmitRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import EpisodesDone, Step, SubmitEnded
+from evopolicy_coordinator.core.structures.ledger import refusal
+
+from . import results, templates
+from .known import live, over
+from .runs import without_permit
+
+
+def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> None:
+    """Take a submit, or refuse it for the first cause in the protocol's order; a known key is answered as before."""
+    message = event.message
+    run = live(state, event.request, message.run, step)
+    if run is None:
+        return
+    known = run.keys.get(message.key)
+    if known is not None:
+        _again(event, run.submits[known], step)
+        return
+    if run.state.phase != "open":
+        step.refuse(event.request, *over(state, run.id))
+        return
+    if run.open is not None:
+        step.refuse(event.request, Refusal.BUSY, f"submit {run.open} is still running; one runs at a time")
+        return
+    refused = refusal(
+        message.env_instances,
+        n_cases=len(run.row.train),
+        minimum=run.row.min_episodes_per_submit,
+        maximum=run.row.max_episodes_per_submit,
+        available=run.ledger.available,
+    )
+    if refused is not None:
+        step.refuse(event.request, *refused)
+        return
+    if message.bundle is None and message.bundle_error is None:
+        step.refuse(event.request, Refusal.BAD_REQUEST, "a submit names a bundle, or says why there is none")
+        return
+    if without_permit(state, event.request, run, step):
+        return
+    _accept(state, run, event, step)
+
+
+def _again(event: events.Asked[gateway.Submit], row: SubmitRow, step: Step) -> None:
+    """The answer to a key that is known: the same as the first time, if the request is."""
+    message = event.message
+    if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
+        text = f"key {message.key!r} was used for submit {row.submit_index} with another request"
+        step.refuse(event.request, Refusal.KEY_CONFLICT, text)
+        return
+    step.reply(event.request, _accepted(row))
+
+
+def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
+    return gateway.SubmitAccepted(
+        submit_index=row.submit_index,
+        first_global_episode=row.first_global_episode,
+        remaining_budget=row.remaining_budget,
+    )
+
+
+def _accept(state: State, run: Run, event: events.Asked[gateway.Submit], step: Step) -> None:
+    message = event.message
+    index, n = len(run.submits), len(message.env_instances)
+    first_global_episode = run.ledger.spent
+    run.ledger.reserve(index, n)
+    row = SubmitRow(
+        run=run.id,
+        submit_index=index,
+        key=message.key,
+        env_instances=message.env_instances,
+        bundle=message.bundle,
+        first_global_episode=first_global_episode,
+        remaining_budget=run.ledger.available,
+        accepted_at=step.now,
+        stimulus_id=step.stimulus_id,
+    )
+    run.submits.append(row)
+    run.keys[message.key] = index
+    step.reply(event.request, _accepted(row))
+    step.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
+    failure = message.bundle_error
+    if failure is not None:
+        run.ledger.settle(index)
+        status: SubmitStatus = "import_error"
+        if failure.category in NO_POLICY:
+            status = cast(SubmitStatus, failure.category)
+        step.change_submit(run, index, status=status, failure=failure, completed_at=step.now)
+        return
+    step.persist(row)
+    run.open = index
+    play(state, run, row, step)
+
+
+def play(state: State, run: Run, row: SubmitRow, step: Step) -> None:
+    """Queue what is left of an open submit."""
+    groups.open_group(state, templates.build("train", run, row, step.now, step.stimulus_id), step)
+
+
+# ---- how a submit goes on and ends ----
+
+
+def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+    """Some episodes of an open submit are done."""
+    group = news.group
+    run = state.runs[group.run]
+    for outcome in news.outcomes:
+        failure = outcome.failure
+        if outcome.index == 0 and failure is not None and failure.category in NO_POLICY:
+            end(state, run, group, cast(SubmitStatus, failure.category), failure, step)
+            return
+    if group.done == group.n:
+        end(state, run, group, "ok", None, step)
+    elif 0 in group.marks:
+        results.answer_polls(state, group, step)
+
+
+def limit_passed(state: State, name: str, step: Step) -> None:
+    """The operator's limit on a submit's wall time has passed, if the time that it was held does not count."""
+    group = state.groups.get(name)
+    if group is None:
+        return
+    held_s = group.held(step.now) - group.held_counted_s
+    if held_s > 0.0:
+        group.held_counted_s += held_s
+        state.timers.arm(("submit", name), step.now + held_s)
+    elif step.now < state.hold_until:
+        state.timers.arm(("submit", name), state.hold_until)
+    else:
+        _timed_out(state, group, step)
+
+
+def _timed_out(state: State, group: JobGroup, step: Step) -> None:
+    """The operator's limit on a whole submit's wall time has passed."""
+    run = state.runs[group.run]
+    limit_s = run.row.settings.limits.submit_wall_s
+    text = (
+        f"the submit took longer than its limit of {limit_s} s; {group.done} of {group.n} episodes were done"
+    )
+    failure = PolicyFailure(category="episode_timeout", step_index=None, message=text, limit=limit_s)
+    end(state, run, group, "rollout_timeout", failure, step)
+
+
+def end(
+    state: State, run: Run, group: JobGroup, status: SubmitStatus, failure: PolicyFailure | None, step: Step
+) -> None:
+    """Settle a submit with its verdict."""
+    n_kept = 0
+    if status == "ok":
+        n_kept = group.n
+    elif status == "rollout_timeout":
+        n_kept = group.first_unfinished()
+    row = step.change_submit(
+        run,
+        group.submit_index,
+        status=status,
+        failure=failure,
+        completed_at=step.now,
+        first_leased_at=group.first_leased_at,
+        released=group.done if n_kept else 0,
+        n_kept=n_kept,
+        mean_return=group.mean_return() if status == "ok" else None,
+        held_s=group.held(step.now),
+    )
+    started_at = group.first_leased_at or step.now
+    run.queue_s += max(0.0, started_at - row.accepted_at)
+    run.rollout_s += step.now - started_at
+    run.ledger.settle(group.submit_index)
+    run.open = None
+    groups.close_group(state, group, step, f"submit ended: {status}")
+    results.answer_polls(state, group, step)
+    step.log("info", "submit_ended", run=run.id, submit=group.submit_index, status=status, episodes=group.n)
+    step.tell(SubmitEnded(run, row))

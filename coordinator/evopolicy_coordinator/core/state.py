@@ -1,0 +1,137 @@
+"""All that a core holds: tables of what is open, and indices into them. No rules here; `loading` fills it, the rules change it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from evopolicy_common.messages.gateway import RunState
+
+from .isolation.families import Families
+from .model import (
+    EVERYWHERE,
+    RANKS,
+    Ask,
+    Ended,
+    Evaluation,
+    Family,
+    Flow,
+    JobGroup,
+    JobState,
+    Kernel,
+    Lane,
+    LaneKey,
+    OutOfService,
+    Profile,
+    ProfileKey,
+    Run,
+    Stay,
+    Worker,
+)
+from .records import KernelRow, OutcomeHead, PermitRow
+from .settings import CoreSettings
+from .structures.polls import Polls
+from .structures.rate import Rate
+from .structures.story import Story
+from .structures.timers import Timers
+
+ATTEMPTS_PER_INCARNATION = 1_000_000
+
+DISPUTES_MAX = 50
+"""So many disputes are kept for the status."""
+
+
+@dataclass(slots=True)
+class Loading:
+    """What a core knows only while it is loaded."""
+
+    heads: dict[str, list[OutcomeHead]] = field(default_factory=dict)
+    """What is stored of each group."""
+    reloaded: list[JobGroup] = field(default_factory=list)
+    """Groups that may be complete already."""
+
+
+class State:
+    """Everything that the rules share."""
+
+    def __init__(self, settings: CoreSettings, incarnation: int, now: float) -> None:
+        """An empty one."""
+        self.settings = settings
+        self.incarnation = incarnation
+        self.first_attempt = (incarnation - 1) * ATTEMPTS_PER_INCARNATION
+        """Attempts up to this number were granted by earlier incarnations."""
+        self.timers = Timers()
+        self.story = Story()
+        self.polls = Polls(self.timers, settings.max_wait_s)
+        self.rate = Rate()
+        self.loading: Loading | None = None
+        self.hold_until = now + settings.lease_ttl_s
+        """Nothing expires before."""
+        self.stalled_at = now
+        """When the loop last came to after standing still for long, or started."""
+
+        # Runs and evaluations.
+        self.runs: dict[str, Run] = {}
+        """The unfinished ones."""
+        self.run_keys: dict[str, str] = {}
+        self.capabilities: dict[str, str] = {}
+        """Of all runs, finished ones too."""
+        self.finished: dict[str, RunState] = {}
+        """What a gateway is still told of a finished run."""
+        self.evaluations: dict[str, Evaluation] = {}
+        self.evaluation_keys: dict[str, str] = {}
+        self.ended_evaluations: dict[str, Ended] = {}
+        self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
+        """What workers disagree on, in words, the latest last; since the core was loaded."""
+
+        # Groups and jobs.
+        self.groups: dict[str, JobGroup] = {}
+        self.jobs: dict[str, JobState] = {}
+        self.adopting: dict[JobState, None] = {}
+        """Jobs that may be running somewhere since before the core was loaded."""
+        self.held: dict[JobGroup, None] = {}
+        """Submits that hidden jobs keep from all workers."""
+
+        # What waits, and for whom.
+        self.lanes: dict[LaneKey, Lane] = {}
+        self.profiles: dict[ProfileKey, Profile] = {}
+        self.unpinned: dict[str, Flow] = {}
+        self.n_flows = 0
+        """Made so far."""
+        self.suspects: dict[JobState, None] = {}
+        """Waiting jobs that are to run alone; few."""
+        self.clock = [0.0] * len(RANKS)
+        """Virtual time of each rank, slot seconds."""
+
+        # Workers and leases.
+        self.workers: dict[str, Worker] = {}
+        self.sessions: dict[str, str] = {}
+        """Present sessions to the workers whose they are."""
+        self.out_of_service: dict[str, OutOfService] = {}
+        """Names that an operator drained or paused; kept over restarts."""
+        self.quarantined: dict[str, str] = {}
+        """Names that an audit found to forge, and why; until an operator takes them back."""
+        self.quarantined_machines: dict[str, str] = {}
+        """Machines of those names, to the name."""
+        self.n_live = 0
+        """Live leases in all."""
+        self.freed: dict[str, None] = {}
+        """Workers that let go of a lease, or are emptied no more: a waiting poll may be answerable now."""
+
+        # Who is on which kernel.
+        self.isolates = settings.hidden_isolation != "off"
+        self.families = Families(strict=settings.hidden_isolation == "strict")
+        self.everywhere = Kernel(EVERYWHERE)
+        self.kernels: dict[str, Kernel] = {EVERYWHERE: self.everywhere}
+        self.lingering: dict[str, dict[str, Stay]] = {}
+        """By worker: stays without a lease."""
+        self.permits: dict[str, dict[Kernel, tuple[PermitRow, Family]]] = {}
+        """By run."""
+        self.asks: dict[tuple[str, str], Ask] = {}
+        """By run and boot id."""
+        self.known_kernels: dict[str, KernelRow] = {}
+        """By worker: as stored."""
+        self.boots: dict[str, dict[str, None]] = {}
+        """By machine: the boot ids under which something of it is known."""
+        self.grantable = False
+        """A permit that is asked for may have become possible in this step."""

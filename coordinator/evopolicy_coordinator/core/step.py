@@ -1,0 +1,181 @@
+"""One step of the core: what one event, or one deadline, leads to. Its effects, its news and its marks are values here.
+
+Rules that this module owns:
+- Whatever rows a step makes durable stand in a single `Persist` ahead of all its other effects, so no reply can tell of
+  something that a crash would take back.
+- A rule calls what it builds on, never what builds on it: leases do not know runs. What happened goes upwards as news,
+  for which `machine` has a table. What follows from a piece of news comes before what was told after it.
+- Work that became available is marked (`dirty`, `State.freed`); the scheduler looks at the marks when the step ends.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.messages.worker import JobResult, Message, Refused
+from evopolicy_common.wire.refusals import Refusal
+
+from . import transitions
+from .effects import Effect, Log, Persist, Reply
+from .events import RequestId
+from .model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
+from .records import AuditRow, Row, SubmitRow
+
+# ---- news ----
+
+
+class HandedIn(NamedTuple):
+    """A worker handed in what came of one lease."""
+
+    worker: Worker
+    result: JobResult
+
+
+class EpisodesDone(NamedTuple):
+    """Episodes of a group have their outcomes."""
+
+    group: JobGroup
+    worker: Worker | None
+    """Who played them; None: before the core was loaded."""
+    outcomes: tuple[EpisodeOutcome, ...]
+
+
+class JobRetried(NamedTuple):
+    """A job is played again for a failure of ours."""
+
+    job: JobState
+
+
+class ResultsDiffered(NamedTuple):
+    """Two results of one episode differed."""
+
+    group: JobGroup
+
+
+class FlowPinned(NamedTuple):
+    """A run or an evaluation has a class of workers now."""
+
+    flow: Flow
+    profile: Profile
+
+
+class SubmitEnded(NamedTuple):
+    """A submit has its verdict."""
+
+    run: Run
+    row: SubmitRow
+
+
+class AuditsMoved(NamedTuple):
+    """An audit of a run is over, or goes on: the run may have waited for it."""
+
+    run: Run
+
+
+class Answered(NamedTuple):
+    """A request is to be answered after what it led to."""
+
+    request: RequestId
+    message: Message
+
+
+News = (
+    HandedIn | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved | Answered
+)
+
+
+def kind_of(news: News) -> str:
+    """What `machine`'s table tells apart beside the news itself: the kind of group or flow; else empty."""
+    match news:
+        case EpisodesDone():
+            return news.group.kind
+        case FlowPinned():
+            return news.flow.of
+        case _:
+            return ""
+
+
+# ---- steps ----
+
+
+class Step:
+    """Collects the effects of one step, its news, and what is to be looked at when it ends."""
+
+    __slots__ = ("_out", "_rows", "dirty", "news", "now", "stimulus_id", "stops")
+
+    def __init__(self, now: float, stimulus_id: str) -> None:
+        self.now = now
+        self.stimulus_id = stimulus_id
+        self._rows: list[Row] = []
+        self._out: list[Effect] = []
+        self.news: deque[News] = deque()
+        """What those above are to hear, in order."""
+        self.dirty: dict[Lane, None] = {}
+        """Lanes in which something waits that did not before."""
+        self.stops: dict[str, list[str]] = {}
+        """Workers to the leases that they are to stop."""
+
+    def tell(self, news: News) -> None:
+        """Let those above hear of something once the present rule has done its part."""
+        self.news.append(news)
+
+    # ---- effects ----
+
+    def persist(self, row: Row) -> None:
+        """Make a row durable before anything else that this step does."""
+        self._rows.append(row)
+
+    def add(self, effect: Effect) -> None:
+        """Let the shell do something once the rows are durable."""
+        self._out.append(effect)
+
+    def reply(self, request: RequestId, message: Message) -> None:
+        """Answer a request."""
+        self._out.append(Reply(request=request, message=message, stimulus_id=self.stimulus_id))
+
+    def refuse(self, request: RequestId, status: Refusal, message: str) -> None:
+        """Answer a request with the reason why it is not carried out."""
+        self.reply(request, Refused(status=status, message=message))
+
+    def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
+        """Tell operators."""
+        self._out.append(Log(level=level, event=event, fields=fields, stimulus_id=self.stimulus_id))
+
+    def effects(self) -> list[Effect]:
+        """All effects in order: the rows first."""
+        if not self._rows:
+            return self._out
+        first: Effect = Persist(rows=tuple(self._rows), stimulus_id=self.stimulus_id)
+        return [first, *self._out]
+
+    # ---- durable changes ----
+
+    def change_run(self, run: Run, **fields: object) -> None:
+        """Change what is stored of a run."""
+        before, run.state = run.state, msgspec.structs.replace(run.state, **fields)
+        if run.state.phase != before.phase:
+            transitions.check(transitions.RUN, run.id, before.phase, run.state.phase)
+        self.persist(run.state)
+
+    def change_submit(self, run: Run, index: int, **fields: object) -> SubmitRow:
+        """Change what is stored of a submit."""
+        before = run.submits[index]
+        row = run.submits[index] = msgspec.structs.replace(before, **fields)
+        if row.status != before.status:
+            key = f"{run.id}/s{index}"
+            transitions.check(transitions.SUBMIT, key, before.status or "open", row.status or "open")
+        self.persist(row)
+        return row
+
+    def put_audit(self, run: Run, row: AuditRow) -> AuditRow:
+        """Store an audit, anew or as it is now."""
+        before = run.audits.get(row.audit)
+        if before is not None and row.state != before.state:
+            transitions.check(transitions.AUDIT, row.audit, before.state, row.state)
+        run.audits[row.audit] = row
+        self.persist(row)
+        return row

@@ -1,0 +1,1 @@
+"""What workers ask and hand in: membership, polls for leases and who gets them, hand-ins."""

@@ -1,0 +1,193 @@
+"""What workers say, and what operators say of them: who is there, who may have work, and under which class.
+
+Rules that this module owns:
+- A request under a session that is not the worker's present one is refused, upon which the worker registers again.
+- A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
+- A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
+- A name is its machine's as long as the worker is there.
+- Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it hands in
+  from then on is not taken. An operator may take it back.
+- Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
+"""
+
+from __future__ import annotations
+
+from evopolicy_common.messages import operator
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.isolation import bars, kernels, stays
+from evopolicy_coordinator.core.leasing import fleet, leases, pins
+from evopolicy_coordinator.core.model import Worker
+from evopolicy_coordinator.core.records import WorkerRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Answered, HandedIn, Step
+
+from . import scheduler
+
+
+def registered(state: State, event: events.WorkerRegistered, step: Step) -> None:
+    """A worker joins, or joins again under a new session."""
+    message = event.message
+    if _refused_as_forger(state, message.worker, event.machine, event.request, step):
+        return
+    old = state.workers.get(message.worker)
+    if old is not None and old.state != "lost" and old.machine != event.machine:
+        # Else one machine could play under another's name, and have it blamed.
+        text = f"a worker of another machine is called {message.worker!r}; choose another --name"
+        step.refuse(event.request, Refusal.NAME_TAKEN, text)
+        return
+    if old is not None:
+        fleet.drop_poll(state, old, step)
+        if old.beat is not None:
+            fleet.answer_beat(state, old, (), step)
+    state.timers.disarm(("forget", message.worker))
+    worker = fleet.register(state, event, kernels.kernel(state, message.boot_id), step)
+    stays.joined(state, worker, step)
+    permits.booted(state, worker.machine_id, worker.kernel.boot_id, step)
+    stays.replaced(state, worker, step)
+    if old is not None and old.kernel is not worker.kernel:
+        stays.forgotten(state, old)
+    reply = wire.Registered(
+        session=event.session,
+        lease_ttl_s=state.settings.lease_ttl_s,
+        heartbeat_s=state.settings.heartbeat_s,
+        refused=pins.refused_runs(state, worker),
+        hidden_bar="" if message.boot_id or not state.isolates else bars.NO_BOOT_ID,
+    )
+    step.reply(event.request, reply)
+    name = worker.profile.fingerprint_class
+    step.log("info", "worker_registered", worker=worker.name, slots=worker.slots, fingerprint_class=name)
+    pins.pin_waiting(state, worker, step)
+
+
+def _refused_as_forger(state: State, name: str, machine: str, request: events.RequestId, step: Step) -> bool:
+    forger = name if name in state.quarantined else state.quarantined_machines.get(machine)
+    if forger is None:
+        return False
+    same = "" if forger == name else f" (as {forger!r} of the same machine)"
+    text = f"worker {name!r} gets no more work here: {state.quarantined[forger]}{same}"
+    step.refuse(request, Refusal.QUARANTINED, text)
+    return True
+
+
+def worker_of(
+    state: State, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.HandIn], step: Step
+) -> Worker | None:
+    """Who speaks; None, and the request is refused, when its session is unknown or it is quarantined."""
+    message = event.message
+    known = state.workers.get(message.worker)
+    if _refused_as_forger(state, message.worker, known.machine if known else "", event.request, step):
+        return None
+    was_lost = known is not None and known.state == "lost"
+    worker = fleet.of_session(state, message.worker, message.session, step.now)
+    if worker is None:
+        text = f"session of worker {message.worker!r} is not known here; register again"
+        step.refuse(event.request, Refusal.UNKNOWN_WORKER, text)
+    else:
+        state.timers.arm_once(("worker", worker.name), step.now + state.settings.lease_ttl_s)
+        if was_lost:
+            pins.pin_waiting(state, worker, step)
+    return worker
+
+
+def lease_requested(state: State, event: events.Asked[wire.LeaseRequest], step: Step) -> None:
+    """A worker asks for work."""
+    worker = worker_of(state, event, step)
+    if worker is not None:
+        scheduler.poll(state, worker, event, step)
+
+
+def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> None:
+    """Renew the leases that a worker lists, and tell it which to stop."""
+    message = event.message
+    worker = worker_of(state, event, step)
+    if worker is None:
+        return
+    if worker.beat is not None:
+        fleet.answer_beat(state, worker, (), step)
+    stop = leases.hear(state, worker, message.held, step, settled=message.settled)
+    worker.beat = event.request
+    if stop or not message.wait_s > 0.0:
+        fleet.answer_beat(state, worker, stop, step)
+    else:
+        state.timers.arm(("beat", worker.name), step.now + min(message.wait_s, state.settings.max_wait_s))
+
+
+def handed_in(state: State, event: events.Asked[wire.HandIn], step: Step) -> None:
+    """Take results, and answer once they are durable."""
+    worker = worker_of(state, event, step)
+    if worker is None:
+        return
+    for result in event.message.results:
+        step.tell(HandedIn(worker, result))
+    step.tell(Answered(event.request, wire.HandInReply(n=len(event.message.results))))
+
+
+def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
+    """A hint only: the worker's leases are looked at sooner than they would be."""
+    worker = state.workers.get(event.worker)
+    if worker is not None and worker.state != "lost" and worker.doubted_at is None:
+        worker.doubted_at = step.now
+        state.timers.arm(("worker", worker.name), step.now + state.settings.liveness_grace_s)
+
+
+def worker_state(state: State, event: events.Asked[operator.SetWorker], step: Step) -> None:
+    """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
+    message = event.message
+    if message.state != "active" and message.worker in state.quarantined:
+        text = f"{message.worker} is quarantined: {state.quarantined[message.worker]}"
+        step.refuse(event.request, Refusal.QUARANTINED, text)
+        return
+    step.persist(WorkerRow(worker=message.worker, state=message.state))
+    worker = state.workers.get(message.worker)
+    if worker is not None and message.state != "active":
+        fleet.drop_poll(state, worker, step)
+    fleet.set_state(state, message.worker, message.state)
+    if worker is not None:
+        if worker.beat is not None:
+            fleet.answer_beat(state, worker, (), step)
+        state.freed[worker.name] = None
+        pins.pin_waiting(state, worker, step)
+        for lane in worker.profile.lanes.values():
+            step.dirty[lane] = None
+    step.reply(event.request, operator.Done())
+
+
+def repinned(state: State, event: events.Asked[operator.RepinRun], step: Step) -> None:
+    """Pin an unfinished run to another class of workers, as an operator says."""
+    message = event.message
+    run = state.runs.get(message.run)
+    offered = {
+        profile.fingerprint_class: profile
+        for profile in state.profiles.values()
+        if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
+    }
+    if run is None:
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no unfinished run {message.run!r}")
+    elif message.fingerprint_class not in offered:
+        text = f"no worker of class {message.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
+        step.refuse(event.request, Refusal.UNKNOWN_CLASS, text)
+    else:
+        text = f"{run.state.fingerprint_class} → {message.fingerprint_class}: {message.reason}"
+        profile = offered[message.fingerprint_class]
+        step.change_run(
+            run,
+            fingerprint_class=message.fingerprint_class,
+            overrides=(*run.state.overrides, text),
+            description=run.state.description or profile.descriptions[run.flow.env],
+            fingerprint=run.state.fingerprint or profile.fingerprint,
+        )
+        run.flow.description = run.state.description
+        pins.place(state, run.flow, message.fingerprint_class, step)
+        step.log("warning", "run_repinned", run=run.id, override=text)
+        step.reply(event.request, operator.Done())
+
+
+def forget(state: State, name: str, _step: Step) -> None:
+    """A worker was lost long ago."""
+    worker = state.workers.get(name)
+    if worker is not None and worker.state == "lost":
+        fleet.forget(state, worker)
+        stays.forgotten(state, worker)

@@ -1,0 +1,106 @@
+"""Stops hidden jobs for train jobs that wait.
+
+Rule that this module owns: a waiting train job stops hidden jobs, a suspect those of the worker that is emptied for it:
+audits and early validation as often as it takes, others a bounded number of times. The hidden job goes back into the queue;
+its worker lets go of it and polls again.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.leasing import leases, queue
+from evopolicy_coordinator.core.model import (
+    AUDIT,
+    EARLY_VALIDATION,
+    HELDOUT,
+    HIDDEN_AUDIT,
+    REFERENCE,
+    TRAIN,
+    Family,
+    JobState,
+    Lane,
+    Lease,
+    Worker,
+)
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+VICTIMS_MAX = 256
+"""Hidden leases looked at for a lane in one step."""
+
+FAMILIES_MAX = 8
+"""Families of waiting train jobs that hidden jobs are stopped for in one step."""
+
+
+def preempt(state: State, lane: Lane, step: Step) -> None:
+    """Stop hidden jobs for the train jobs that wait in the lane.
+
+    The last that were leased go first: they have come least far, and of a batch they wait behind the others.
+    """
+    if any(any(profile.hidden) for profile in lane.profiles):
+        # What is spared now may be stopped later with nothing else happening: a worker is avoided no longer, or one
+        # that was to let go of a hidden job is lost.
+        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+    wanted = lane.n_ready[TRAIN] - lane.stopping
+    avoided = queue.avoided(lane, TRAIN, step.now)
+    for family in list(islice(lane.waiting[TRAIN], FAMILIES_MAX)):
+        wanted -= clear(state, lane, family, avoided, step)
+    for priority in (HIDDEN_AUDIT, AUDIT, EARLY_VALIDATION, HELDOUT, REFERENCE):
+        for profile in lane.profiles:
+            hidden = profile.hidden[priority]
+            for lease in list(islice(reversed(hidden), VICTIMS_MAX)):
+                job = lease.job
+                if wanted <= 0:
+                    return
+                worker = state.workers[lease.worker]
+                if lease.worker == avoided or bars.goes_first(lease):
+                    continue
+                if not queue.may_train(state, lane, worker):
+                    continue
+                if not may_stop(state, job):
+                    del hidden[lease]
+                    continue
+                stop_hidden(state, lease, worker, f"preempted for {lane.key[0]}", step)
+                if worker.n_live < worker.slots:
+                    # Only now a slot comes free by it: what was stopped before had still to wait for one.
+                    wanted -= 1
+                    lane.stopping += 1
+                    lease.stopped_for = lane
+
+
+def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, step: Step) -> int:
+    """Stop the related hidden jobs that keep a family's train jobs from kernels, on as many kernels as have slots for
+    them: one that stays bars its whole kernel. Gives the slots that come free."""
+    slots = 0
+    wanted = lane.waiting[TRAIN].get(family, 0)
+    for kernel, playing in bars.to_clear(state, family):
+        if slots >= wanted:
+            break
+        there = [state.workers[name] for name in kernel.workers if name != avoided]
+        room = sum(worker.slots for worker in there if worker.profile in lane.profiles)
+        if not room:
+            continue
+        # What may be stopped no more plays to its end; nothing hidden begins there meanwhile.
+        lasting = any(not may_stop(state, lease.job) for lease in playing)
+        for lease in playing:
+            if not lasting or lease.job.priority != HELDOUT:
+                worker = state.workers[lease.worker]
+                stop_hidden(state, lease, worker, f"preempted for {lane.key[0]}", step)
+        if not lasting:
+            slots += room
+    return slots
+
+
+def may_stop(state: State, job: JobState) -> bool:
+    """Whether train jobs may stop a hidden job (once more)."""
+    bounded = job.priority in (HELDOUT, REFERENCE)
+    return not bounded or job.preemptions < state.settings.preemptions_max
+
+
+def stop_hidden(state: State, lease: Lease, worker: Worker, why: str, step: Step) -> None:
+    """Stop a hidden job for the sake of train jobs; it goes back into the queue."""
+    lease.job.preemptions += 1
+    leases.stop(state, lease, step, why)
+    leases.give_back(state, lease.job, "returned", worker, step, ran=False)

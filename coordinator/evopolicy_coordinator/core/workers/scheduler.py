@@ -1,0 +1,235 @@
+"""Brings waiting jobs and waiting workers together.
+
+Rules that this module owns:
+- Work is pulled: a worker's poll says how many leases it can take and waits until there is some. Free slots are filled
+  first. Ahead of them a worker gets only short episodes, worth about `batch_s` a slot, even more of them than it asked
+  for, and never so many that another idle worker goes without.
+- A poll whose time is over gets no lease: while the loop stood still its worker has given it up, and would never see it.
+- New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
+- At the end of each step `dispatch` hands out what the step made available; nothing else calls the scheduler but a poll.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_coordinator.core.agents import permits, precedence
+from evopolicy_coordinator.core.events import Asked
+from evopolicy_coordinator.core.leasing import fleet, leases, queue
+from evopolicy_coordinator.core.model import TRAIN, Lane, LeasePoll, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+from . import preemption, suspects
+
+PREFETCH_BELOW_S = 1.0
+"""Longer episodes are leased to free slots only: fetching them takes no time beside playing them."""
+
+TRIES_MAX = 4
+"""Parked workers that are tried for a lane in one step before the rest waits for the next."""
+
+LOOKS_MAX = 64
+"""Parked workers whose kernels may be barred to a lane that are looked past in one step."""
+
+LEASES_MAX = 256
+"""Most leases in one answer: it has to fit into a message."""
+
+EPISODES_MAX = 2048
+"""Of jobs with many episodes fewer are leased at once, but at least one."""
+
+HELD_MAX = 16_384
+"""Most leases that a worker may hold: its heartbeats name them all."""
+
+
+def poll(state: State, worker: Worker, event: Asked[wire.LeaseRequest], step: Step) -> None:
+    """A worker asks for leases; an older poll of it is answered with none."""
+    message = event.message
+    fleet.drop_poll(state, worker, step)
+    if message.n < 1 or event.waited_s > message.wait_s + state.settings.late_s:
+        step.reply(event.request, wire.Leases(leases=()))
+        return
+    wait_s = min(max(message.wait_s - event.waited_s, 0.0), state.settings.max_wait_s)
+    warm = frozenset(message.warm_bundles) | frozenset(message.warm_environments)
+    n = max(1, min(message.n, 2 * worker.slots))
+    worker.poll = LeasePoll(event.request, n, warm, until=step.now + wait_s, serial=message.serial)
+    if worker.first_serial is None:
+        worker.first_serial = message.serial
+    if not _serve(state, worker, step):
+        state.timers.arm(("lease", worker.name), step.now + wait_s)
+        _park(state, worker, step)
+
+
+def _park(state: State, worker: Worker, step: Step) -> None:
+    """Let a worker's poll wait where new work finds it, if it has a slot for it. Else its next free slot is what
+    brings the poll up again."""
+    if worker.n_live >= worker.slots or worker.reserved is not None:
+        return
+    if not fleet.available(worker, step.now):
+        return
+    fleet.park(worker)
+    for lane in worker.profile.busy:
+        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+
+
+def _serve(state: State, worker: Worker, step: Step) -> bool:
+    """Answer a worker's poll if there is anything for it."""
+    found = _fill(state, worker, step)
+    if found:
+        fleet.answer_poll(state, worker, tuple(found), step)
+    return bool(found)
+
+
+def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
+    poll = worker.poll
+    if poll is None or not fleet.available(worker, step.now):
+        return []
+    if step.now > poll.until + state.settings.late_s:
+        return []
+    if state.suspects and (suspect := suspects.next_of(state, worker, step)) is not None:
+        return [suspect]
+    if worker.reserved is not None:
+        return []
+    free = worker.slots - worker.n_live
+    given: list[wire.Lease] = []
+    limit = min(_limit(state, worker, poll.n, free), LEASES_MAX, HELD_MAX - len(worker.leases))
+    n_episodes = 0
+    while len(given) < limit and n_episodes < EPISODES_MAX:
+        job = queue.take(state, worker, poll.warm, step.now)
+        if job is None:
+            break
+        given.append(leases.grant(state, job, worker, step))
+        n_episodes += job.n
+    return given
+
+
+def _limit(state: State, worker: Worker, n: int, free: int) -> int:
+    """How many leases a poll for `n` gets at most, `free` of the worker's slots having nothing to play.
+
+    More than the free slots can take only of short episodes, not ahead of what has less right to the slot, and no
+    more than the worker's part of what waits.
+    """
+    settings, found = state.settings, queue.leading(state, worker)
+    if found is None or found[0].lane is None:
+        return 0
+    at_least = min(n, max(0, free))
+    flow, priority = found
+    assert flow.lane is not None
+    episode_s = flow.episode_s
+    behind_hidden = any(worker.held[priority + 1 :])
+    if episode_s is None or episode_s >= PREFETCH_BELOW_S or behind_hidden:
+        return at_least
+    ahead = min(settings.batch_max, 1 + int(settings.batch_s / max(episode_s, 1e-4)))
+    share = math.ceil(sum(flow.lane.n_ready) * worker.slots / max(1, flow.lane.slots()))
+    return max(at_least, min(worker.slots * ahead - worker.n_live, share))
+
+
+# ---- the end of a step ----
+
+
+def dispatch(state: State, step: Step) -> None:
+    """Hand out what this step made available."""
+    permits.settle(state, step)
+    while state.freed:
+        name = next(iter(state.freed))
+        del state.freed[name]
+        worker = state.workers.get(name)
+        if worker is not None and worker.poll is not None and name not in worker.profile.parked:
+            reconsider(state, worker, step)
+    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
+        lane = job.group.flow.lane
+        if lane is not None and job.queued:
+            if job.priority == TRAIN:
+                avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
+                preemption.clear(state, lane, job.group.flow.family, avoided, step)
+            _try_parked(state, lane, step, TRIES_MAX)
+    fed = list(step.dirty)
+    step.dirty.clear()
+    for lane in fed:
+        _feed(state, lane, step)
+    for lane in fed:
+        if lane.n_ready[TRAIN]:
+            preemption.preempt(state, lane, step)
+    while step.dirty:
+        # What was stopped just now waits again: another worker may have a slot for it.
+        lane = next(iter(step.dirty))
+        del step.dirty[lane]
+        _feed(state, lane, step)
+    for lane in fed:
+        precedence.watch(state, lane, step)
+    for name, stops in step.stops.items():
+        _tell(state, name, tuple(stops), step)
+
+
+def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
+    """Tell a worker now what to stop, if any answer of ours is due to it; else its next heartbeat brings it."""
+    worker = state.workers.get(name)
+    if worker is None:
+        return
+    if worker.beat is not None:
+        fleet.answer_beat(state, worker, stops, step)
+    elif worker.poll is not None:
+        fleet.answer_poll(state, worker, (), step, stops)
+
+
+def reconsider(state: State, worker: Worker, step: Step) -> None:
+    """A worker with a waiting poll may have become available."""
+    if worker.poll is None or not fleet.available(worker, step.now):
+        return
+    if not _serve(state, worker, step):
+        _park(state, worker, step)
+
+
+def bench_ended(state: State, name: str, step: Step) -> None:
+    """A worker has sat out for long enough."""
+    worker = state.workers.get(name)
+    if worker is not None:
+        reconsider(state, worker, step)
+
+
+def _feed(state: State, lane: Lane, step: Step) -> None:
+    """Answer parked polls while the lane has something for them."""
+    tries = 0
+    while any(lane.n_ready) and tries < TRIES_MAX:
+        worker = _parked(state, lane)
+        if worker is None:
+            return
+        if _serve(state, worker, step):
+            tries = 0
+        else:
+            tries += 1
+            _to_the_back(state, worker, step)
+    if any(lane.n_ready):
+        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+
+
+def _try_parked(state: State, lane: Lane, step: Step, tries: int) -> None:
+    for profile in lane.profiles:
+        for name in list(islice(profile.parked, tries)):
+            worker = state.workers[name]
+            if not _serve(state, worker, step):
+                _to_the_back(state, worker, step)
+
+
+def _to_the_back(state: State, worker: Worker, step: Step) -> None:
+    fleet.unpark(worker)
+    _park(state, worker, step)
+
+
+def _parked(state: State, lane: Lane) -> Worker | None:
+    """The waiting worker that should get what goes next in the lane."""
+    following = queue.next_bundle(lane)
+    if following is None:
+        return None
+    workers = state.workers
+    for item in following:
+        for profile in lane.profiles if item is not None else ():
+            for name in islice(profile.warm.get(item or "", ()), LOOKS_MAX):
+                if queue.may_serve(state, lane, workers[name]):
+                    return workers[name]
+    for profile in lane.profiles:
+        for name in islice(profile.parked, LOOKS_MAX):
+            if queue.may_serve(state, lane, workers[name]):
+                return workers[name]
+    return None

@@ -1,0 +1,78 @@
+"""Suspects: jobs that may take workers down run with nothing beside them.
+
+Rule that this module owns: a suspect runs alone, on an idle worker, or on one that is emptied for it; nothing else goes there
+meanwhile.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.leasing import fleet, leases, queue
+from evopolicy_coordinator.core.model import EARLY_VALIDATION, TRAIN, JobState, Worker
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+from . import preemption
+
+SUSPECTS_MAX = 16
+"""Suspects looked at in one step."""
+
+
+def next_of(state: State, worker: Worker, step: Step) -> wire.Lease | None:
+    """The suspect that an idle worker is to play; a busy one may be reserved for one instead."""
+    idle = not worker.leases
+    if worker.reserved is not None:
+        job = worker.reserved
+        if not job.queued or _barred(state, job, worker):
+            worker.reserved = job.reserved = None
+        elif not idle:
+            return None
+        else:
+            return _alone(state, job, worker, step)
+    for job in list(islice(state.suspects, SUSPECTS_MAX)):
+        lane = job.group.flow.lane
+        if lane is None or worker.profile not in lane.profiles:
+            continue
+        if job.reserved is not None and not idle:
+            continue
+        if job.avoid == worker.name and step.now < job.avoid_until and lane.workers() > 1:
+            continue
+        if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
+            continue
+        if job.group.bars(worker) or _barred(state, job, worker):
+            continue
+        if idle:
+            return _alone(state, job, worker, step)
+        _reserve(state, job, worker, step)
+        return None
+    return None
+
+
+def _barred(state: State, job: JobState, worker: Worker) -> bool:
+    return bars.bar(state, job.priority, job.group.flow.family, worker)
+
+
+def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
+    """Begin to empty a busy worker for a suspect; a train job does not wait for what is hidden there to end."""
+    job.reserved = worker.name
+    worker.reserved = job
+    state.story.tell(step.now, step.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
+    if job.priority == TRAIN:
+        for lease in list(worker.leases.values()):
+            first = bars.goes_first(lease)
+            if (
+                lease.live
+                and lease.job.priority != TRAIN
+                and not first
+                and preemption.may_stop(state, lease.job)
+            ):
+                preemption.stop_hidden(state, lease, worker, f"preempted for {job.job_id}", step)
+
+
+def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+    fleet.unreserve(state, job)
+    queue.withdraw(state, job)
+    return leases.grant(state, job, worker, step)
