@@ -60,6 +60,7 @@ def write_run(
     seeded_by: Literal["case", "run"] = "run",
     closed_reason: str | None = None,
     settings: Mapping[str, Any] | None = None,
+    simulation: Literal["forbidden", "allowed"] = "forbidden",
 ) -> Path:
     """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone."""
     folder = (
@@ -104,6 +105,7 @@ def write_run(
             n_train=64,
             n_validation=16,
             n_heldout=32,
+            simulation=simulation,
             hidden_cases=hidden_cases,  # type: ignore[arg-type]
         ),
         timing=Timing(

@@ -56,6 +56,10 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     """Whether hidden episodes and agents shared a kernel: `exclusive`, `shared`, `waived`, `unknown`."""
     hidden_cases: str
     """`shared`, or `per_run`."""
+    simulation: str
+    """Whether the run's rules let its agent simulate: `forbidden`, `allowed`."""
+    simulator_flags: int | None
+    """Places in its code that look like a simulator; None where simulation was allowed."""
 
 
 class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,6 +121,8 @@ def _signals(run: Run) -> AuditSignals:
         jail=run.record.jail,
         hidden_isolation=run.record.hidden_isolation,
         hidden_cases=run.record.experiment_dimensions.hidden_cases,
+        simulation=run.record.experiment_dimensions.simulation,
+        simulator_flags=None if run.simulation_allowed else len(run.simulator_flags),
     )
 
 

@@ -16,7 +16,9 @@ from evopolicy_coordinator.analysis.html.small_timeline import small_timeline
 from evopolicy_coordinator.analysis.palette import Look
 from evopolicy_coordinator.analysis.reading.records import Run, Submit
 from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
+from evopolicy_coordinator.analysis.simulators.look import Flag
 from evopolicy_coordinator.analysis.study import Study
+from evopolicy_coordinator.analysis.tables.run_tables import submits_text
 from evopolicy_coordinator.analysis.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
@@ -124,7 +126,7 @@ def index_page(
                  tables=shown_tables("structure")),
         _section(
             "cost", "Cost and audit", figures=shown_figures("tokens", "wall_time"),
-            tables=shown_tables("tokens", "audit"),
+            tables=shown_tables("tokens", "audit", "simulator_flags"),
         ),
         _section(
             "feedback", "Feedback use",
@@ -200,6 +202,15 @@ def _notices(study: Study) -> list[dict[str, Any]]:
                 "lines": [],
             }
         )
+    if flagged := sum(bool(run.simulator_flags) for run in study.runs):
+        title = (
+            f"{flagged} of {len(study.runs)} runs have code that looks like a simulator, which their rules forbid: "
+            "a signal to read, never a verdict."
+        )
+        out.append({"title": title, "lines": []})
+    if allowed := sum(run.simulation_allowed for run in study.runs):
+        title = f"{allowed} of {len(study.runs)} runs let their agent simulate, or are from before there was a rule against it."
+        out.append({"title": title, "lines": []})
     unjailed = sum(signals.jail == "none" for signals in study.audit)
     if unjailed:
         out.append(
@@ -297,8 +308,21 @@ def trace_page(
         log_note=note,
         rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index)) for row in trace.rows],
         unplaced=trace.unplaced,
+        simulation_allowed=run.simulation_allowed,
+        flags=[_flag(flag) for flag in run.simulator_flags],
         checkpoints=checkpoints,
     )  # fmt: skip
+
+
+def _flag(flag: Flag) -> dict[str, Any]:
+    return {
+        "kind": flag.kind,
+        "path": flag.path,
+        "lines": f"{flag.line}–{flag.end_line}",
+        "submits": submits_text(flag.submits),
+        "reasons": flag.reasons,
+        "quote": "\n".join(flag.quote),
+    }
 
 
 def failed_page(run: Run, reason: str) -> str:

@@ -26,6 +26,7 @@ from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
 from evopolicy_coordinator.analysis.behaviour.topology import describe
 from evopolicy_coordinator.analysis.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.reading.sources import reachable_modules, read_python_files, source_digest
+from evopolicy_coordinator.analysis.simulators.look import Flag, flags_of
 
 Files = Mapping[str, bytes]
 
@@ -145,8 +146,23 @@ def read_run(folder: Path) -> Run:
     if outcome.status == "completed" and selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has left nothing behind")
     run = Run(path=folder, record=record, submits=submits)
+    if not run.simulation_allowed:
+        run = msgspec.structs.replace(run, simulator_flags=_simulators(run))
     _check_numbers({"run.json": run.record, "submits": run.submits})
     return run
+
+
+def _simulators(run: Run) -> tuple[Flag, ...]:
+    def files_of(submit: Submit) -> Files:
+        try:
+            return read_python_files(run.checkpoint(submit.index) / "system")
+        except OSError:
+            return {}
+
+    artifacts = run.record.artifacts
+    log = run.path / artifacts.agent_log if artifacts.agent_log else None
+    workspace = run.path / (artifacts.workspace or "workspace")
+    return flags_of(((submit.index, files_of(submit)) for submit in run.submits), workspace, log, run.env)
 
 
 def _check_numbers(told: Any) -> None:

@@ -15,6 +15,7 @@ import msgspec
 
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_coordinator.analysis.behaviour.topology import Features
+from evopolicy_coordinator.analysis.simulators.look import Flag
 
 EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "data"]
 """What a score-bearing submit is to the score-bearing submit before it; see `edits`."""
@@ -78,6 +79,12 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     record: RunRecord
     submits: tuple[Submit, ...]
     """In order of their index."""
+    simulator_flags: tuple[Flag, ...] = ()
+    """Code that looks like a simulator; empty where the run's rules allow simulation, as then nobody looked."""
+
+    @property
+    def simulation_allowed(self) -> bool:
+        return self.record.experiment_dimensions.simulation == "allowed"
 
     @property
     def entry(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator, Mapping
 
-from evopolicy_coordinator.analysis.sources import parse
+from evopolicy_coordinator.analysis.reading.sources import parse
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 Scope = ast.Module | Function
@@ -13,6 +13,8 @@ Scope = ast.Module | Function
 MAX_NODES = 20_000
 """AST nodes of one module above which it is not looked into: data in disguise, or a library."""
 _MAX_TEXTS = 20
+_MAX_NAMESAKES = 4
+"""Functions of one name that a call may mean."""
 _SELECTING = frozenset(
     {"max", "min", "sorted", "sort", "argmax", "argmin", "argsort", "argpartition", "nlargest", "nsmallest", "amax", "amin"}
 )  # fmt: skip
@@ -29,10 +31,9 @@ RECORDED_KEYS = frozenset(
 class Part:
     """One module of a bundle: a file, or code that a file keeps in a string."""
 
-    def __init__(self, path: str, tree: ast.Module, lines: list[str], first_line: int = 1) -> None:
+    def __init__(self, path: str, tree: ast.Module, first_line: int = 1) -> None:
         self.path = path
         self.tree = tree
-        self.lines = lines
         self.first_line = first_line
         """Line of the file at which the text of `tree` begins."""
         self.scopes: list[Scope] = [tree, *(n for n in ast.walk(tree) if isinstance(n, Function))]
@@ -69,19 +70,27 @@ class Code:
 
     def _collect(self, tree: ast.Module) -> None:
         members: set[ast.AST] = set()
+
+        def add(name: str, function: Function) -> None:
+            known = self.functions.setdefault(name, [])
+            if len(known) < _MAX_NAMESAKES:
+                known.append(function)
+
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 self.classes[node.name] = node
                 for child in node.body:
                     if isinstance(child, ast.FunctionDef):
                         members.add(child)
-                        self.methods.setdefault(child.name, []).append((node, child))
+                        namesakes = self.methods.setdefault(child.name, [])
+                        if len(namesakes) < _MAX_NAMESAKES:
+                            namesakes.append((node, child))
             elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node not in members:
-                self.functions.setdefault(node.name, []).append(node)
+                add(node.name, node)
             elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Lambda):
                 for target in node.targets:
                     if isinstance(target, ast.Name):
-                        self.functions.setdefault(target.id, []).append(node.value)
+                        add(target.id, node.value)
 
     def called(self, call: ast.Call) -> list[Function]:
         """Functions of the bundle that this call may mean, by name."""
@@ -100,7 +109,9 @@ class Code:
             for scope in scopes:
                 names = self.recorded[scope]
                 for node in own_nodes(scope):
-                    if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign | ast.For | ast.comprehension):
+                    if isinstance(
+                        node, ast.Assign | ast.AugAssign | ast.AnnAssign | ast.For | ast.comprehension
+                    ):
                         source = node.iter if isinstance(node, ast.For | ast.comprehension) else node.value
                         if source is not None and self.is_recorded(source, names):
                             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
@@ -126,7 +137,11 @@ class Code:
                 return True
             if isinstance(inner, ast.Call) and called_name(inner) in _LOADING:
                 return True
-            if isinstance(inner, ast.Subscript) and key_of(inner) in RECORDED_KEYS and "desired_goal" not in ast.dump(inner.slice):
+            if (
+                isinstance(inner, ast.Subscript)
+                and key_of(inner) in RECORDED_KEYS
+                and "desired_goal" not in ast.dump(inner.slice)
+            ):
                 return isinstance(inner.value, ast.Name) and inner.value.id not in ("obs", "observation")
         return False
 
@@ -147,8 +162,7 @@ def _parts(path: str, source: bytes) -> list[Part]:
     tree = parse(source)
     if tree is None or sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         return []
-    lines = source.decode("utf-8", "replace").splitlines()
-    found = [Part(path, tree, lines)]
+    found = [Part(path, tree)]
     texts = [
         node
         for node in ast.walk(tree)
@@ -158,8 +172,10 @@ def _parts(path: str, source: bytes) -> list[Part]:
     for node in texts[:_MAX_TEXTS]:
         text = str(node.value)
         inner = parse(text.encode("utf-8", "replace")) if id(node) not in documentation else None
-        if inner is not None and any(isinstance(n, ast.For | ast.While | ast.FunctionDef) for n in inner.body):
-            found.append(Part(path, inner, text.splitlines(), node.lineno))
+        if inner is not None and any(
+            isinstance(n, ast.For | ast.While | ast.FunctionDef) for n in inner.body
+        ):
+            found.append(Part(path, inner, node.lineno))
     return found
 
 
@@ -189,7 +205,10 @@ def own_nodes(scope: Scope, *, lambdas: bool = False) -> list[ast.AST]:
 def _calls_for_each(scope: Scope) -> Iterator[ast.Call]:
     """Calls inside loops, comprehensions and lambdas of a scope, and functions that are named as a key."""
     for node in own_nodes(scope, lambdas=True):
-        if isinstance(node, ast.For | ast.While | ast.ListComp | ast.GeneratorExp | ast.DictComp | ast.SetComp | ast.Lambda):
+        if isinstance(
+            node,
+            ast.For | ast.While | ast.ListComp | ast.GeneratorExp | ast.DictComp | ast.SetComp | ast.Lambda,
+        ):
             yield from (inner for inner in ast.walk(node) if isinstance(inner, ast.Call))
         elif isinstance(node, ast.Call):
             named = [k.value for k in node.keywords if k.arg == "key"]
@@ -208,8 +227,16 @@ def selects(node: ast.AST) -> bool:
     if isinstance(node, ast.If):
         tests = [n for n in ast.walk(node.test) if isinstance(n, ast.Compare)]
         compared = {name.id for test in tests for name in ast.walk(test) if isinstance(name, ast.Name)}
-        stored = {name for s in node.body if isinstance(s, ast.Assign) for t in s.targets for name in stored_names(t)}
-        return bool(compared & stored) and any(isinstance(op, ast.Gt | ast.Lt | ast.GtE | ast.LtE) for t in tests for op in t.ops)
+        stored = {
+            name
+            for s in node.body
+            if isinstance(s, ast.Assign)
+            for t in s.targets
+            for name in stored_names(t)
+        }
+        return bool(compared & stored) and any(
+            isinstance(op, ast.Gt | ast.Lt | ast.GtE | ast.LtE) for t in tests for op in t.ops
+        )
     return False
 
 
@@ -228,7 +255,11 @@ def stored_names(target: ast.AST) -> list[str]:
     """Plain names that an assignment to `target` stores or changes."""
     if isinstance(target, ast.Subscript | ast.Attribute | ast.Starred):
         return stored_names(target.value)
-    return [target.id] if isinstance(target, ast.Name) else [n for c in getattr(target, "elts", ()) for n in stored_names(c)]
+    return (
+        [target.id]
+        if isinstance(target, ast.Name)
+        else [n for c in getattr(target, "elts", ()) for n in stored_names(c)]
+    )
 
 
 def parameters_of(function: Function) -> list[str]:

@@ -21,7 +21,7 @@ from evopolicy_coordinator.analysis.simulators.code import (
     stored_names,
 )
 
-MAX_STEPS, MAX_ALL_STEPS = 20_000, 200_000
+MAX_STEPS, MAX_ALL_STEPS = 8_000, 60_000
 """Expressions that are followed for one loop, and for all of a bundle."""
 _DEPTH = 4
 _NOTHING: frozenset[str] = frozenset()
@@ -35,8 +35,12 @@ _DRAWING = frozenset(
      "randn", "sample"}
 )  # fmt: skip
 _CHOOSING = frozenset({"argmax", "argmin", "sign", "copysign"})
-_ADDING = frozenset({"append", "appendleft", "add", "extend", "insert", "push", "put", "update", "heappush", "setdefault"})
-_ASKING = frozenset({"urlopen", "post", "submit", "request", "getresponse", "sendall", "recv", "check_output", "Popen"})
+_ADDING = frozenset(
+    {"append", "appendleft", "add", "extend", "insert", "push", "put", "update", "heappush", "setdefault"}
+)
+_ASKING = frozenset(
+    {"urlopen", "post", "submit", "request", "getresponse", "sendall", "recv", "check_output", "Popen"}
+)
 _BENDING = (ast.Mult, ast.Div, ast.Pow, ast.MatMult, ast.FloorDiv)
 
 
@@ -82,9 +86,16 @@ class _Frame:
         self.returned: list[Flow] = []
         self.own: set[str] = set()
         if function is not None:
-            outer = {n for node in own_nodes(function) if isinstance(node, ast.Nonlocal | ast.Global) for n in node.names}
+            outer = {
+                n
+                for node in own_nodes(function)
+                if isinstance(node, ast.Nonlocal | ast.Global)
+                for n in node.names
+            }
             stored = {
-                node.id for node in own_nodes(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+                node.id
+                for node in own_nodes(function)
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
             }
             self.own = (stored - outer) | set(parameters_of(function))
 
@@ -205,7 +216,9 @@ class Pass:
 
     def _branch(self, node: ast.If) -> None:
         test = self.value(node.test)
-        if any(isinstance(n, ast.Break | ast.Return) for s in (*node.body, *node.orelse) for n in ast.walk(s)):
+        if any(
+            isinstance(n, ast.Break | ast.Return) for s in (*node.body, *node.orelse) for n in ast.walk(s)
+        ):
             self.tested.append(test)
         before = dict(self.values), dict(self._frames[-1].values)
         self.run(node.body)
@@ -236,6 +249,8 @@ class Pass:
     def _added(self, target: ast.expr, value: ast.expr) -> bool:
         """`total = total + x` is `total += x`."""
         if not isinstance(value, ast.BinOp) or not isinstance(value.op, ast.Add | ast.Sub):
+            return False
+        if not isinstance(target, ast.Name | ast.Attribute):
             return False
         same = ast.dump(_loaded(target)) == ast.dump(value.left)
         if not same or self._sum_name(target) is None:
@@ -311,7 +326,11 @@ class Pass:
             return
         recorded = self._frames[-1].function is None and self.code.is_recorded(source, self.recorded)
         item = Flow(deps=frozenset({"@item"}), chosen=True, fresh=recorded)
-        if isinstance(source, ast.Call) and called_name(source) == "enumerate" and isinstance(target, ast.Tuple):
+        if (
+            isinstance(source, ast.Call)
+            and called_name(source) == "enumerate"
+            and isinstance(target, ast.Tuple)
+        ):
             self._assign(target.elts[0], Flow(time=True))
             target = target.elts[-1]
         self._assign(target, item)
@@ -342,7 +361,9 @@ class Pass:
             test = self.value(node.test)
             sides = join([self.value(node.body), self.value(node.orelse)])
             return sides._replace(
-                deps=sides.deps | test.deps, chosen=sides.chosen or bool(test.deps), fresh=sides.fresh or test.fresh
+                deps=sides.deps | test.deps,
+                chosen=sides.chosen or bool(test.deps),
+                fresh=sides.fresh or test.fresh,
             )
         if isinstance(node, ast.Attribute):
             return self._attribute(node)
@@ -388,7 +409,9 @@ class Pass:
         if key_of(node) in RECORDED_KEYS and "@item" in base.deps:
             found = found._replace(fresh=True)
         # A slice is a shorter text or list, not what a table says of a state.
-        return found if isinstance(node.slice, ast.Slice) else found._replace(looked=found.looked | index.deps)
+        return (
+            found if isinstance(node.slice, ast.Slice) else found._replace(looked=found.looked | index.deps)
+        )
 
     def _comprehension(self, node: ast.ListComp | ast.SetComp | ast.GeneratorExp | ast.DictComp) -> Flow:
         for generator in node.generators:
@@ -411,7 +434,9 @@ class Pass:
             if not library:
                 if name == "act":  # the contract's name: whose answer is an action, whatever it remembers
                     return given._replace(chosen=True, bent=_NOTHING)
-                followed = [(c, m) for c, m in self.code.methods.get(name, []) if m is not self._frames[-1].function]
+                followed = [
+                    (c, m) for c, m in self.code.methods.get(name, []) if m is not self._frames[-1].function
+                ]
                 if followed:
                     return self._follow_method(node.func, followed, arguments, named, node)
                 if name in _ADDING:
@@ -475,7 +500,12 @@ class Pass:
         if len(self._frames) > _DEPTH or any(frame.function is function for frame in self._frames):
             return given
         parameters = parameters_of(function)
-        if own is None and parameters[:1] == ["self"] and len(arguments) < len(parameters) and call is not None:
+        if (
+            own is None
+            and parameters[:1] == ["self"]
+            and len(arguments) < len(parameters)
+            and call is not None
+        ):
             parameters = parameters[1:]
         frame = _Frame(function)
         starred = call is not None and any(isinstance(arg, ast.Starred) for arg in call.args)
@@ -483,13 +513,19 @@ class Pass:
             if starred:
                 frame.values[parameter] = given
             else:
-                frame.values[parameter] = named.get(parameter, arguments[number] if number < len(arguments) else Flow())
+                frame.values[parameter] = named.get(
+                    parameter, arguments[number] if number < len(arguments) else Flow()
+                )
         shift = 1 if own is not None else 0
         if own is not None and parameters:
             frame.stands_for[parameters[0]] = own
         if call is not None and not starred:
             for parameter, argument in zip(parameters[shift:], call.args, strict=False):
-                if isinstance(argument, ast.Name) and (place := self._place(argument.id)) is not None and _changes(function, parameter):
+                if (
+                    isinstance(argument, ast.Name)
+                    and (place := self._place(argument.id)) is not None
+                    and _changes(function, parameter)
+                ):
                     frame.stands_for[parameter] = place
         self._frames.append(frame)
         try:
@@ -504,9 +540,9 @@ class Pass:
 def _changes(function: Function, parameter: str) -> bool:
     """Whether the function stores into a part of what it is given."""
     for node in own_nodes(function):
-        if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store):
-            if parameter in stored_names(node):
-                return True
+        stored = isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store)
+        if stored and parameter in stored_names(node):
+            return True
     return False
 
 

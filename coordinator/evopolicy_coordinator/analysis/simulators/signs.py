@@ -19,6 +19,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.simulators import SIMULATORS
+from evopolicy_coordinator.analysis.reading.sources import parse
 from evopolicy_coordinator.analysis.simulators.code import (
     Code,
     Function,
@@ -33,7 +34,15 @@ from evopolicy_coordinator.analysis.simulators.flow import Flow, Pass, TooMuchEr
 
 Kind = Literal["package", "rollout", "recursion", "environment class", "solver", "sums of sums"]
 FLAGGED = 3.0
-_PACKAGES = frozenset(SIMULATORS) | {"brax", "gymnax", "pymunk", "jumanji", "mujoco_mjx", "envpool", "safety_gymnasium"}
+_PACKAGES = frozenset(SIMULATORS) | {
+    "brax",
+    "gymnax",
+    "pymunk",
+    "jumanji",
+    "mujoco_mjx",
+    "envpool",
+    "safety_gymnasium",
+}
 _HARMLESS = ("spaces",)
 _SOLVERS = frozenset({"solve_ivp", "odeint", "ode", "RK45", "RK23", "DOP853", "LSODA", "odeint_adjoint"})
 _FOLDS = frozenset({"reduce", "accumulate", "scan", "fori_loop", "while_loop"})
@@ -58,25 +67,18 @@ class Sign(msgspec.Struct, frozen=True, kw_only=True):
     end_line: int
     """1-based, inclusive."""
     reasons: tuple[str, ...]
-    quote: tuple[str, ...]
-    """The lines, shortened."""
 
 
-_QUOTED_LINES, _QUOTED_CHARS = 10, 160
-
-
-def signs_of(code: Code, env: str) -> list[Sign]:
-    """Every sign in a bundle, strongest first. `env` adds the numbers of that environment's dynamics."""
+def signs_of(code: Code) -> list[Sign]:
+    """Every sign in a bundle, strongest first. Does not depend on the numbers in it."""
     found: list[Sign] = []
     for part in code.parts:
-        known = _known_constants(part, env)
         found += _packages(part)
         for scope in part.scopes:
-            for judged in _judged(code, part, scope):
-                points, kind, node, reasons = judged
-                if known and points < FLAGGED:
-                    points, reasons = points + 0.5, (*reasons, f"the file has {known} numbers of this environment's dynamics")
-                found.append(_sign(part, kind, node, points, reasons))
+            found += [
+                _sign(part, kind, node, points, reasons)
+                for points, kind, node, reasons in _judged(code, scope)
+            ]
         for node in ast.walk(part.tree):
             if isinstance(node, ast.ClassDef):
                 found += _environment_class(code, part, node)
@@ -85,13 +87,10 @@ def signs_of(code: Code, env: str) -> list[Sign]:
 
 def _sign(part: Part, kind: Kind, node: ast.AST, points: float, reasons: tuple[str, ...]) -> Sign:
     first, last = getattr(node, "lineno", 1), getattr(node, "end_lineno", None) or 1
-    lines = [line[:_QUOTED_CHARS] for line in part.lines[first - 1 : last]]
-    if len(lines) > _QUOTED_LINES:
-        lines = [*lines[: _QUOTED_LINES - 1], f"… {len(lines) - _QUOTED_LINES + 1} more lines"]
     shift = part.first_line - 1
     return Sign(
-        kind=kind, points=points, path=part.path, line=first + shift, end_line=last + shift, reasons=reasons, quote=tuple(lines)
-    )  # fmt: skip
+        kind=kind, points=points, path=part.path, line=first + shift, end_line=last + shift, reasons=reasons
+    )
 
 
 # -- packages
@@ -117,7 +116,11 @@ def _packages(part: Part) -> Iterator[Sign]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and not node.level:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.Call) and called_name(node) in ("import_module", "__import__", "find_spec") and node.args:
+        elif (
+            isinstance(node, ast.Call)
+            and called_name(node) in ("import_module", "__import__", "find_spec")
+            and node.args
+        ):
             names = [_text(node.args[0], texts)]
         for name in names:
             root, _, rest = name.partition(".")
@@ -135,9 +138,18 @@ def _text(node: ast.expr, names: dict[str, str]) -> str:
         return _text(node.left, names) + _text(node.right, names)
     if isinstance(node, ast.JoinedStr):
         return "".join(_text(v.value if isinstance(v, ast.FormattedValue) else v, names) for v in node.values)
-    if isinstance(node, ast.Call) and called_name(node) == "join" and node.args and isinstance(node.args[0], ast.List | ast.Tuple):
+    if (
+        isinstance(node, ast.Call)
+        and called_name(node) == "join"
+        and node.args
+        and isinstance(node.args[0], ast.List | ast.Tuple)
+    ):
         return "".join(_text(part, names) for part in node.args[0].elts)
-    if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Slice) and "-1" in ast.unparse(node.slice):
+    if (
+        isinstance(node, ast.Subscript)
+        and isinstance(node.slice, ast.Slice)
+        and "-1" in ast.unparse(node.slice)
+    ):
         return _text(node.value, names)[::-1]
     return ""
 
@@ -147,21 +159,23 @@ def _text(node: ast.expr, names: dict[str, str]) -> str:
 _Judged = tuple[float, Kind, ast.AST, tuple[str, ...]]
 
 
-def _judged(code: Code, part: Part, scope: Scope) -> Iterator[_Judged]:
+def _judged(code: Code, scope: Scope) -> Iterator[_Judged]:
     for node in own_nodes(scope):
         try:
             if isinstance(node, ast.For | ast.AsyncFor | ast.While):
-                yield from _loop(code, part, scope, node)
-            elif isinstance(node, ast.ListComp | ast.GeneratorExp) and any(isinstance(n, ast.NamedExpr) for n in ast.walk(node)):
-                yield from _comprehension(code, part, scope, node)
+                yield from _loop(code, scope, node)
+            elif isinstance(node, ast.ListComp | ast.GeneratorExp) and any(
+                isinstance(n, ast.NamedExpr) for n in ast.walk(node)
+            ):
+                yield from _comprehension(code, scope, node)
             elif isinstance(node, ast.Call):
-                yield from _fold(code, part, scope, node)
+                yield from _fold(code, scope, node)
                 yield from _solver(code, scope, node)
         except TooMuchError:
             continue
     if not isinstance(scope, ast.Module):
         try:
-            yield from _recursion(code, part, scope)
+            yield from _recursion(code, scope)
         except TooMuchError:
             pass
         yield from _sums_of_sums(code, scope)
@@ -171,7 +185,7 @@ def _begin(code: Code, scope: Scope) -> Pass:
     return Pass(code, code.recorded.get(scope, set()))
 
 
-def _loop(code: Code, part: Part, scope: Scope, node: ast.For | ast.AsyncFor | ast.While) -> Iterator[_Judged]:
+def _loop(code: Code, scope: Scope, node: ast.For | ast.AsyncFor | ast.While) -> Iterator[_Judged]:
     run = _begin(code, scope)
     if isinstance(node, ast.While):
         run.tested.append(run.value(node.test))
@@ -181,7 +195,7 @@ def _loop(code: Code, part: Part, scope: Scope, node: ast.For | ast.AsyncFor | a
     yield from _verdict(code, scope, node, run)
 
 
-def _comprehension(code: Code, part: Part, scope: Scope, node: ast.ListComp | ast.GeneratorExp) -> Iterator[_Judged]:
+def _comprehension(code: Code, scope: Scope, node: ast.ListComp | ast.GeneratorExp) -> Iterator[_Judged]:
     run = _begin(code, scope)
     generator = node.generators[0]
     run.bind_loop(generator.target, generator.iter)
@@ -189,7 +203,10 @@ def _comprehension(code: Code, part: Part, scope: Scope, node: ast.ListComp | as
         run.value(test)
     worth = run.value(node.elt)
     summed = any(
-        isinstance(call, ast.Call) and called_name(call) in ("sum", "max", "min", "fsum") and node in call.args for call in own_nodes(scope)
+        isinstance(call, ast.Call)
+        and called_name(call) in ("sum", "max", "min", "fsum")
+        and node in call.args
+        for call in own_nodes(scope)
     )
     if summed:
         run.sums.setdefault("sum()", []).append(worth)
@@ -217,7 +234,9 @@ class _States:
             for key in run.sums
             if key in self.new
             and key not in run.stored_otherwise
-            and not any(key in self.edges[other] for other in self.carried if other != key and other not in run.sums)
+            and not any(
+                key in self.edges[other] for other in self.carried if other != key and other not in run.sums
+            )
             and not any(key in {self._name(d, roots) for d in flow.deps} for flow in run.sums[key])
         }
         """Sums that feed nothing but themselves."""
@@ -243,7 +262,9 @@ class _States:
         found = set[str]()
         for name in names:
             circle = {other for other in reach[name] if name in reach.get(other, ())}
-            if name in circle and any(self.bent[one] & circle or self._looked(one) & circle for one in circle):
+            if name in circle and any(
+                self.bent[one] & circle or self._looked(one) & circle for one in circle
+            ):
                 found.add(name)
         return found
 
@@ -253,12 +274,16 @@ class _States:
         return flow.looked if flow.chosen else frozenset()
 
 
-def _verdict(code: Code, scope: Scope, node: ast.AST, run: Pass, sinks: frozenset[str] = frozenset()) -> Iterator[_Judged]:
+def _verdict(
+    code: Code, scope: Scope, node: ast.AST, run: Pass, sinks: frozenset[str] = frozenset()
+) -> Iterator[_Judged]:
     found = _States(run)
     states = found.states - sinks
     if not states or run.asks or any(found.new[name].fresh for name in states):
         return
-    reasons = [f"{_listed(states)} follow{'s' * (len(states) == 1)} from {'its' if len(states) == 1 else 'their'} own value a pass before"]
+    reasons = [
+        f"{_listed(states)} follow{'s' * (len(states) == 1)} from {'its' if len(states) == 1 else 'their'} own value a pass before"
+    ]
     points = 1.0
     tried = _tries_candidates(code, scope, node)
     if any(found.new[name].chosen for name in states):
@@ -325,7 +350,8 @@ def _used(scope: Scope, loop: ast.AST, name: str) -> bool:
 def _returned(scope: Scope, name: str) -> bool:
     last = name.split(".")[-1]
     return any(
-        (isinstance(inner, ast.Name) and inner.id == name) or (isinstance(inner, ast.Attribute) and inner.attr == last and "." in name)
+        (isinstance(inner, ast.Name) and inner.id == name)
+        or (isinstance(inner, ast.Attribute) and inner.attr == last and "." in name)
         for node in own_nodes(scope)
         if isinstance(node, ast.Return | ast.Yield) and node.value is not None
         for inner in ast.walk(node.value)
@@ -356,7 +382,7 @@ def _tries_candidates(code: Code, scope: Scope, node: ast.AST) -> bool:
 # -- other forms of a loop
 
 
-def _fold(code: Code, part: Part, scope: Scope, call: ast.Call) -> Iterator[_Judged]:
+def _fold(code: Code, scope: Scope, call: ast.Call) -> Iterator[_Judged]:
     """`reduce` and its like: the first parameter of the function is the state."""
     if called_name(call) not in _FOLDS or not call.args:
         return
@@ -378,7 +404,12 @@ def _fold(code: Code, part: Part, scope: Scope, call: ast.Call) -> Iterator[_Jud
                 after = join(run.returned)
             if parameters[0] not in after.bent:
                 continue
-            points, reasons = 1.0, [f"{called_name(call)} makes {parameters[0]} from {parameters[0]} and an item, again and again"]
+            points, reasons = (
+                1.0,
+                [
+                    f"{called_name(call)} makes {parameters[0]} from {parameters[0]} and an item, again and again"
+                ],
+            )
             if "@item" in after.deps:
                 points += 1.0
                 reasons.append("a plan's item enters")
@@ -400,7 +431,7 @@ def _solver(code: Code, scope: Scope, call: ast.Call) -> Iterator[_Judged]:
         )
 
 
-def _recursion(code: Code, part: Part, function: Function) -> Iterator[_Judged]:
+def _recursion(code: Code, function: Function) -> Iterator[_Judged]:
     if isinstance(function, ast.Lambda):
         return
     parameters = set(parameters_of(function))
@@ -419,7 +450,9 @@ def _recursion(code: Code, part: Part, function: Function) -> Iterator[_Judged]:
             points += 1.0
             reasons.append("for each of several choices")
         returns = [n for n in own_nodes(function) if isinstance(n, ast.Return) and n.value is not None]
-        if any(_weighs(statement.value, node) for statement in returns if statement.value is not None) or (over and _selects(function)):
+        if any(_weighs(statement.value, node) for statement in returns if statement.value is not None) or (
+            over and _selects(function)
+        ):
             points += 1.0
             reasons.append("and adds up or compares what comes of it")
         yield points, "recursion", function, tuple(reasons)
@@ -443,10 +476,16 @@ def _sums_of_sums(code: Code, function: Scope) -> Iterator[_Judged]:
     summed: set[str] = set()
     statements = [n for n in own_nodes(function) if isinstance(n, ast.Assign)]
     for statement in sorted(statements, key=lambda n: n.lineno):
-        calls = [n for n in ast.walk(statement.value) if isinstance(n, ast.Call) and called_name(n) in ("cumsum", "cumulative_sum")]
+        calls = [
+            n
+            for n in ast.walk(statement.value)
+            if isinstance(n, ast.Call) and called_name(n) in ("cumsum", "cumulative_sum")
+        ]
         inner = {n.id for call in calls for n in ast.walk(call) if isinstance(n, ast.Name)}
         nested = any(
-            isinstance(n, ast.Call) and n is not call and called_name(n) == "cumsum" for call in calls for n in ast.walk(call)
+            isinstance(n, ast.Call) and n is not call and called_name(n) == "cumsum"
+            for call in calls
+            for n in ast.walk(call)
         )
         if calls and (nested or inner & summed):
             chosen = any(selects(n) for n in own_nodes(function, lambdas=True)) or function in code.selected
@@ -454,7 +493,10 @@ def _sums_of_sums(code: Code, function: Scope) -> Iterator[_Judged]:
                 FLAGGED if chosen else 2.0,
                 "sums of sums",
                 statement,
-                ("integrates twice by cumulative sums", *(["one of several candidates is chosen"] if chosen else [])),
+                (
+                    "integrates twice by cumulative sums",
+                    *(["one of several candidates is chosen"] if chosen else []),
+                ),
             )
         if calls:
             summed |= {n.id for t in statement.targets for n in ast.walk(t) if isinstance(n, ast.Name)}
@@ -472,7 +514,9 @@ def _environment_class(code: Code, part: Part, node: ast.ClassDef) -> Iterator[S
         parameters = parameters_of(method)
         if len(parameters) < 2 or method.name in ("act", "__init__"):
             continue
-        answers = [n.value for n in own_nodes(method) if isinstance(n, ast.Return) and isinstance(n.value, ast.Tuple)]
+        answers = [
+            n.value for n in own_nodes(method) if isinstance(n, ast.Return) and isinstance(n.value, ast.Tuple)
+        ]
         if not any(len(answer.elts) >= 2 for answer in answers):
             continue
         run = _begin(code, method)
@@ -483,13 +527,23 @@ def _environment_class(code: Code, part: Part, node: ast.ClassDef) -> Iterator[S
         own = parameters[0]
         changed = {key: flow for key, flow in run.values.items() if key.startswith(f"{own}.")}
         states = {
-            key for key, flow in changed.items() if any(dep.startswith(f"{own}.") for dep in flow.deps) and key not in _counters(run)
+            key
+            for key, flow in changed.items()
+            if any(dep.startswith(f"{own}.") for dep in flow.deps) and key not in _counters(run)
         }
         moved = {k for k in states if set(parameters[1:]) & changed[k].deps or changed[k].chosen}
         again = [
             other
             for other in methods
-            if other is not method and {_attribute(t, own) for n in own_nodes(other) if isinstance(n, ast.Assign) for x in n.targets for t in ast.walk(x)} & states
+            if other is not method
+            and {
+                _attribute(t, own)
+                for n in own_nodes(other)
+                if isinstance(n, ast.Assign)
+                for x in n.targets
+                for t in ast.walk(x)
+            }
+            & states
             and other.name != "__init__"
         ]
         if not moved or not again:
@@ -537,16 +591,23 @@ def _called_in_loop(code: Code, name: str) -> bool:
 # -- numbers
 
 
-def _known_constants(part: Part, env: str) -> int:
-    """How many numbers of the environment's dynamics a file has, when they are too many for a coincidence; else 0."""
-    if env not in _CONSTANTS:
-        return 0
+def with_numbers(sign: Sign, source: bytes, env: str) -> Sign:
+    """Half a point more where the sign's file has numbers of the environment's dynamics, too many for a coincidence."""
+    if not FLAGGED - 0.5 <= sign.points < FLAGGED or env not in _CONSTANTS:
+        return sign
     numbers, enough = _CONSTANTS[env]
     found = set[float]()
-    for node in ast.walk(part.tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+    tree = parse(source)
+    for node in ast.walk(tree) if tree is not None else ():
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, int | float)
+            and not isinstance(node.value, bool)
+        ):
             found |= {n for n in numbers if abs(abs(node.value) - n) < 1e-3 * n}
-        elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult) and "pi" in ast.unparse(node.right):
+        elif (
+            isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult) and "pi" in ast.unparse(node.right)
+        ):
             left = node.left.value if isinstance(node.left, ast.Constant) else None
             if isinstance(left, int | float):
                 found |= {n for n in numbers if abs(left * 3.14159 - n) < 1e-3 * n}
@@ -554,4 +615,7 @@ def _known_constants(part: Part, env: str) -> int:
             sides = [s.value if isinstance(s, ast.Constant) else None for s in (node.left, node.right)]
             if all(isinstance(s, int | float) and s for s in sides):
                 found |= {n for n in numbers if abs(sides[0] / sides[1] - n) < 1e-3}  # type: ignore[operator]
-    return len(found) if len(found) >= enough else 0
+    if len(found) < enough:
+        return sign
+    reason = f"the file has {len(found)} numbers of this environment's dynamics"
+    return msgspec.structs.replace(sign, points=sign.points + 0.5, reasons=(*sign.reasons, reason))

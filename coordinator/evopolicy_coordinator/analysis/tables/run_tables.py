@@ -40,6 +40,7 @@ def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
     return [
         _runs(study, link_of),
         _audit(study, link_of),
+        _simulators(study, link_of),
         _agents(study),
         _environments(study),
         _left_out(study),
@@ -292,6 +293,15 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             Column(key="complexity_growth", title="Growth (×)", kind="number", digits=2),
             integer("turns", "Turns"),
             integer("retries", "Retries"),
+            Column(
+                key="simulation", title="Simulation", note="Whether the run's rules let the agent simulate."
+            ),
+            Column(
+                key="simulator_flags",
+                title="Simulator flags",
+                kind="integer",
+                note="Places in its code that look like a simulator: a signal to read, never a verdict.",
+            ),
             seconds("wall_s", "Wall"),
             seconds("agent_s", "Agent"),
             seconds("queue_s", "Queue"),
@@ -302,6 +312,54 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
         rows=tuple(rows),
         links={i: link for i, found in enumerate(study.audit) if (link := link_of(found.run))},
     )
+
+
+def _simulators(study: Study, link_of: LinkOf) -> Table:
+    found = [(run, flag) for run in study.runs for flag in run.simulator_flags]
+    return Table(
+        name="simulator_flags",
+        title="Code that looks like a simulator",
+        caption="A signal to read, never a verdict: places where a state is made from the state before again and again, something decides "
+        "in between, and something of it is summed up or compared. Runs whose rules allow simulation are not looked through. "
+        "Submits: whose checkpoints have the lines; none for other files of the workspace, and for code in the agent's log.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column(key="file", title="File"),
+            Column(key="lines", title="Lines"),
+            Column(key="submits", title="Submits"),
+            Column(key="kind", title="Kind"),
+            Column(key="reasons", title="Why"),
+            Column(key="quote", title="Code"),
+        ),
+        rows=tuple(
+            {
+                "env": title_of(run.env),
+                "entry": run.entry,
+                "run": _short(run.name),
+                "file": flag.path,
+                "lines": f"{flag.line}–{flag.end_line}",
+                "submits": submits_text(flag.submits) or None,
+                "kind": flag.kind,
+                "reasons": "; ".join(flag.reasons),
+                "quote": " ⏎ ".join(line.strip() for line in flag.quote)[:_MAX_QUOTE],
+            }
+            for run, flag in found
+        ),
+        links={i: link for i, (run, _) in enumerate(found) if (link := link_of(run.name))},
+    )
+
+
+def submits_text(indices: Iterable[int]) -> str:
+    """`s000–s003, s007`: neighbours as a range."""
+    spans: list[list[int]] = []
+    for index in sorted(indices):
+        if spans and index == spans[-1][1] + 1:
+            spans[-1][1] = index
+        else:
+            spans.append([index, index])
+    return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
 
 
 def _left_out(study: Study) -> Table:
