@@ -1,6 +1,7 @@
 # make demo   installs into .venv, then plays a whole run
 # make test   installs, then runs every test
 # make check  ruff and mypy
+# make docs   the documentation as a site in build/site
 # make bench  what an episode costs, beside a bare loop
 # make bench-throughput   episodes per second through the coordinator
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
@@ -15,7 +16,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
+.PHONY: help install demo test check docs bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -43,6 +44,10 @@ check: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check -q .
 	@$(BIN)/mypy
+
+docs: install
+	@test -x $(BIN)/mkdocs || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q && echo "the site is in build/site/index.html"
 
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 bench: install

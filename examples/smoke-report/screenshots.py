@@ -1,4 +1,4 @@
-"""Screenshots of a report in a headless Chromium, small enough to be kept: docs/reports.md shows them.
+"""Screenshots of a report in a headless Chromium, small enough to be kept: docs/how-to/reports.md shows them.
 
 PYTHONPATH=tests/support python examples/smoke-report/screenshots.py REPORT OUT
 """

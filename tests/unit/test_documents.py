@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +15,14 @@ from evopolicy_coordinator.server.intake import _VERBS
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
-    *("README.md", "ARCHITECTURE.md", "SECURITY.md", "deploy/README.md", "examples/policies/README.md"),
+    *(
+        "README.md",
+        "ARCHITECTURE.md",
+        "SECURITY.md",
+        "CONTRIBUTING.md",
+        "deploy/README.md",
+        "examples/policies/README.md",
+    ),
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
 FOLDERS = ("common", "coordinator", "worker", "agent_gateway", "deploy", "docs", "examples", "tests")
@@ -115,3 +123,13 @@ def test_the_keys_that_the_architecture_lists_are_those_that_are_answered() -> N
     assert len(listed) == 2
     verbs = {verb.strip() for verbs in listed for verb in verbs.split(",")}
     assert verbs <= set(_VERBS.values())
+
+
+def test_the_list_of_commands_is_that_of_the_commands() -> None:
+    page = subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "_site" / "commands.py")],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert text_of("docs/reference/cli.md") == page, "python docs/_site/commands.py > docs/reference/cli.md"

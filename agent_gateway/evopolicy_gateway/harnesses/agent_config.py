@@ -1,6 +1,6 @@
 """An agent's settings, from a TOML file or a suite's `[[agents]]` table.
 
-`docs/agents.md` lists them with examples. Unknown keys are refused. A file holds no secrets: `environment` is written to
+`docs/how-to/coding-agents.md` lists them with examples. Unknown keys are refused. A file holds no secrets: `environment` is written to
 `run.json`, `pass_environment` only names variables that must be set.
 """
 

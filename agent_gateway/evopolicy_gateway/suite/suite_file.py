@@ -1,6 +1,6 @@
 """A suite's TOML file, and the runs that it comes to.
 
-`docs/suites.md` explains it with examples. A setting of a run is looked for in the last `[[overrides]]` that fits, then in
+`docs/how-to/sweeps.md` explains it with examples. A setting of a run is looked for in the last `[[overrides]]` that fits, then in
 the agent's `[agents.run]`, then in `[defaults]`; what is nowhere is the environment suite's own. Unknown keys are refused.
 """
 

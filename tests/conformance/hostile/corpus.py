@@ -2,9 +2,9 @@
 
 Two kinds. *Probes* (files in `policies/`) try one door after another and print `held: …` or `THROUGH: …`: their verdict
 is an ordinary episode in which every door held. *Breakers* (`breakers.py`) misbehave at step 3 of an episode, or before its
-first; their verdict is the failure's category. docs/hostile-policies.md is made by
+first; their verdict is the failure's category. docs/explanation/hostile-policies.md is made by
 
-    PYTHONPATH=tests/support python tests/conformance/hostile/corpus.py > docs/hostile-policies.md
+    PYTHONPATH=tests/support python tests/conformance/hostile/corpus.py > docs/explanation/hostile-policies.md
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ PROBES = (
 
 
 def document() -> str:
-    """What docs/hostile-policies.md holds: the corpus as a table, and the words around it from `document.md`."""
+    """What docs/explanation/hostile-policies.md holds: the corpus as a table, and the words around it from `document.md`."""
     rows = []
     for probe in PROBES:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")

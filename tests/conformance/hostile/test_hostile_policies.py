@@ -354,7 +354,7 @@ async def both(one: Any, two: Any) -> Any:
 
 
 def test_the_documented_table_is_the_corpus() -> None:
-    path = Path(__file__).parents[3] / "docs" / "hostile-policies.md"
+    path = Path(__file__).parents[3] / "docs" / "explanation" / "hostile-policies.md"
     assert path.read_text(encoding="utf-8") == document(), "make it anew: see corpus.py"
 
 

@@ -1,4 +1,4 @@
-"""The README's five lines for a second machine, run as they stand on two hosts with nothing in common but a cable."""
+"""The five lines of docs/how-to/second-machine.md, run as they stand on two hosts with nothing in common but a cable."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from evopolicy_common.records.run_record import decode_run_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-README = Path(__file__).parents[3] / "README.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "second-machine.md"
 FIRST = "10.92.1.1"
 PATIENCE_S = 300.0
 
@@ -70,7 +70,7 @@ def machines() -> Iterator[tuple[Machine, Machine]]:
 
 def lines() -> list[str]:
     """The block of commands, without what is said about them."""
-    block = README.read_text().partition("## A second machine")[2].split("```\n")[1]
+    block = PAGE.read_text().split("```\n")[1]
     return [line.partition("#")[0].strip().replace("FIRST", FIRST) for line in block.splitlines()]
 
 

@@ -1,0 +1,48 @@
+"""Builds the site from `docs/` and from the documents in the repository's root, which readers expect there."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT_PAGES = {
+    "ARCHITECTURE.md": "explanation/architecture.md",
+    "SECURITY.md": "explanation/security.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "deploy/README.md": "how-to/deploy.md",
+    "examples/policies/README.md": "reference/example-policies.md",
+}
+"""Where a document of the repository stands in the site."""
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Adds the root's documents under their place in the site."""
+    root = posixpath.dirname(config["docs_dir"])
+    for source, page in ROOT_PAGES.items():
+        with open(posixpath.join(root, source), encoding="utf-8") as text:
+            files.append(File.generated(config, page, content=text.read()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Leads links between root and `docs/` to the site's pages; a file that is no page keeps its name only."""
+    place = {page: source for source, page in ROOT_PAGES.items()}.get(
+        page.file.src_uri, f"docs/{page.file.src_uri}"
+    )
+
+    def led(match: re.Match[str]) -> str:
+        picture, label, target, anchor = match.groups()
+        if "://" in target:
+            return match.group(0)
+        source = posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
+        uri = ROOT_PAGES.get(source) or (source.removeprefix("docs/") if source.startswith("docs/") else None)
+        if uri is None or (files.get_file_from_path(uri) is None):
+            return match.group(0) if uri is not None else label
+        return f"{picture}[{label}]({posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or '.')}{anchor or ''})"
+
+    return LINK.sub(led, markdown)
