@@ -16,7 +16,7 @@ import typer
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
-from evopolicy_common.terminal import harmless, one_line, say
+from evopolicy_common.terminal import end_without_reader, harmless, one_line, say
 
 Connect = Annotated[
     list[str] | None,
@@ -145,8 +145,10 @@ def end_on_sigterm() -> None:
 def run_app(app: typer.Typer) -> None:
     """Runs the command that `sys.argv` names, and exits."""
     setup_notices()
+    end_without_reader()
     try:
-        code = typer.main.get_command(app).main(standalone_mode=False)
+        with fail_on_our_errors():
+            code = typer.main.get_command(app).main(standalone_mode=False)
     except _ClickError as error:
         fail(" ".join(error.format_message().split()) or "wrong usage; see --help", USAGE_ERROR)
     except (typer.Abort, KeyboardInterrupt):

@@ -7,11 +7,16 @@ every character that is not printable is shown as U+FFFD. `tests/unit/test_rooms
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import logging
+import os
 import re
+import signal
 import sys
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import rich.console
@@ -19,7 +24,12 @@ from rich.console import ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
+
 _ODD = re.compile(r"[^\n\t -~]")
+READER_GONE = 128 + signal.SIGPIPE
+"""Exit status of a program that nobody reads any more, as a shell tells it."""
 WIDTH = 200
 """Columns where there is no terminal: a table that is cut off is worse than a long line."""
 
@@ -40,8 +50,9 @@ def _shown(found: re.Match[str]) -> str:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Prints `text` and a newline on stdout, or on stderr."""
-    print(harmless(text), file=sys.stderr if err else sys.stdout, flush=True)
+    """Prints `text` and a newline on stdout, or on stderr, where it is lost if nobody reads that any more."""
+    with contextlib.suppress(BrokenPipeError) if err else contextlib.nullcontext():
+        print(harmless(text), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
@@ -65,6 +76,38 @@ def _escaped(found: re.Match[str]) -> str:
     return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
+class _WatchedStdout(io.FileIO):
+    """Stdout that ends the program when its reader is gone: quietly, in order, and as SIGPIPE would have it."""
+
+    def write(self, data: Buffer, /) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self.fileno())
+            raise SystemExit(READER_GONE) from None
+
+
+def end_without_reader() -> None:
+    """From now on the program ends with `READER_GONE` when it prints what nobody reads, as in `evopolicy status | head -1`."""
+    stream = sys.stdout
+    if not isinstance(stream, io.TextIOWrapper):
+        return  # closed, or not ours
+    # The loop that a task ends with it is as good as told: asyncio need not complain that nobody looked at the task.
+    logging.getLogger("asyncio").addFilter(_is_no_exit)
+    raw = _WatchedStdout(stream.fileno(), "wb", closefd=False)
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(raw),
+        encoding=stream.encoding,
+        errors=stream.errors,
+        line_buffering=stream.line_buffering,
+    )
+
+
+def _is_no_exit(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and isinstance(record.exc_info[1], SystemExit))
+
+
 class Terminal(rich.console.Console):
     """A console that takes texts as they are: no markup, no emoji codes, nothing that is not printable."""
 
@@ -73,6 +116,10 @@ class Terminal(rich.console.Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(harmless(text), **options)
+
+    def on_broken_pipe(self) -> None:
+        # Of stderr: the results are on stdout, which ends the program by itself.
+        self.quiet = True
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):

@@ -12,8 +12,6 @@ import os
 import re
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from evopolicy_common.records.run_record import RunRecord, decode_checkpoint_met
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
 from evopolicy_coordinator.analysis.behaviour.topology import describe
+from evopolicy_coordinator.analysis.reading.parallel import in_processes
 from evopolicy_coordinator.analysis.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.reading.sources import reachable_modules, read_python_files, source_digest
 from evopolicy_coordinator.analysis.simulators.look import Flag, flags_of
@@ -107,12 +106,7 @@ def load_runs(
 def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
     if jobs <= 1 or len(folders) < _PARALLEL_FROM:
         return map(read_or_explain, folders)
-    return _read_parallel(folders, jobs)
-
-
-def _read_parallel(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(read_or_explain, folders, chunksize=8)
+    return in_processes(read_or_explain, folders, jobs, lambda folder, why: LeftOut(path=folder, reason=why))
 
 
 def read_or_explain(folder: Path) -> Run | LeftOut:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import operator
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from invented_policies import Version, policy
 from run_dirs import write_run
+from waiting import wait_until
 
 from evopolicy_coordinator.analysis.reading.comparability import (
     IN_QUESTION,
@@ -15,6 +24,7 @@ from evopolicy_coordinator.analysis.reading.comparability import (
     MixedRunsError,
     mixtures,
 )
+from evopolicy_coordinator.analysis.reading.parallel import in_processes
 from evopolicy_coordinator.analysis.reading.reader import (
     count_changed_lines,
     find_run_dirs,
@@ -184,6 +194,48 @@ def test_reading_in_several_processes_gives_the_same_runs(tmp_path: Path) -> Non
         write_run(tmp_path, VERSIONS[:1], exp_id=f"e{number:02d}")
     (tmp_path / "Agent-A" / "gym_acrobot" / "e07" / "run.json").write_text("{")
     assert load_runs([tmp_path], jobs=2) == load_runs([tmp_path], jobs=1)
+
+
+def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
+    items: list[Any] = [partial(abs, -number) for number in range(20)]
+    items[5] = partial(os._exit, 7)
+    items[19] = partial(os.kill, 0, signal.SIGKILL)
+    found = list(in_processes(operator.call, items, 2, lambda item, why: (item, why)))
+    assert found[:5] + found[6:19] == [*range(5), *range(6, 19)]
+    assert found[5] == (items[5], "the process that read it ended with status 7")
+    assert found[19][1] == "the process that read it ended with status -9"
+
+
+READS = (
+    "import sys; from pathlib import Path\n"
+    "from evopolicy_coordinator.analysis.reading.reader import load_runs\n"
+)
+READS += "load_runs([Path(sys.argv[1])], jobs=2, progress=lambda done, total: print(done, flush=True))"
+
+
+def test_a_report_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
+    for number in range(45):
+        write_run(tmp_path, VERSIONS, exp_id=f"e{number:02d}")
+    mark = {"EVOTEST_REPORT": str(tmp_path)}
+
+    def alive() -> list[str]:
+        found = []
+        for entry in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if entry.name.isdecimal() and str(tmp_path).encode() in (entry / "environ").read_bytes():
+                    found.append(entry.name)
+        return found
+
+    before = set(Path("/dev/shm").iterdir())
+    command = [sys.executable, "-c", READS, str(tmp_path)]
+    report = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **mark})
+    assert report.stdout is not None
+    assert report.stdout.readline() == b"1\n"
+    assert len(alive()) >= 3
+    report.kill()
+    report.communicate()
+    wait_until(lambda: not alive())
+    assert set(Path("/dev/shm").iterdir()) - before == set()
 
 
 def test_changed_lines_count_both_sides_of_every_file() -> None:
