@@ -14,6 +14,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=0,
         help="tests/faults: instants at which each kind of fault strikes; 0: some kinds only, at one",
     )
+    parser.addoption(
+        "--rewrite-transcripts",
+        action="store_true",
+        help="write the core's transcripts (coordinator/evopolicy_coordinator/core/transcripts) anew from what it does now",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

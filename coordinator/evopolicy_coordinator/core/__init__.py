@@ -7,6 +7,11 @@
 
 No clock, RNG, disk, log or await in here: `now` and randomness come in, ordered effects and the next deadline go out.
 
+Where to begin: `transcripts/submit.txt` and `transcripts/hand_in.txt` show what the core is told, which rules act and what
+it asks of its shell. Then `machine`, whose tables say who takes which event, news and deadline; `model` and `state`, what the
+rules work on; and the rules, each folder building on those before it: `isolation` (who may be on which kernel), `leasing` (from
+the queue to a worker and back), `agents` (permits, and who goes first), `workers` (what workers ask), `runs`.
+
 Contract with the shell
 -----------------------
 *Time.* `now` is Unix time in seconds, read once at the core's start and advanced by a monotonic clock since: it never goes

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
+from . import transitions
 from .isolation.kernels import all_related, related
-from .model import N_PRIORITIES, TRAIN
+from .model import N_PRIORITIES, TRAIN, JobState
 from .records import train_group
 from .state import State
 from .structures.story import InvariantError
@@ -20,6 +21,19 @@ def check(state: State) -> None:
     _isolation(state)
     for run in state.runs.values():
         run.ledger.validate()
+        phase = run.state.phase
+        want(state, run.id, transitions.goes_on(transitions.RUN, phase), "a run that is over is not kept")
+        unsettled = [
+            row.submit_index
+            for row in run.submits
+            if transitions.goes_on(transitions.SUBMIT, row.status or "open")
+        ]
+        want(
+            state,
+            run.id,
+            unsettled == ([] if run.open is None else [run.open]),
+            "one submit has no verdict yet: the open one",
+        )
         want(
             state,
             run.id,
@@ -69,7 +83,11 @@ def _audits(state: State) -> None:
     for run in state.runs.values():
         for row in run.audits.values():
             n = len(row.replayed_by)
-            waits = row.state == "open" and row.actions is not None and n == row.compared
+            waits = (
+                transitions.goes_on(transitions.AUDIT, row.state)
+                and row.actions is not None
+                and n == row.compared
+            )
             playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in state.groups]
             want(
                 state,
@@ -91,6 +109,9 @@ def want(state: State, key: str, holds: bool, what: str) -> None:
 
 def _jobs(state: State) -> None:
     live = 0
+    ready: dict[JobState, None] = {}
+    for flow in {group.flow for group in state.groups.values()}:
+        ready |= {job: None for line in flow.ready for ticket, job in line if ticket == job.ticket}
     ends = not state.adopting or ("adopt", "") in state.timers
     want(state, "", ends, "what waits to be adopted does not wait for ever")
     for group in state.groups.values():
@@ -102,14 +123,15 @@ def _jobs(state: State) -> None:
         for job in group.jobs.values():
             key = job.job_id
             want(state, key, state.jobs.get(key) is job, "an open job is known by its id")
-            waits = ("job", key) in state.timers
-            places = [job.queued, job.lease is not None, waits, job in state.adopting]
-            want(
-                state,
-                key,
-                sum(places) == 1,
-                f"it is in one place (queued, leased, backing off, adopting): {places}",
-            )
+            found = {
+                "queued": job in (state.suspects if job.alone else ready),
+                "leased": job.lease is not None,
+                "backing_off": ("job", key) in state.timers,
+                "adopting": job in state.adopting,
+            }
+            places = [place for place, there in found.items() if there]
+            want(state, key, places == [job.place], f"it is where it says ({job.place}): {places}")
+            want(state, key, transitions.goes_on(transitions.JOB, job.place), "an open job may go on")
             if job.reserved is not None:
                 emptied = state.workers.get(job.reserved)
                 want(

@@ -19,10 +19,10 @@ from .state import State
 
 
 class CoreStatus(NamedTuple):
-    """The state's part of a `StatusReply`."""
+    """The core's part of a `StatusReply`."""
 
     episodes_done: int
-    """Since the state was loaded."""
+    """Since the core was loaded."""
     episodes_per_s: float
     """Over the last minute."""
     workers: tuple[WorkerStatus, ...]
@@ -36,7 +36,7 @@ class CoreStatus(NamedTuple):
 
 
 def status(state: State, now: float) -> CoreStatus:
-    """The state's part of a `StatusReply`."""
+    """The core's part of a `StatusReply`."""
     workers = tuple(_worker(state, worker, now) for worker in state.workers.values())
     runs = tuple(_run(state, run) for run in state.runs.values())
     states: dict[str, int] = {}

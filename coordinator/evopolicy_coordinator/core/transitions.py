@@ -43,6 +43,11 @@ JOB: Table = {
 }
 
 
+def goes_on(table: Table, state: str) -> bool:
+    """Whether anything may follow `state`."""
+    return bool(table[state])
+
+
 def check(table: Table, key: str, before: str, after: str) -> None:
     """InvariantError when `after` may not follow `before`. `key` names what changes."""
     if after not in table[before]:

@@ -202,7 +202,7 @@ def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:
 
 
 def resume(state: State, run: Run, step: Step) -> None:
-    """Go on, in a state that was just loaded, with what is open of a run's audits."""
+    """Go on, in a core that was just loaded, with what is open of a run's audits."""
     for row in list(run.audits.values()):
         if row.state != "open":
             continue
