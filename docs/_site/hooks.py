@@ -41,8 +41,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return match.group(0)
         source = posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
         uri = ROOT_PAGES.get(source) or (source.removeprefix("docs/") if source.startswith("docs/") else None)
-        if uri is None or (files.get_file_from_path(uri) is None):
-            return match.group(0) if uri is not None else label
+        if uri is None and posixpath.exists(posixpath.join(posixpath.dirname(config["docs_dir"]), source)):
+            return label
+        if uri is None or files.get_file_from_path(uri) is None:
+            return match.group(0)
         return f"{picture}[{label}]({posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or '.')}{anchor or ''})"
 
     return LINK.sub(led, markdown)
