@@ -1,5 +1,6 @@
 # make demo   installs into .venv, then plays a whole run
 # make test   installs, then runs every test
+# make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
 # make docs   the documentation as a site in build/site
 # make bench  what an episode costs, beside a bare loop
@@ -16,7 +17,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check docs bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
+.PHONY: help install paper-worker demo test check docs bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -30,6 +31,15 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV) (a minute or two the first time)"
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[coordinator,gateway,worker,dev]'
 	@touch $(STAMP)
+
+# Another fingerprint class than the usual worker's: no run is played by both.
+paper-worker:
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11 or newer found; install one, or name it: make PYTHON=/path/to/python3"; exit 2; }
+	@test -x .venv-paper/bin/python || $(PYTHON) -m venv .venv-paper
+	@echo "installing into .venv-paper (a minute or two the first time)"
+	@.venv-paper/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[worker]'
+	@.venv-paper/bin/python -m pip install -q --disable-pip-version-check --no-deps -r deploy/paper-versions.txt
+	@echo "next: .venv-paper/bin/evopolicy-worker --env core16"
 
 demo: install
 	@$(BIN)/evopolicy local --env gym/continuouscar --agent evolve --budget 32 --exp-id demo --overwrite --runs runs
@@ -78,4 +88,4 @@ sim: install
 	@test -n "$(ARGS)" || $(BIN)/python tests/simulation/scale.py
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) .venv-paper .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -126,9 +126,10 @@ def command(cwd: Path, *arguments: str) -> Iterator[Command]:
 
 
 @contextlib.contextmanager
-def toy_cluster(root: Path) -> Iterator[Path]:
-    """The operator's credentials for a coordinator and a worker with two slots for the toy environments."""
-    coordinator = Coordinator(root / "s")
+def toy_cluster(root: Path, *arguments: str) -> Iterator[Path]:
+    """The operator's credentials for a coordinator, with these arguments, and a worker with two slots for the toy
+    environments."""
+    coordinator = Coordinator(root / "s", *arguments)
     credentials = coordinator.ready["credentials"]
     options = ["--env", "toy", "--slots", "2", "--grace", "0", "--credentials", credentials["worker"]]
     with coordinator.log.open("ab") as log:

@@ -59,8 +59,9 @@ def describe(env: str = ENV) -> EnvironmentDescription:
     )
 
 
-def fingerprint(version: str = "1") -> wire.Fingerprint:
-    return wire.Fingerprint(code_version=version, python="3.11", packages={"numpy": "2.4"}, cpu="x")
+def fingerprint(version: str = "1", packages: dict[str, str] | None = None) -> wire.Fingerprint:
+    packages = {"numpy": "2.4"} if packages is None else packages
+    return wire.Fingerprint(code_version=version, python="3.11", packages=packages, cpu="x")
 
 
 def outcome_of(index: int, value: float = 1.0, failure: FailureCategory | None = None) -> EpisodeOutcome:
@@ -236,7 +237,7 @@ class Rig:
                 slots=slots,
                 tiers=more.get("tiers", ("bwrap",)),
                 environments=tuple(describe(env) for env in envs),
-                fingerprint=fingerprint(version),
+                fingerprint=fingerprint(version, more.get("packages")),
                 boot_id=more.get("boot_id", f"kernel-of-{worker}"),
                 machine_id=more.get("machine_id", ""),
             )

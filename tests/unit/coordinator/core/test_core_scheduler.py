@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -12,6 +14,7 @@ from core_rig import BUNDLE, Rig, result, split_of
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.workers import scheduler
+from evopolicy_worker.fingerprint import PACKAGES
 
 
 def validating(rig: Rig, session: str, n: int = 1) -> None:
@@ -269,6 +272,29 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     rig.work_off(other)
     (override,) = rig.finished().fingerprint_overrides
     assert override.endswith(f" → {named}: the old host is gone")
+
+
+def pinned_versions(file: str) -> dict[str, str]:
+    text = (Path(__file__).parents[4] / file).read_text()
+    return dict(re.findall(r"^([\w-]+)==([\w.]+)$", text.lower(), re.MULTILINE))
+
+
+def test_a_worker_with_the_papers_versions_is_a_class_of_its_own_and_named_so() -> None:
+    paper = pinned_versions("deploy/paper-versions.txt")
+    usual = {name: version for name, version in pinned_versions("constraints.txt").items() if name in paper}
+    assert paper.keys() == usual.keys() == {"gymnasium", "highway-env", "minigrid", "mujoco"}
+    assert set(paper) <= {name.lower() for name in PACKAGES}
+    rig = Rig()
+    rig.register("w1", packages=usual)
+    rig.create()
+    rig.submit(0)
+    other = rig.register("w2", packages=usual | paper)
+    assert rig.poll(other) == []
+    workers = {each.worker: each for each in rig.core.status(rig.now).workers}
+    assert workers["w1"].fingerprint != workers["w2"].fingerprint
+    for name, version in paper.items():
+        assert workers["w2"].versions[name] == version
+        assert f"{name} {usual[name]} there, {version} here" in workers["w2"].refused["r1"]
 
 
 @pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])
