@@ -87,7 +87,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     results: list[TrialResult] = []
 
     async def work(operations: Operations) -> None:
-        await operations.upload(bundle)
+        await operations.upload(bundle.digest, bundle.packed)
         message = Evaluate(
             token="",
             key=uuid.uuid4().hex,

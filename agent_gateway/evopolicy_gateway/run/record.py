@@ -208,14 +208,6 @@ def _outcome(finished: RunFinished) -> Outcome:
 
 def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
     fingerprint = finished.fingerprint
-    known = {}
-    if fingerprint is not None:
-        known = {
-            **fingerprint.packages,
-            "python": fingerprint.python,
-            "cpu": fingerprint.cpu,
-            "evopolicy-worker": fingerprint.code_version,
-        }
     return Versions(
         harness=f"evopolicy {version('evopolicy')}",
         env=finished.env_version,
@@ -223,7 +215,7 @@ def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
         data_train_hash=finished.split_hashes.get("train", ""),
         data_valid_hash=finished.split_hashes.get("validation", ""),
         data_heldout_hash=finished.split_hashes.get("heldout", ""),
-        fingerprint=known,
+        fingerprint={} if fingerprint is None else fingerprint.flat(),
         fingerprint_overrides=finished.fingerprint_overrides,
         data_secret=finished.split_secret,
         initial_policy_hash=staged.initial_policy_hash if staged else None,

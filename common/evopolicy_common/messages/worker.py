@@ -34,6 +34,11 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
     cpu: Text
     """CPU model and the features that numerical libraries choose their code by."""
 
+    def flat(self) -> dict[str, str]:
+        """As `run.json` has it."""
+        own = {"python": self.python, "cpu": self.cpu, "evopolicy-worker": self.code_version}
+        return {**self.packages, **own}
+
 
 class Register(Message, frozen=True, kw_only=True, tag="register"):
     """The first thing a worker says, and again whenever the coordinator does not know its session."""

@@ -9,7 +9,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, TypeVar
 
 import typer
 from rich import box
@@ -20,17 +20,11 @@ from rich.text import Text
 
 from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.messages.operator import (
-    AgentGone,
-    CancelRun,
-    Done,
-    RepinRun,
-    SetWorker,
     StatusReply,
-    StatusRequest,
 )
 from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.requests import operator_requests
+from evopolicy_common.wire.operator_client import OperatorClient
 
 T = TypeVar("T")
 
@@ -53,45 +47,14 @@ runs_app = typer.Typer(
 )
 
 
-class Operator:
-    """Asks an operator's requests."""
-
-    def __init__(self, link: transport.Link) -> None:
-        self.token = link.credentials.token
-        self._ask = operator_requests(link)
-
-    async def status(self) -> StatusReply:
-        """What the cluster is doing."""
-        return await self._ask.until_answered(
-            "status", StatusRequest(token=self.token), StatusReply, patience_s=10.0
-        )
-
-    async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
-        message = SetWorker(token=self.token, worker=worker, state=state)
-        await self._ask.until_answered("worker", message, Done, patience_s=10.0)
-
-    async def cancel_run(self, run: str) -> None:
-        """End a run without a score."""
-        message = CancelRun(token=self.token, run=run)
-        await self._ask.until_answered("cancel", message, Done, patience_s=10.0)
-
-    async def agent_gone(self, run: str) -> None:
-        """Vouch that a run's agent is not alive any more."""
-        message = AgentGone(token=self.token, run=run)
-        await self._ask.until_answered("agent-gone", message, Done, patience_s=10.0)
-
-    async def repin_run(self, run: str, fingerprint_class: str, reason: str) -> None:
-        """Let a run go on with workers of another fingerprint class."""
-        message = RepinRun(token=self.token, run=run, fingerprint_class=fingerprint_class, reason=reason)
-        await self._ask.until_answered("repin", message, Done, patience_s=10.0)
-
-
-def _asking(connect: list[str] | None, file: Path | None, work: Callable[[Operator], Awaitable[T]]) -> T:
+def _asking(
+    connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]
+) -> T:
     """`work` with a link to the coordinator; our errors as one line."""
 
     async def ask() -> T:
         async with transport.connect(credentials.find("operator", tuple(connect or ()), file)) as link:
-            return await work(Operator(link))
+            return await work(OperatorClient(link))
 
     with fail_on_our_errors():
         return asyncio.run(ask())
@@ -114,14 +77,14 @@ def status(
     if watch:
         _asking(connect, file, _watch_lines if as_json else _watch)
         return
-    reply = _asking(connect, file, Operator.status)
+    reply = _asking(connect, file, OperatorClient.status)
     if as_json:
         say_json(reply)
     else:
         terminal().print(render(reply))
 
 
-async def _watch(operator: Operator) -> None:
+async def _watch(operator: OperatorClient) -> None:
     with Live(console=terminal(), auto_refresh=False) as live:
         while True:
             started = time.monotonic()
@@ -129,7 +92,7 @@ async def _watch(operator: Operator) -> None:
             await asyncio.sleep(max(0.0, 1.0 - (time.monotonic() - started)))
 
 
-async def _watch_lines(operator: Operator) -> None:
+async def _watch_lines(operator: OperatorClient) -> None:
     while True:
         say_json(await operator.status(), indent=False)
         await asyncio.sleep(1.0)
@@ -180,7 +143,7 @@ def cancel(
     file: CredentialsFile = None,
 ) -> None:
     """End a run without a score; what of it is played stops."""
-    _asking(connect, file, lambda operator: operator.cancel_run(run))
+    _asking(connect, file, lambda operator: operator.cancel(run))
     say(f"{run} is cancelled")
 
 
@@ -212,7 +175,7 @@ def repin(
     file: CredentialsFile = None,
 ) -> None:
     """Let a run go on with workers of other library versions, when those it began with are gone."""
-    _asking(connect, file, lambda operator: operator.repin_run(run, fingerprint_class, reason))
+    _asking(connect, file, lambda operator: operator.repin(run, fingerprint_class, reason))
     say(f"{run} goes on with workers of class {fingerprint_class}")
 
 

@@ -8,18 +8,14 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-
 from evopolicy_common.errors import ProtocolError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.records.trajectory import Recorder, Trajectory, decode
+from evopolicy_common.records.trajectory import Trajectory, decode
 from evopolicy_coordinator.core.effects import AuditEffect, CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.events import AuditCompared, AuditEvent, AuditPrepared
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_coordinator.verify import compare as verify_compare
+from evopolicy_coordinator.verify import compare
 
 _LOST = "its record is not in the store any more"
 
@@ -38,8 +34,7 @@ def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPre
     error, at_fault = "", False
     try:
         recorded = _recording(_outcome(reader, effect.group, effect.index), blobs)
-        arrays = isinstance(recorded.actions, np.ndarray)
-        packed = action_log([np.asarray(action) if arrays else action for action in recorded.actions])
+        packed = compare.recorded_actions(recorded)
         actions = BlobRef(digest=blobs.put(packed), size=len(packed))
     except ProtocolError as caught:
         error, at_fault = f"its recording cannot be read: {caught}", True
@@ -92,16 +87,7 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
     left, right = recordings
     if (left.record, left.observations) != (right.record, right.observations):
         return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
-    return verify_compare.first_difference(left, right) or verify_compare.outcome_difference(ours, theirs)
-
-
-def action_log(actions: list[Any]) -> bytes:
-    """A trajectory's bytes with these actions and nothing else."""
-    recorder = Recorder("actions")
-    for action in actions:
-        kept = np.asarray(action) if isinstance(action, np.generic) else action
-        recorder.append(None, kept, 0.0, False, False, {})
-    return recorder.finish()
+    return compare.episode_difference(ours, left, theirs, right)
 
 
 def _outcome(reader: Reader, group: str, index: int) -> EpisodeOutcome:

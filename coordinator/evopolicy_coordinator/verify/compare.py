@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,31 @@ import numpy as np
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.columns import leaves
-from evopolicy_common.records.trajectory import Trajectory
+from evopolicy_common.records.trajectory import Recorder, Trajectory
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
 _MARKS = frozenset({"policy_failed"})
+
+
+def recorded_actions(recording: Trajectory) -> bytes:
+    """The actions of a recording and nothing that came of them: what is given to who plays the episode again."""
+    return action_log(recording.actions)
+
+
+def action_log(actions: Iterable[Any]) -> bytes:
+    """A trajectory's bytes with these actions and nothing else."""
+    recorder = Recorder("actions")
+    for action in actions:
+        kept = np.asarray(action) if isinstance(action, np.generic) else action
+        recorder.append(None, kept, 0.0, False, False, {})
+    return recorder.finish()
+
+
+def episode_difference(
+    ours: EpisodeOutcome, recorded: Trajectory, theirs: EpisodeOutcome, replayed: Trajectory
+) -> str | None:
+    """Where two outcomes of the same actions and their trajectories part, in words; None when they never do."""
+    return first_difference(recorded, replayed) or outcome_difference(ours, theirs)
 
 
 def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:

@@ -12,39 +12,28 @@ from __future__ import annotations
 
 import contextlib
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError
+from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.operator import (
-    CancelRun,
     DescribeEnvironment,
-    Done,
     EnvironmentState,
     Evaluate,
-    EvaluationPage,
-    EvaluationPoll,
-    EvaluationStarted,
     PlayedAs,
-    RecordedRequest,
 )
-from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records import bundles
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.trajectory import Trajectory, decode
-from evopolicy_common.wire.requests import operator_requests
+from evopolicy_common.wire.operator_client import PATIENCE_S, OperatorClient
 from evopolicy_common.wire.transport import Link
-from evopolicy_coordinator.server.auditing import action_log
 from evopolicy_coordinator.verify import compare as verify_compare
 from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
 
-_SENDER = "operator"
-_WAIT_S = 5.0
-_PATIENCE_S = 10.0
 _HASHES: dict[Split, str] = {
     "train": "data_train_hash",
     "validation": "data_valid_hash",
@@ -104,8 +93,7 @@ class Verifier:
     """One verification on one cluster."""
 
     def __init__(self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None) -> None:
-        self._token = link.credentials.token
-        self._ask = operator_requests(link)
+        self._ask = OperatorClient(link)
         self._run = run
         self._tell = tell
         self._tier: Tier = tier or run.record.sandbox_tier
@@ -142,7 +130,7 @@ class Verifier:
         refs = []
         for recording in recordings:
             digest = digest_of(recording.actions)
-            await self._ask.upload(_SENDER, self._token, digest, recording.actions)
+            await self._ask.upload(digest, recording.actions)
             refs.append(BlobRef(digest=digest, size=len(recording.actions)))
         record: Record = "full" if played.split == "train" else "actions"
         by_index = dict(enumerate(recordings))
@@ -180,7 +168,7 @@ class Verifier:
         if bundle.digest != played.digest:
             self.report.differs(name, "its checkpoint does not hold the policy that metrics.json names")
             return
-        await self._ask.upload(_SENDER, self._token, bundle.digest, bundle.packed)
+        await self._ask.upload(bundle.digest, bundle.packed)
         message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
         async for outcome in self._outcomes(message):
             recording = self._kept.get(indexes[outcome.index])
@@ -198,7 +186,7 @@ class Verifier:
         known = self._run.record.versions.fingerprint
         found: dict[str, None] = {}
         for fingerprint in (await self._describe()).fingerprints if known else ():
-            here = _flat(fingerprint)
+            here = fingerprint.flat()
             for name in sorted(known.keys() | here.keys()):
                 ours, theirs = known.get(name, "none"), here.get(name, "none")
                 if ours != theirs:
@@ -216,11 +204,11 @@ class Verifier:
             rows = self._rows(played, index)
             stored: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
-                stored = await self._fetch(outcome.trajectory)
-                actions = action_log([row.action for row in decode(stored).rows()])
+                stored = await self._ask.fetch(outcome.trajectory)
+                actions = verify_compare.recorded_actions(decode(stored))
             elif rows is not None:
                 try:
-                    actions = action_log(verify_compare.actions_of(rows))
+                    actions = verify_compare.action_log(verify_compare.actions_of(rows))
                 except Exception as error:
                     # JSON of any shape and size: an agent without a jail could have written it.
                     self.report.differs(
@@ -257,21 +245,10 @@ class Verifier:
 
     async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
         """Outcomes that the coordinator stored, by index."""
-        found: dict[int, EpisodeOutcome] = {}
-        cursor = 0
-        while True:
-            message = RecordedRequest(
-                token=self._token,
-                run=self._run.record.run,
-                split=played.split,
-                submit_index=played.submit_index,
-                cursor=cursor,
-            )
-            page = await self._ask.until_answered("recorded", message, EvaluationPage, patience_s=_PATIENCE_S)
-            found.update((outcome.index, outcome) for outcome in page.outcomes)
-            if page.finished:
-                return found
-            cursor = page.cursor
+        found = self._ask.recorded(
+            self._run.record.run, played.split, played.submit_index, patience_s=PATIENCE_S
+        )
+        return {outcome.index: outcome async for outcome in found}
 
     # What comes of it now.
 
@@ -279,7 +256,7 @@ class Verifier:
         self.report.episodes += 1
         index, name = recording.index, played.name(recording.index)
         assert outcome.trajectory is not None
-        replayed = decode(await self._fetch(outcome.trajectory))
+        replayed = decode(await self._ask.fetch(outcome.trajectory))
         for what, told in (
             ("the stored record", _stored_difference(recording, replayed, outcome)),
             ("the feedback files", self._files_difference(played, recording, replayed)),
@@ -309,7 +286,7 @@ class Verifier:
         if outcome.failure is not None and outcome.length == 0:
             return f"{outcome.failure.category}: {outcome.failure.message}"
         assert outcome.trajectory is not None
-        again = decode(await self._fetch(outcome.trajectory))
+        again = decode(await self._ask.fetch(outcome.trajectory))
         if recording.stored is not None:
             return verify_compare.first_difference(decode(recording.stored), again)
         return _of_files(played, recording.index, again, actions=True)
@@ -320,13 +297,13 @@ class Verifier:
         record = self._run.record
         dimensions = record.experiment_dimensions
         message = DescribeEnvironment(
-            token=self._token,
+            token="",
             env=record.env,
             run=record.run,
             n_validation=dimensions.n_validation,
             n_heldout=dimensions.n_heldout,
         )
-        return await self._ask.until_answered("describe", message, EnvironmentState, patience_s=_PATIENCE_S)
+        return await self._ask.describe(message)
 
     def _evaluate(
         self,
@@ -339,7 +316,7 @@ class Verifier:
     ) -> Evaluate:
         dimensions = self._run.record.experiment_dimensions
         return Evaluate(
-            token=self._token,
+            token="",
             key=uuid.uuid4().hex,
             env=self._run.record.env,
             bundle=bundle,
@@ -363,35 +340,14 @@ class Verifier:
             ),
         )
 
-    async def _outcomes(self, message: Evaluate) -> Any:
-        """Outcomes as they come; what is not waited for to its end is cancelled."""
-        started = await self._ask.until_answered(
-            "evaluate", message, EvaluationStarted, patience_s=_PATIENCE_S
-        )
-        cursor, finished = 0, False
-        try:
-            while not finished:
-                poll = EvaluationPoll(
-                    token=self._token, evaluation=started.evaluation, cursor=cursor, wait_s=_WAIT_S
-                )
-                page = await self._ask.until_answered("poll", poll, EvaluationPage, wait_s=_WAIT_S)
-                cursor, finished = page.cursor, page.finished
-                self._came += len(page.outcomes)
-                self._tell(self._came, "" if page.outcomes else page.waits_for)
-                for outcome in page.outcomes:
+    async def _outcomes(self, message: Evaluate) -> AsyncIterator[EpisodeOutcome]:
+        """Outcomes as they come."""
+        async with contextlib.aclosing(self._ask.evaluate(message)) as told:
+            async for outcome, _, waits_for in told:
+                self._came += outcome is not None
+                self._tell(self._came, waits_for)
+                if outcome is not None:
                     yield outcome
-        finally:
-            if not finished:
-                cancel = CancelRun(token=self._token, run=started.evaluation)
-                with contextlib.suppress(EvopolicyError):
-                    await self._ask.once("cancel", cancel, Done)
-
-    async def _fetch(self, ref: BlobRef) -> bytes:
-        if ref.inline is None:
-            return await self._ask.download(_SENDER, self._token, ref.digest)
-        if digest_of(ref.inline) != ref.digest:
-            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
-        return ref.inline
 
 
 def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:
@@ -409,15 +365,4 @@ def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: Epi
     then = recording.outcome
     if recording.stored is None or then is None:
         return None
-    told = verify_compare.first_difference(decode(recording.stored), replayed)
-    return told or verify_compare.outcome_difference(then, outcome)
-
-
-def _flat(fingerprint: Fingerprint) -> dict[str, str]:
-    """As `run.json` has it."""
-    return {
-        **fingerprint.packages,
-        "python": fingerprint.python,
-        "cpu": fingerprint.cpu,
-        "evopolicy-worker": fingerprint.code_version,
-    }
+    return verify_compare.episode_difference(then, decode(recording.stored), outcome, replayed)

@@ -16,12 +16,11 @@ from structlog.testing import capture_logs
 
 from evopolicy_common.errors import TransportError
 from evopolicy_common.messages.operator import Done, WaitRun
-from evopolicy_common.wire import codec, keys, requests, transport
+from evopolicy_common.wire import codec, keys, operator_client, requests, transport
 from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import IncomingQuery, Link
 from evopolicy_coordinator.verify import run as verify_run
-from evopolicy_gateway.operator import operations
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import session
 from evopolicy_gateway.run.session import Session
@@ -88,7 +87,7 @@ def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
 
 def test_an_operators_command_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
-    monkeypatch.setattr(operations, "_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(operator_client, "PATIENCE_S", SOON_S)
 
     async def scenario(link: Link) -> None:
         with pytest.raises(TransportError):
@@ -99,11 +98,11 @@ def test_an_operators_command_gives_up(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_verification_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
-    monkeypatch.setattr(verify_run, "_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(verify_run, "PATIENCE_S", SOON_S)
 
     async def scenario(link: Link) -> None:
         verification: Any = object.__new__(verify_run.Verifier)
-        verification._ask, verification._token = asking(link), ""
+        verification._ask = operator_client.OperatorClient(link)
         verification._run = SimpleNamespace(record=SimpleNamespace(run="r"))
         with pytest.raises(TransportError):
             await verification._stored(SimpleNamespace(split="train", submit_index=0))

@@ -22,6 +22,7 @@ from evopolicy_coordinator.core.records import AuditRow, OutcomeRow
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.storage.store import Reader, Store
 from evopolicy_coordinator.storage.upkeep import collect
+from evopolicy_coordinator.verify import compare
 
 GROUP = "r-1/s0/train"
 ACTIONS = [np.array([0.25], np.float32), [1, 2.5], {"a": float("nan")}, np.float64(-0.0), None, "left"]
@@ -88,7 +89,7 @@ def test_an_auditor_is_given_the_very_actions_and_nothing_that_came_of_them(shel
 @given(st.lists(st.floats(width=32), min_size=1, max_size=30))
 def test_actions_of_one_form_come_back_bit_for_bit(values: list[float]) -> None:
     actions = [np.array([value], np.float32) for value in values]
-    packed = decode(auditing.action_log(actions))
+    packed = decode(compare.action_log(actions))
     assert [row.action.tobytes() for row in packed.rows()] == [action.tobytes() for action in actions]
 
 
@@ -121,7 +122,7 @@ def test_what_the_store_has_lost_is_nobodys_fault(shelf: Shelf) -> None:
         (played(recording(1.0, 2.0), reward_components={"x": 1.0}), "reward components"),
         (played(recording(1.0, 2.0, obs=0.5)), "step 0: the observations differ"),
         (played(recording(1.0, 2.0, 3.0)), "step 1: terminated"),
-        (played(auditing.action_log([1, 2])), "records of actions, arrays and of full, arrays"),
+        (played(compare.action_log([1, 2])), "records of actions, arrays and of full, arrays"),
         (played(b"nonsense"), "cannot be read"),
     ],
 )

@@ -1,0 +1,149 @@
+"""What an operator's commands ask the coordinator, whichever room they are of."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncGenerator, AsyncIterator
+from typing import Literal
+
+from msgspec.structs import replace
+
+from evopolicy_common.errors import EvopolicyError, ProtocolError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.operator import (
+    AgentGone,
+    CancelRun,
+    DescribeEnvironment,
+    Done,
+    EnvironmentState,
+    Evaluate,
+    EvaluationPage,
+    EvaluationPoll,
+    EvaluationStarted,
+    RecordedRequest,
+    RepinRun,
+    SetWorker,
+    StatusReply,
+    StatusRequest,
+)
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire.requests import operator_requests
+from evopolicy_common.wire.transport import Link
+
+WAIT_S = 3.0
+"""Of a long poll: so often a command hears what it waits for."""
+PATIENCE_S = 10.0
+"""Of what must be answered soon: TransportError when nobody does."""
+_SENDER = "operator"
+
+
+class OperatorClient:
+    """One operator's link. RefusedError where the coordinator says no; a message's token is filled in."""
+
+    def __init__(self, link: Link) -> None:
+        self._token = link.credentials.token
+        self._requests = operator_requests(link)
+
+    # The cluster.
+
+    async def status(self) -> StatusReply:
+        """What the cluster is doing."""
+        message = StatusRequest(token=self._token)
+        return await self._requests.until_answered("status", message, StatusReply, patience_s=PATIENCE_S)
+
+    async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
+        await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
+
+    async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
+        """What there is for playing a finished run's episodes again."""
+        asked = replace(message, token=self._token)
+        return await self._requests.until_answered("describe", asked, EnvironmentState, patience_s=PATIENCE_S)
+
+    # Runs.
+
+    async def cancel(self, run: str) -> None:
+        """Ends a run as it is, without a score."""
+        await self._done("cancel", CancelRun(token=self._token, run=run))
+
+    async def agent_gone(self, run: str) -> None:
+        """Ends the permit of a run's agent, which is no longer alive."""
+        await self._done("agent_gone", AgentGone(token=self._token, run=run))
+
+    async def repin(self, run: str, fingerprint_class: str, reason: str) -> None:
+        """Lets a run go on with workers of another fingerprint class."""
+        message = RepinRun(token=self._token, run=run, fingerprint_class=fingerprint_class, reason=reason)
+        await self._done("repin", message)
+
+    async def recorded(
+        self, run: str, split: Split, submit_index: int, *, patience_s: float | None = None
+    ) -> AsyncIterator[EpisodeOutcome]:
+        """Outcomes of a finished run as they were stored, in the order in which they came in.
+
+        RefusedError for a run that is not finished, or not known any more.
+        """
+        cursor = 0
+        while True:
+            message = RecordedRequest(
+                token=self._token, run=run, split=split, submit_index=submit_index, cursor=cursor
+            )
+            page = await self._requests.until_answered(
+                "recorded", message, EvaluationPage, patience_s=patience_s
+            )
+            cursor = page.cursor
+            for outcome in page.outcomes:
+                yield outcome
+            if page.finished:
+                return
+
+    # Episodes outside any run.
+
+    async def evaluate(
+        self, message: Evaluate
+    ) -> AsyncGenerator[tuple[EpisodeOutcome | None, int, str], None]:
+        """Each outcome as it comes, with the number of episodes in all; every few seconds without one, what it waits for.
+
+        Yields `(outcome, total, "")` or `(None, total, waits_for)`. What is not waited for to its end is cancelled.
+        """
+        asked = replace(message, token=self._token)
+        started = await self._requests.until_answered(
+            "evaluate", asked, EvaluationStarted, patience_s=PATIENCE_S
+        )
+        cursor, finished = 0, False
+        try:
+            while not finished:
+                poll = EvaluationPoll(
+                    token=self._token, evaluation=started.evaluation, cursor=cursor, wait_s=WAIT_S
+                )
+                page = await self._requests.until_answered("poll", poll, EvaluationPage, wait_s=WAIT_S)
+                cursor, finished = page.cursor, page.finished
+                for outcome in page.outcomes:
+                    yield outcome, page.total, ""
+                if not page.outcomes:
+                    yield None, page.total, page.waits_for
+        finally:
+            if not finished:
+                cancel = CancelRun(token=self._token, run=started.evaluation)
+                with contextlib.suppress(EvopolicyError):
+                    await self._requests.once("cancel", cancel, Done)
+
+    # Blobs.
+
+    async def upload(self, digest: str, data: bytes) -> None:
+        """Brings a blob to the coordinator."""
+        await self._requests.upload(_SENDER, self._token, digest, data)
+
+    async def download(self, digest: str) -> bytes:
+        """A blob by its digest, checked."""
+        return await self._requests.download(_SENDER, self._token, digest)
+
+    async def fetch(self, ref: BlobRef) -> bytes:
+        """The bytes that `ref` names, checked."""
+        if ref.inline is None:
+            return await self.download(ref.digest)
+        if digest_of(ref.inline) != ref.digest:
+            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
+        return ref.inline
+
+    async def _done(self, verb: str, message: AgentGone | CancelRun | RepinRun | SetWorker) -> None:
+        await self._requests.until_answered(verb, message, Done, patience_s=PATIENCE_S)
