@@ -50,6 +50,8 @@ ROLES = {
     "command": 1,
 }
 """What is hit, and how often by comparison. Never an agent: what becomes of a run without it is another run."""
+ENOUGH = 200
+"""Strikes of which some hit every role."""
 PATIENCE_S = 600.0
 CALM_S = 15.0
 """For what was killed last to be taken up again."""
@@ -157,6 +159,9 @@ def chaos(seconds: float, seed: int, root: Path, tell: Tell) -> bool:
             faults.end()
         total = sum(faults.struck.values())
         tell(f"{total} strikes: {', '.join(f'{what} {n}' for what, n in sorted(faults.struck.items()))}")
+        never = [role for role in ROLES if not any(what.startswith(f"{role} SIG") for what in faults.struck)]
+        if never and total >= ENOUGH:
+            wrong.append(f"never hit: {', '.join(never)}: is it still called so?")
         end = time.monotonic() + CALM_S
         while (strays := cluster.strays()) and time.monotonic() < end:
             time.sleep(0.1)

@@ -44,8 +44,8 @@ KINDS = {
     "policy's jail": ("bwrap", "zygote.py"),
     "zygote": ("python", "zygote.py"),
     "policy": ("python", "zygote.py"),
-    "gateway": ("python", "serve_cli"),
-    "keeper": ("python", "harnesses.keeper"),
+    "gateway": ("python", "evopolicy_gateway.cli.serve"),
+    "keeper": ("python", "evopolicy_gateway.agent_supervisor.keeper"),
 }
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0

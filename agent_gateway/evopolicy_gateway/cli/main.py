@@ -27,7 +27,7 @@ from evopolicy_gateway.cli.suite import suite as play_suite
 from evopolicy_gateway.http import door
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import trials
-from evopolicy_gateway.operator.runs import Cluster, exit_code, play_all
+from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
 from evopolicy_gateway.operator.runs import report as report_runs
 from evopolicy_gateway.run import processes
 from evopolicy_gateway.run.gateway import folder_of
@@ -262,7 +262,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> No
         say_json(results)
     else:
         report_runs(results, console)
-    _exit(exit_code((result.status, result.closed_reason) for result in results))
+    _exit(exit_code(ends_of(results)))
 
 
 def _trial_cluster(

@@ -22,11 +22,11 @@ from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.alone import alone
-from evopolicy_gateway.operator.runs import Cluster, connected, exit_code
+from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
-from evopolicy_gateway.suite.suite_index import FINISHED, Index
+from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
 from evopolicy_gateway.suite.sweep import Sweep, look
 
@@ -165,8 +165,14 @@ async def _suite(order: Order) -> int:
         if (told := suite_index.told(index)) is not None:
             console.print(told)
         console.print(f"index: {order.root / suite_index.FILE_NAME}", soft_wrap=True)
-    missing = [("error", "")] * (len(names) - len(entries))
-    return exit_code([*missing, *((entry.state, entry.closed_reason) for entry in entries)])
+    return exit_code([_end(order, index.runs.get(name), name) for name in names])
+
+
+def _end(order: Order, entry: Entry | None, name: str) -> End:
+    if entry is None:
+        return End(name, "error", "", "it was not begun", "")
+    where = str(order.root / entry.directory) if entry.directory else ""
+    return End(name, entry.state, entry.closed_reason, entry.error, where)
 
 
 def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal) -> None:

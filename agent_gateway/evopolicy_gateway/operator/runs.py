@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 from rich.table import Table
@@ -17,7 +18,7 @@ from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
 from evopolicy_common.processes.preflight import explained
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.terminal import Terminal
+from evopolicy_common.terminal import Terminal, say_lines
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials
@@ -140,16 +141,45 @@ async def play_all(
     return [results[index] for index in range(len(plans))]
 
 
-def exit_code(ends: Iterable[tuple[str, str]]) -> int:
-    """For the gravest of some runs' ends, each told as its status and why its agent stopped: see `EXIT_CODES`."""
-    found = {_end(status, closed_reason) for status, closed_reason in ends}
-    return next((code for end, code in EXIT_CODES.items() if end in found), 0)
+class End(NamedTuple):
+    """What a run came to, as far as the exit code and its reason go."""
+
+    name: str
+    status: str
+    closed_reason: str
+    error: str | None
+    where: str
+    """Its folder; empty where there is none here."""
+
+    @property
+    def kind(self) -> str:
+        """A key of `EXIT_CODES`, or `completed`."""
+        if self.closed_reason in _AGENT_FAILED and self.status != "cancelled":
+            return "agent_failed"
+        return self.status if self.status in EXIT_CODES or self.status == "completed" else "error"
+
+    @property
+    def why(self) -> str:
+        """In a line."""
+        said = {
+            "agent_failed": f"its agent stopped: {self.closed_reason}",
+            "no_ok_submit": "no submit of it was ok",
+            "cancelled": "it was cancelled",
+        }
+        why = self.error or said.get(self.kind, f"it was left {self.status or 'as it was'}")
+        return f"{self.name}: {why}" + (f"; see {self.where}" if self.where else "")
 
 
-def _end(status: str, closed_reason: str) -> str:
-    if closed_reason in _AGENT_FAILED and status != "cancelled":
-        return "agent_failed"
-    return status if status in EXIT_CODES or status == "completed" else "error"
+def exit_code(ends: Sequence[End]) -> int:
+    """For the gravest of some runs' ends: see `EXIT_CODES`. Says on stderr of each run that did not complete why."""
+    say_lines((end.why for end in ends if end.kind != "completed"), err=True)
+    kinds = {end.kind for end in ends}
+    return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
+
+
+def ends_of(results: Sequence[RunResult]) -> list[End]:
+    """What these runs came to."""
+    return [End(one.env, one.status, one.closed_reason, one.error, one.run_directory) for one in results]
 
 
 def report(results: Sequence[RunResult], console: Terminal) -> None:
@@ -170,8 +200,6 @@ def report(results: Sequence[RunResult], console: Terminal) -> None:
         )
     console.print(table)
     for result in results:
-        if result.error:
-            console.print(f"{result.env}: {result.error}", soft_wrap=True)
         if result.in_question:
             text = f"{result.env}: audits put these results in question; see `audit` in run.json"
             console.print(text, soft_wrap=True)

@@ -33,7 +33,9 @@ def main(arguments: list[str]) -> None:
     parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
     end_with_parent(death_signal)
     if os.getppid() != parent:
-        raise SystemExit(1)  # it died before we asked to be told
+        # It died before we asked to be told.
+        print(f"not starting {program[0]}: process {parent}, which wanted it, is gone", file=sys.stderr)
+        raise SystemExit(1)
     try:
         os.execvp(program[0], program)
     except OSError as error:

@@ -314,6 +314,7 @@ def test_a_cap_of_the_sweep_interrupts_and_a_higher_one_goes_on_in_the_session(
         assert first.alive() == []
         assert "1020 of 1000 tokens are used" in first.text
         assert "1 runs are left as they are" in first.text
+        assert "it was left running; see " in first.text
     (entry,) = index_in(root).values()
     assert (entry["state"], entry["tokens"]["output"]) == ("running", 20)
     # Whether the second start, which never ends, has come before the cap or not: the next one works.

@@ -21,7 +21,7 @@ from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.control import AgentDoing, Progress
-from evopolicy_gateway.operator.runs import Cluster, RunResult, exit_code, report
+from evopolicy_gateway.operator.runs import Cluster, RunResult, ends_of, exit_code, report
 from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.layout import Staged
 from evopolicy_gateway.run.plan import Plan
@@ -231,7 +231,7 @@ def test_watchers_on_a_terminal_draw_a_table() -> None:
         assert needed in text
 
 
-def test_exit_codes_and_the_report_tell_how_runs_ended() -> None:
+def test_exit_codes_and_the_report_tell_how_runs_ended(capsys: pytest.CaptureFixture[str]) -> None:
     completed = RunResult(
         env="a", run_directory="/r/a", status="completed", final_score=1.0, random_score=0.5
     )
@@ -242,8 +242,17 @@ def test_exit_codes_and_the_report_tell_how_runs_ended() -> None:
     seen = []
     for result, code in ((completed, 0), (nothing, 3), (gave_up, 4), (cancelled, 5), (failed, 1)):
         seen.append(result)
-        assert exit_code((one.status, one.closed_reason) for one in seen) == code
+        assert exit_code(ends_of(seen)) == code
+        # Whatever is no success is explained where nobody has to look for it.
+        said = capsys.readouterr().err.splitlines()
+        assert [line.partition(":")[0] for line in said] == [one.env for one in seen[1:]]
+    assert said == [
+        "b: no submit of it was ok; see /r/b",
+        "d: its agent stopped: agent_failed; see /r/d",
+        "e: it was cancelled; see /r/e",
+        "c: worker lost; see /r/c",
+    ]
     out = io.StringIO()
     report(seen, Terminal(file=out, width=100))
-    for needed in ("no_ok_submit", "worker lost", "run directory: /r/a", "agent failed", "cancelled"):
+    for needed in ("no_ok_submit", "run directory: /r/a", "agent failed", "cancelled"):
         assert needed in out.getvalue()
