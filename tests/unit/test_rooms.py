@@ -55,6 +55,72 @@ def test_the_coordinators_core_does_no_io() -> None:
         assert not imports_of(path) & banned, f"{path.relative_to(ROOT)}"
 
 
+def modules() -> dict[str, Path]:
+    """Every module of the product by its full name, packages by theirs."""
+    found: dict[str, Path] = {}
+    for folder in ROOMS.values():
+        for path in sorted(folder.rglob("*.py")):
+            parts = path.relative_to(folder.parent).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
+    """Modules of the product that a module imports anywhere in its code, under `TYPE_CHECKING` too."""
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = (
+                ".".join(package.split(".")[: len(package.split(".")) - node.level + 1]) if node.level else ""
+            )
+            source = ".".join(part for part in (base, node.module or "") if part)
+            within = {f"{source}.{alias.name}" for alias in node.names}
+            found |= (within & known.keys()) or {source}
+            if not within <= known.keys():
+                found.add(source)
+    return (found & known.keys()) - {name}
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Sets of modules that import each other, by Tarjan's algorithm: strongly connected components of more than one."""
+    order: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    path: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        order[name] = lowest[name] = len(order)
+        path.append(name)
+        for other in graph[name]:
+            if other not in order:
+                visit(other)
+            if other in path:
+                lowest[name] = min(lowest[name], lowest[other])
+        if lowest[name] == order[name]:
+            circle = path[path.index(name) :]
+            del path[path.index(name) :]
+            if len(circle) > 1:
+                found.append(sorted(circle))
+
+    for name in graph:
+        if name not in order:
+            visit(name)
+    return found
+
+
+def test_a_circle_is_found_where_there_is_one() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"d"}}
+    assert circles(graph) == [["a", "b", "c"]]
+
+
+def test_no_module_of_the_product_is_in_an_import_circle() -> None:
+    known = modules()
+    assert circles({name: imported(name, path, known) for name, path in known.items()}) == []
+
+
 OWN_STDOUT = {
     "evopolicy_gateway/agents": "programs of their own, whose stdout is an agent's log",
     "evopolicy_gateway/jail/doorway.py": "inside the jail, with the standard library alone",
