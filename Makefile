@@ -57,7 +57,7 @@ check: install
 
 docs: install
 	@test -x $(BIN)/mkdocs || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q && echo "the site is in build/site/index.html"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build && echo "the site is in build/site/index.html"
 
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 bench: install
