@@ -83,7 +83,7 @@ BUGS = (
         "live = lease is not None and lease.live and job.lease is lease",
         "live = True",
     ),
-    Bug("count late limit verdicts", handin, "_done", "(silent or not live) and", "False and"),
+    Bug("count late limit verdicts", handin, "_done", "if silent and", "if False and"),
     Bug(
         "keep a job open when it is done",
         handin,
@@ -269,5 +269,21 @@ BUGS = (
         "and not permits_there(state, kernel, family)",
         "",
     ),
+    Bug(
+        "throw the dice of a stopped episode again at once",
+        leases,
+        "put_off",
+        "job.group.template.bundle is None",
+        "True",
+    ),
+    Bug("keep what was handed back in memory only", handin, "_goes_on", "step.persist(", "str("),
+    Bug(
+        "drop what was handed back",
+        handin,
+        "_goes_on",
+        "job.begun, job.begun_attempt = result.begun, result.attempt",
+        "job.begun_attempt = result.attempt",
+    ),
+    Bug("forget at a restart what was handed back", loading, "load", "loading.begun.update(", "dict("),
     Bug("draw episodes anew at a restart", audits, "sample", "run.row.audit_share", "0.5"),
 )

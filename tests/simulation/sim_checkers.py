@@ -10,6 +10,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from sim_oracle import ExpectedRun, PlannedRun, expect
+from sim_worker import begun_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
@@ -36,6 +37,8 @@ QUIET_S = 600.0
 """Longest without a commit, once there are no more faults, that slow workers and long episodes can account for."""
 VALIDATE_EVERY = 7
 """Steps between looks at the core's invariants, which are costly."""
+HEARD_S = 4.0
+"""A worker that was heard at least so often was never taken for lost."""
 PREEMPT_S = 19.0
 """A train job may wait so long while hidden jobs run in its lane: a worker that was told to stop and is cut off counts as
 about to stop until its lease would have expired."""
@@ -64,6 +67,10 @@ class Checkers:
         self._attempts: dict[str, int] = {}
         """Job to its highest attempt."""
         self._handed_in: set[str] = set()
+        self._granted_at: dict[str, float] = {}
+        """Leases to when they were told."""
+        self._heard: dict[str, tuple[float, float]] = {}
+        """Workers to when they were last heard, and since when without a long silence."""
         self._steps = 0
         self._moved_at = 0.0
         self._core: Core | None = None
@@ -175,8 +182,13 @@ class Checkers:
 
     def asking(self, event: events.Event) -> None:
         """A request reached the core."""
-        if isinstance(event, events.Asked) and isinstance(event.message, wire.HandIn):
-            self._handed_in.update(result.lease_id for result in event.message.results)
+        message = event.message if isinstance(event, events.Asked) else None
+        if isinstance(message, wire.Heartbeat | wire.Register):
+            now = self._simulation.world.now
+            last, since = self._heard.get(message.worker, (-1e9, now))
+            self._heard[message.worker] = now, since if now - last <= HEARD_S else now
+        if isinstance(message, wire.HandIn):
+            self._handed_in.update(result.lease_id for result in message.results)
 
     def answering(self, request: Message, message: Any) -> None:
         """An answer is about to be sent: is what it tells durable, and may it be told?"""
@@ -219,6 +231,10 @@ class Checkers:
         group = result.job_id.rpartition("/")[0]
         if "/audit-" in group:
             return
+        job = None if self._core is None else self._core.state.jobs.get(result.job_id)
+        if result.begun is not None and job is not None and self._attempts[job.job_id] == result.attempt:
+            row = self._disk.begun.get((group, job.first))
+            want(row is not None and row.begun == result.begun, "what was handed back stands", result, row)
         parts = group.split("/")
         state = self._disk.states.get(parts[0])
         if state is None or state.phase == "finished":
@@ -247,6 +263,8 @@ class Checkers:
         self._attempts[lease.job.job_id, lease.attempt] = (worker, disk.incarnation)
         for spec in job.episodes:
             want(disk.outcome(group, spec.index) is None, "what is done is not played again", lease)
+        self._thrown_once(lease)
+        self._granted_at[lease.lease_id] = self._simulation.world.now
         able = self._simulation.workers[worker]
         want(job.env in able.envs, "a worker gets what it can play", worker, job.env)
         run = group.split("/")[0]
@@ -258,6 +276,29 @@ class Checkers:
             worker,
             lease.lease_id,
         )
+
+    def _thrown_once(self, lease: wire.Lease) -> None:
+        """A hidden episode goes on from what its policy had returned, unless its worker cannot have told."""
+        job, now = lease.job, self._simulation.world.now
+        group, _, first = job.job_id.rpartition("/")
+        row = self._disk.begun.get((group, int(first)))
+        want(job.begun == (None if row is None else row.begun), "what stands is gone on from", lease, row)
+        for worker in self._simulation.workers.values():
+            if worker.name in self.named:
+                continue
+            last, since = self._heard.get(worker.name, (-1e9, now))
+            told = [each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None]
+            played = [
+                each.lease_id
+                for each in worker.running.values()
+                if each.job.job_id == job.job_id and begun_of(each) not in (None, job.begun)
+            ]
+            for lease_id in [*(each.lease_id for each in told if each.begun != job.begun), *played]:
+                known = self._granted[lease_id][1] == self._disk.incarnation
+                heard = now - last <= HEARD_S and since < self._granted_at[lease_id]
+                want(
+                    not (known and heard), "no dice are thrown while a worker can hand back", lease, lease_id
+                )
 
     def refused(self, message: Any) -> None:
         """The answer to a submit that must be refused."""

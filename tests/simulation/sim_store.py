@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from evopolicy_coordinator.core.records import (
     AuditRow,
+    BegunRow,
     EvaluationRow,
     FinishedRow,
     KernelRow,
@@ -32,6 +33,7 @@ class Disk:
         self.states: dict[str, RunStateRow] = {}
         self.submits: dict[tuple[str, int], SubmitRow] = {}
         self.outcomes: dict[str, dict[int, OutcomeRow]] = {}
+        self.begun: dict[tuple[str, int], BegunRow] = {}
         self.evaluations: dict[str, EvaluationRow] = {}
         self.finished: dict[str, FinishedRow] = {}
         self.workers: dict[str, WorkerRow] = {}
@@ -50,6 +52,8 @@ class Disk:
                     self.states[row.run] = row
                 case RunRow():
                     self.runs[row.run] = row
+                case BegunRow():
+                    self.begun[row.group, row.first] = row
                 case EvaluationRow():
                     self.evaluations[row.evaluation] = row
                 case FinishedRow():
@@ -89,6 +93,7 @@ class Disk:
             states=tuple(self.states.values()),
             submits=tuple(row for row in self.submits.values() if row.run in live),
             outcomes=tuple(heads),
+            begun=tuple(row for row in self.begun.values() if wanted(row.group)),
             evaluations=tuple(self.evaluations.values()),
             workers=tuple(self.workers.values()),
             audits=tuple(row for row in self.audits.values() if row.run in live),

@@ -1,7 +1,8 @@
 """A worker as simulated: registers, polls, beats, plays, hands in; it can die, stand still, be slow, and be in trouble.
 One may slander: what it plays again as an auditor it says to have gone otherwise.
 
-What it plays depends on the job alone, as with the real one; only its faults come from chance.
+What it plays depends on the job alone, as with the real one; only its faults come from chance. What the policy of a hidden
+episode has returned, were its luck the clock's, is named by the attempt that it is of, and handed back when that is stopped.
 """
 
 from __future__ import annotations
@@ -246,9 +247,10 @@ class SimWorker(Asker):
 
     def _stop(self, lease_id: str) -> None:
         lease = self.queue.pop(lease_id, None) or self.running.pop(lease_id, None)
+        was_running = (self.name, lease_id) in self.simulation.truth.plays
         self.simulation.truth.play_ends(self.name, lease_id)
         if lease is not None:
-            self._put(lease, "returned")
+            self._put(lease, "returned", begun=begun_of(lease) if was_running else None)
             self._start()
 
     def _poll(self) -> None:
@@ -282,7 +284,11 @@ class SimWorker(Asker):
         self.ask(wire.LeaseRequest, fields, answered, POLL_S)
 
     def _put(
-        self, lease: wire.Lease, kind: wire.ResultKind, episodes: tuple[EpisodeOutcome, ...] = ()
+        self,
+        lease: wire.Lease,
+        kind: wire.ResultKind,
+        episodes: tuple[EpisodeOutcome, ...] = (),
+        begun: BlobRef | None = None,
     ) -> None:
         self.outbox.append(
             wire.JobResult(
@@ -291,6 +297,7 @@ class SimWorker(Asker):
                 attempt=lease.attempt,
                 kind=kind,
                 episodes=episodes,
+                begun=begun,
             )
         )
         self._hand_in()
@@ -342,6 +349,14 @@ class SimWorker(Asker):
             self._put(lease, "done", episodes)
         self._start()
         self._poll()
+
+
+def begun_of(lease: wire.Lease) -> BlobRef | None:
+    """What its policy has returned once it is played: what stands from before, or a throw of its own."""
+    job = lease.job
+    if job.bundle is None or job.record == "full":
+        return None
+    return job.begun or BlobRef(digest=lease.lease_id, size=1)
 
 
 def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float, *, lies: bool) -> EpisodeOutcome:

@@ -142,7 +142,8 @@ class Outbox:
             )
             for outcome in result.episodes
         ]
-        ready = msgspec.structs.replace(result, episodes=tuple(outcomes))
+        begun = await self._by_digest(result.begun, codec.INLINE_BEGUN_BYTES)
+        ready = msgspec.structs.replace(result, episodes=tuple(outcomes), begun=begun)
         weight = len(msgspec.msgpack.encode(ready))
         if weight <= MAX_RESULT_BYTES:
             return ready, weight
@@ -210,9 +211,14 @@ class Outbox:
 
 def _n_bytes(result: JobResult) -> int:
     """Bytes of what is bulky in it."""
-    return 1000 + sum(
-        len(outcome.stdout)
-        + len(outcome.stderr)
-        + sum(len(ref.inline or b"") for ref in (outcome.trajectory, outcome.video) if ref is not None)
-        for outcome in result.episodes
+    begun = 0 if result.begun is None else result.begun.size
+    return (
+        1000
+        + begun
+        + sum(
+            len(outcome.stdout)
+            + len(outcome.stderr)
+            + sum(len(ref.inline or b"") for ref in (outcome.trajectory, outcome.video) if ref is not None)
+            for outcome in result.episodes
+        )
     )

@@ -6,6 +6,7 @@ Rules:
 - A result leaves the outbox only when the coordinator answered that it is durable; sending it twice is safe.
 - What is leased with `stop_in_silence` is stopped when no heartbeat was answered for the leases' time to live: from some
   time after that the coordinator may let an agent onto this kernel.
+- What is given back unfinished takes with it what its policy has returned: the next attempt goes on from there.
 - A slot that is ended from outside takes its own job with it and nothing else, and that is played again. What a policy can do to
   its slot is an outcome of its job (`endings`).
 - On SIGTERM nothing new is asked for, what waits is given back, what runs may finish within the grace time.
@@ -31,7 +32,7 @@ from evopolicy_common.errors import (
     TransportError,
 )
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
     Fingerprint,
     HeartbeatReply,
@@ -46,11 +47,13 @@ from evopolicy_common.messages.worker import (
     ResultKind,
     WorkerReply,
 )
+from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
+from evopolicy_worker.episodes.begun import HandedBack
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
 from evopolicy_worker.outbox import Outbox
 
@@ -67,6 +70,9 @@ SILENCE_LOOK_S = 0.5
 
 class SlotLike(Protocol):
     """What the supervisor needs of a slot; `slot.Slot` is the one there is."""
+
+    @property
+    def begun(self) -> HandedBack | None: ...
 
     async def start(self) -> None: ...
 
@@ -359,7 +365,7 @@ class Supervisor:
                 last_told = now
                 self._held.put(_held(lease, running=True, episodes_done=episodes_done, steps=steps))
 
-        healthy = True
+        healthy, playing = True, False
         try:
             async with contextlib.AsyncExitStack() as stack:
                 folder = (
@@ -372,10 +378,11 @@ class Supervisor:
                 ):  # while it waited for its files, when there was nothing to stop
                     self._put_result(lease, "returned")
                     return healthy
+                playing = True
                 outcomes = await slot.play(job, folder, on_progress)
             self._warm_environments[job.env] = None
-            if lease.lease_id in self._cancelled:
-                self._put_result(lease, "returned")
+            if not outcomes:
+                self._put_result(lease, "returned", begun=slot.begun)
             else:
                 self._put_result(lease, "done", outcomes)
                 self.jobs_done += 1
@@ -384,9 +391,10 @@ class Supervisor:
             returned = lease.lease_id in self._cancelled
             if not returned:
                 log.error("job failed here", job=job.job_id, attempt=lease.attempt, error=str(error))
-            self._put_result(lease, "returned" if returned else "failed", error=str(error))
+            begun = slot.begun if playing else None
+            self._put_result(lease, "returned" if returned else "failed", error=str(error), begun=begun)
         except asyncio.CancelledError:
-            self._put_result(lease, "returned")
+            self._put_result(lease, "returned", begun=slot.begun if playing else None)
             raise
         finally:
             self._running.pop(lease.lease_id, None)
@@ -396,7 +404,10 @@ class Supervisor:
         return healthy
 
     async def _with_recordings(self, job: Job) -> Job:
-        """The job with the recordings that it plays again inline."""
+        """The job with the recordings that it plays again, or goes on from, inline."""
+        if job.begun is not None and job.begun.inline is None:
+            data = await self._ask.download(self._options.name, self._session, job.begun.digest)
+            job = msgspec.structs.replace(job, begun=msgspec.structs.replace(job.begun, inline=data))
         if all(spec.replay is None or spec.replay.inline is not None for spec in job.episodes):
             return job
         specs = []
@@ -414,8 +425,14 @@ class Supervisor:
     # Handing in.
 
     def _put_result(
-        self, lease: Lease, kind: ResultKind, episodes: tuple[EpisodeOutcome, ...] = (), error: str = ""
+        self,
+        lease: Lease,
+        kind: ResultKind,
+        episodes: tuple[EpisodeOutcome, ...] = (),
+        error: str = "",
+        begun: HandedBack | None = None,
     ) -> None:
+        data = b"" if begun is None else begun.data
         self._outbox.put(
             JobResult(
                 lease_id=lease.lease_id,
@@ -424,6 +441,8 @@ class Supervisor:
                 kind=kind,
                 episodes=episodes,
                 error=error[:2000],
+                begun=BlobRef(digest=digest_of(data), size=len(data), inline=data) if data else None,
+                limit_verdict=begun is not None and begun.limit_verdict,
             )
         )
 

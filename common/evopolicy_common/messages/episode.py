@@ -131,6 +131,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     limits: ResourceLimits = ResourceLimits()
     max_steps: Int = 0
     """An episode is cut after so many steps; 0: only its environment ends it."""
+    begun: BlobRef | None = None
+    """What the policy returned in an earlier attempt, and stands (`JobResult.begun`); None: the job begins anew."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):

@@ -145,7 +145,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
 
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played; returned: given back unplayed (drained, preempted, cancelled); failed: infrastructure (ended
+"""done: played; returned: given back unfinished (drained, preempted, cancelled); failed: infrastructure (ended
 from outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions; the same as
 failed."""
 
@@ -163,6 +163,11 @@ class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     """`codec.pack_outcomes` of the episodes, uploaded before, where they are too large for a message."""
     error: Text = ""
     """For operators; never shown to an agent."""
+    begun: BlobRef | None = None
+    """Of a hidden job that was not finished: what its policy has returned, and how it has failed, for `Job.begun` of the next
+    attempt. Bytes that workers alone read."""
+    limit_verdict: bool = False
+    """Whether that tells of a failure by a limit."""
 
 
 class HandIn(Message, frozen=True, kw_only=True, tag="done"):

@@ -29,6 +29,9 @@ CHUNK_BYTES = 48 * 1024
 INLINE_BYTES = 24 * 1024
 """A blob up to this size travels inside the message that names it."""
 
+INLINE_BEGUN_BYTES = 4096
+"""The same of what a job goes on from: one answer may bring hundreds of jobs."""
+
 MAX_MESSAGE_BYTES = (16 << 20) - (64 << 10)
 """No longer message is made or read. Zenoh's own limit, beyond which it drops a message without a word, is 16 MiB."""
 
@@ -36,7 +39,7 @@ MAX_BLOB_BYTES = 1 << 30
 """Of one blob."""
 
 MAX_PACKED_BYTES = 256 << 20
-"""Of a job's outcomes packed as one blob."""
+"""Of a job's outcomes packed as one blob; of what a job goes on from, too."""
 
 _encoder = msgspec.msgpack.Encoder()
 worker_requests: msgspec.msgpack.Decoder[WorkerRequest] = msgspec.msgpack.Decoder(WorkerRequest)

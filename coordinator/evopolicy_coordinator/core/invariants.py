@@ -126,6 +126,7 @@ def _jobs(state: State) -> None:
             found = {
                 "queued": job in (state.suspects if job.alone else ready),
                 "leased": job.lease is not None,
+                "parting": job.parting is not None,
                 "backing_off": ("job", key) in state.timers,
                 "adopting": job in state.adopting,
             }
@@ -137,6 +138,10 @@ def _jobs(state: State) -> None:
                 want(
                     state, key, emptied is not None and emptied.reserved is job, "who is emptied for it knows"
                 )
+            stopped = job.parting
+            if stopped is not None:
+                there = state.workers[stopped.worker].leases.get(stopped.id) is stopped
+                want(state, key, there and not stopped.live, "what it waits for is still its worker's")
             lease = job.lease
             if lease is not None:
                 worker = state.workers.get(lease.worker)

@@ -29,6 +29,7 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
         if "/audit-" not in head.group:
             of_run = played.setdefault(head.group.partition("/")[0], {})
             of_run[head.worker] = of_run.get(head.worker, 0) + 1
+    loading.begun.update({(row.group, row.first): row for row in snapshot.begun})
     for worker in snapshot.workers:
         fleet.set_state(state, worker.worker, worker.state, worker.reason, worker.machine)
     stored = {row.run: row for row in snapshot.states}

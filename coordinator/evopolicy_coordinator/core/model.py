@@ -135,6 +135,12 @@ class JobState:
     """When it last began to wait."""
     held_attempts: set[int] = field(default_factory=set)
     """Attempts that this incarnation granted or adopted: none is adopted twice."""
+    begun: BlobRef | None = None
+    """What its policy had returned when it was given back, and stands; None: it begins anew."""
+    begun_attempt: int = 0
+    """The attempt that told so."""
+    parting: Lease | None = None
+    """The lease that was stopped, while it waits for what the worker hands back."""
 
     @property
     def queued(self) -> bool:
@@ -147,10 +153,12 @@ class JobState:
         self.place = place
 
     def names_blob(self, digest: str) -> bool:
-        """Whether its worker needs the blob: the bundle, or a recording that it plays."""
+        """Whether its worker needs the blob: the bundle, a recording that it plays, or what it goes on from."""
         template = self.group.template
-        recordings = template.replays[self.first : self.first + self.n]
-        return digest == template.bundle or any(ref.digest == digest for ref in recordings)
+        recordings = [self.begun, *template.replays[self.first : self.first + self.n]]
+        return digest == template.bundle or any(
+            ref is not None and ref.digest == digest for ref in recordings
+        )
 
 
 @dataclass(slots=True, eq=False)
@@ -260,6 +268,11 @@ class Lease:
     """Whose train jobs it was preempted for."""
     stay: Stay | None = None
     """Where it is, if it is hidden or train: as long as it is its worker's."""
+
+    @property
+    def parting(self) -> bool:
+        """Whether its job waits for what its worker hands back."""
+        return self.job.parting is self
 
 
 # ---- queues ----

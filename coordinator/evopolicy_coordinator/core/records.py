@@ -139,6 +139,17 @@ class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
     at: float
 
 
+class BegunRow(msgspec.Struct, frozen=True, kw_only=True, tag="begun"):
+    """What the policy of a job returned in an attempt that was given back, and stands. Key: `group`, `first`."""
+
+    group: str
+    first: int
+    """Index of the job's first episode."""
+    attempt: int
+    begun: BlobRef | None
+    """None once the job is done."""
+
+
 class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation"):
     """Cases to play outside any run. Key: `evaluation`; `key` is unique."""
 
@@ -241,6 +252,7 @@ Row = (
     | RunStateRow
     | SubmitRow
     | OutcomeRow
+    | BegunRow
     | EvaluationRow
     | FinishedRow
     | WorkerRow
@@ -283,9 +295,9 @@ def head_of(row: OutcomeRow) -> OutcomeHead:
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """All that a core starts from, read in one transaction.
 
-    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits` and
-    `outcomes` are wanted only for runs whose phase is not `finished`, and `outcomes` also for evaluations that are not
-    finished; more does no harm. Order does not matter.
+    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits`,
+    `outcomes` and `begun` are wanted only for runs whose phase is not `finished`, and the last two also for evaluations that
+    are not finished; more does no harm. Order does not matter.
     """
 
     incarnation: int
@@ -294,6 +306,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     states: tuple[RunStateRow, ...] = ()
     submits: tuple[SubmitRow, ...] = ()
     outcomes: tuple[OutcomeHead, ...] = ()
+    begun: tuple[BegunRow, ...] = ()
     evaluations: tuple[EvaluationRow, ...] = ()
     workers: tuple[WorkerRow, ...] = ()
     audits: tuple[AuditRow, ...] = ()

@@ -28,7 +28,7 @@ from .model import (
     Stay,
     Worker,
 )
-from .records import KernelRow, OutcomeHead, PermitRow
+from .records import BegunRow, KernelRow, OutcomeHead, PermitRow
 from .settings import CoreSettings
 from .structures.polls import Polls
 from .structures.rate import Rate
@@ -47,6 +47,8 @@ class Loading:
 
     heads: dict[str, list[OutcomeHead]] = field(default_factory=dict)
     """What is stored of each group."""
+    begun: dict[tuple[str, int], BegunRow] = field(default_factory=dict)
+    """What unfinished jobs go on from, by group and first index."""
     reloaded: list[JobGroup] = field(default_factory=list)
     """Groups that may be complete already."""
 

@@ -31,12 +31,17 @@ AUDIT: Table = {
     "not_audited": (),
 }
 
-Place = Literal["new", "queued", "leased", "backing_off", "adopting", "closed"]
+Place = Literal["new", "queued", "leased", "parting", "backing_off", "adopting", "closed"]
 
 JOB: Table = {
     "new": ("queued", "adopting"),  # adopting: it may be running somewhere since before the core was loaded
     "queued": ("queued", "leased", "closed"),  # queued again: at another priority
-    "leased": ("queued", "backing_off", "closed"),
+    "leased": ("queued", "parting", "backing_off", "closed"),
+    "parting": (
+        "queued",
+        "leased",
+        "closed",
+    ),  # its lease was stopped; it waits for what its worker hands back
     "backing_off": ("queued", "leased", "closed"),  # leased: adopted from its worker's heartbeat
     "adopting": ("queued", "leased", "closed"),
     "closed": (),

@@ -33,6 +33,7 @@ from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
     MAX_EPISODES_PER_SUBMIT,
     bounded_agent,
+    check_begun,
     check_counts,
     check_idempotency_key,
     check_inline,
@@ -209,6 +210,9 @@ class Intake:
     def _checked_results(self, m: worker.HandIn) -> worker.HandIn:
         results = tuple(map(self._unpacked, m.results))
         for result in results:
+            check_begun(result.begun)
+            if result.begun is not None and result.begun.inline is None:
+                self._check_stored(result.begun)
             for outcome in result.episodes:
                 for ref in (outcome.trajectory, outcome.video):
                     check_inline(ref)

@@ -133,6 +133,19 @@ def check_place(boot_id: str, machine_id: str, host: str) -> None:
             )
 
 
+def check_begun(ref: BlobRef | None) -> None:
+    """What a job goes on from is bounded, and fits into a lease."""
+    check_inline(ref)
+    if ref is None:
+        return
+    if not 0 < ref.size <= codec.MAX_PACKED_BYTES or len(ref.inline or b"") > codec.INLINE_BEGUN_BYTES:
+        raise RefusedError(
+            Refusal.BAD_BLOB,
+            f"what a job goes on from takes {ref.size:,} bytes; {codec.MAX_PACKED_BYTES:,} are the limit, and inside a message"
+            f" {codec.INLINE_BEGUN_BYTES:,}",
+        )
+
+
 def check_inline(ref: BlobRef | None) -> None:
     """Bytes that came inside a message are the blob they are said to be."""
     if ref is None or ref.inline is None:

@@ -26,6 +26,7 @@ from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import (
     AuditRow,
+    BegunRow,
     EvaluationRow,
     FinishedRow,
     KernelRow,
@@ -84,6 +85,9 @@ _MIGRATIONS: tuple[str, ...] = (
     );
     CREATE TABLE kernels (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
     """,
+    """
+    CREATE TABLE begun (grp TEXT NOT NULL, first INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, first));
+    """,
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
 
@@ -95,6 +99,7 @@ _PLACES: dict[type[Any], tuple[str, str, str]] = {
     SubmitRow: ("submits", "run, submit_index", "data"),
     OutcomeRow: ("outcomes", "grp, idx", "data"),
     OutcomeHead: ("outcomes", "grp, idx", "head"),
+    BegunRow: ("begun", "grp, first", "data"),
     EvaluationRow: ("evaluations", "evaluation", "data"),
     FinishedRow: ("finished", "run", "data"),
     WorkerRow: ("workers", "worker", "data"),
@@ -205,6 +210,7 @@ class Store:
                 for group in groups
                 for head in rows(db, OutcomeHead, "WHERE grp = ? ORDER BY seq", (group,))
             ),
+            begun=tuple(row for group in groups for row in rows(db, BegunRow, "WHERE grp = ?", (group,))),
             evaluations=evaluations,
             workers=tuple(rows(db, WorkerRow)),
             audits=tuple(rows(db, AuditRow, f"WHERE run IN ({live_runs})")),
@@ -370,6 +376,7 @@ _RUN = _upsert("runs", "run, key, data", "run")
 _RUN_STATE = _upsert("run_states", "run, phase, data", "run")
 _SUBMIT = _upsert("submits", "run, submit_index, key, data", "run, submit_index")
 _OUTCOME = _upsert("outcomes", "grp, idx, seq, head, data", "grp, idx")
+_BEGUN = _upsert("begun", "grp, first, data", "grp, first")
 _EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
 _FINISHED = _upsert("finished", "run, data", "run")
 _WORKER = _upsert("workers", "worker, data", "worker")
@@ -397,6 +404,10 @@ def _write_outcome(db: sqlite3.Connection, row: OutcomeRow) -> None:
     if run is not None:
         for ref in stored_blobs(row.outcome):
             db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
+
+
+def _write_begun(db: sqlite3.Connection, row: BegunRow) -> None:
+    db.execute(_BEGUN, (row.group, row.first, _encode(row)))
 
 
 def _write_evaluation(db: sqlite3.Connection, row: EvaluationRow) -> None:
@@ -428,6 +439,7 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     RunStateRow: _write_run_state,
     SubmitRow: _write_submit,
     OutcomeRow: _write_outcome,
+    BegunRow: _write_begun,
     EvaluationRow: _write_evaluation,
     FinishedRow: _write_finished,
     WorkerRow: _write_worker,

@@ -25,6 +25,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_coordinator.core.records import (
     AuditRow,
+    BegunRow,
     EvaluationRow,
     FinishedRow,
     OutcomeRow,
@@ -205,7 +206,7 @@ def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
 def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
     """One short transaction for each run, so that a running coordinator waits for none for long."""
     db.execute("BEGIN IMMEDIATE")
-    for table in ("outcomes", "strikes"):
+    for table in ("outcomes", "strikes", "begun"):
         db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
     db.execute("COMMIT")
 
@@ -228,6 +229,7 @@ def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: fr
         digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
     }
     named |= {row.actions.digest for row in rows(db, AuditRow) if row.actions is not None}
+    named |= {row.begun.digest for row in rows(db, BegunRow) if row.begun is not None}
     hidden = "WHERE grp NOT LIKE '%/train'"
     for row in rows(db, OutcomeRow, hidden):
         head, _, tail = row.group.partition("/")

@@ -33,6 +33,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 from evopolicy_worker import outbox, supervisor
+from evopolicy_worker.episodes.begun import HandedBack
 from evopolicy_worker.supervisor import Options, Supervisor
 
 
@@ -48,6 +49,7 @@ class ScriptedSlot:
         self.dress = dress
         self.started = 0
         self.stopped = asyncio.Event()
+        self.begun: HandedBack | None = None
 
     async def start(self) -> None:
         self.started += 1
@@ -60,6 +62,8 @@ class ScriptedSlot:
         self.stopped.clear()
         await self.script(self, job)
         on_progress(1, 10)
+        if self.stopped.is_set():
+            return ()
         return tuple(self.dress(play(job, spec)) for spec in job.episodes)
 
     async def cancel(self) -> None:

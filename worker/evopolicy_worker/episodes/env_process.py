@@ -113,10 +113,13 @@ class EnvProcess:
             player.play(
                 command.job, files, progress, self._channel.send_frame, command.first, command.failure
             )
-            return messages.Played(cancelled=progress.cancelled)
+            progress.give_up(None)
+            return messages.Played()
         except CancelledJobError:
+            progress.give_up(self._channel.send)
             return messages.Played(cancelled=True)
         except Exception as error:
+            progress.give_up(self._channel.send)
             if progress.cancelled:
                 # Whatever it met on its way out.
                 return messages.Played(cancelled=True)
@@ -151,6 +154,8 @@ class EnvProcess:
             progress = self._progress
             if progress is not None:
                 progress.cancel()
+                # Now: a simulator may take long over its step, and is ended then.
+                progress.give_up(self._channel.send)
 
     def _tell(self) -> None:
         progress = self._progress

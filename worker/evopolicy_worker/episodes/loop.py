@@ -10,8 +10,8 @@ Rules:
 - What the policy did is a result, and so is what its actions did to the environment: an environment that breaks down on
   them plays the episode once more, anew and with random actions alone. What the environment or the sandbox did wrong
   otherwise is raised.
-- A policy that is ended from outside is started again, and the episode with it. What it had returned stands: whatever a
-  policy may do to itself, it never gets to throw its dice again.
+- A policy that is ended from outside is started again, and the episode with it; so is a hidden episode whose job was given
+  back. What it had returned stands, and how it had failed: whatever a policy or its agent may do, its dice are thrown once.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import contextlib
 import hashlib
 import math
 import sys
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -47,6 +48,7 @@ from evopolicy_common.wire import codec
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.episodes import float_environment
+from evopolicy_worker.episodes.begun import Begun, Returned, is_kept, unpack
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import (
     BundleFiles,
@@ -87,6 +89,23 @@ class Progress:
         self.steps = 0
         self.cancelled = False
         self.policy: PolicyProcess | None = None
+        self._begun: tuple[int, Begun] | None = None
+        self._given_up = False
+        self._lock = threading.Lock()
+
+    def begins(self, place: int, begun: Begun) -> None:
+        """The job's episode at this place is played now; what is in `begun` is told when the job is given up."""
+        self._begun = place, begun
+
+    def give_up(self, send: Callable[[messages.Message], None] | None) -> None:
+        """Tell what was begun, once; it is told when this returns. With None there is nothing to tell any more."""
+        with self._lock:
+            if self._given_up:
+                return
+            self._given_up = True
+            if send is not None and self._begun is not None:
+                place, begun = self._begun
+                send(messages.Begun(place=place, begun=begun.packed()))
 
     def cancel(self) -> None:
         """Ends the running job at the next step, and the policy at once."""
@@ -130,6 +149,7 @@ class Player:
         if job.bundle is not None and files is None:
             raise WorkerError("a job with a bundle came without the bundle")
         policies = _Policies(self, job, files, environment)
+        before = unpack(job)
         if not job.video:
             self._videos.close()
         try:
@@ -138,12 +158,18 @@ class Player:
                 spec = job.episodes[k]
                 if progress.cancelled:
                     raise CancelledJobError
-                failure, frame = self._play(k, job, spec, policies, progress, tell, failure)
+                begun = before[k].unpacked() if k in before else Begun()
+                if failure is not None:
+                    begun = Begun(failure=failure)
+                if is_kept(job):
+                    progress.begins(k, begun)
+                failure, frame = self._play(k, job, spec, policies, progress, tell, begun)
                 tell(frame)
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
                     for other in job.episodes[k + 1 :]:
-                        tell(_framed(_brief(_unplayed(other.index, failure), _share(job))))
+                        unplayed = _brief(_unplayed(other.index, failure), _share(job))
+                        tell(messages.framed(messages.Finished(outcome=unplayed)))
                     break
                 failure = None
         finally:
@@ -157,17 +183,18 @@ class Player:
         policies: _Policies,
         progress: Progress,
         tell: Callable[[bytes], None],
-        failure: PolicyFailure | None,
+        begun: Begun,
     ) -> tuple[PolicyFailure | None, bytes]:
-        """The failure in one episode, and its outcome as it is told."""
-        taken: list[Any] = []
+        """The failure in one episode, which goes on from what was `begun` of it, and its outcome as it is told."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
-            episode = _Episode(job, spec, environment, policies, progress, self._videos, tell, taken, failure)
+            episode = _Episode(job, spec, environment, policies, progress, self._videos, tell, begun)
             try:
                 outcome = episode.play(k)
-                return outcome.failure, _framed(_brief(outcome, _share(job)))
+                kept = begun.packed() if is_kept(job) and len(job.episodes) > 1 else None
+                finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept)
+                return outcome.failure, messages.framed(finished)
             except EndedFromOutsideError as error:
                 # Where one policy plays several episodes it took with it what it had learned.
                 n_ends += 1
@@ -178,12 +205,13 @@ class Player:
             except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
                 raise
             except Exception as error:
-                if progress.cancelled or not episode.acted or failure is not None:
+                if progress.cancelled or not episode.acted:
                     raise
                 # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
                 note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
                 self._environments.pop(job.env).close()
-                failure = episode.failure or endings.broken_down(Ending("environment", "exit"))
+                begun.failure = begun.failure or endings.broken_down(Ending("environment", "exit"))
+                begun.taken.clear()
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
@@ -309,24 +337,27 @@ class _Episode:
         progress: Progress,
         videos: VideoRecorder,
         tell: Callable[[bytes], None],
-        taken: list[Any],
-        failure: PolicyFailure | None,
+        begun: Begun,
     ) -> None:
-        """`taken`: what the policy has returned in this episode before it was ended from outside, which stands: it is asked
-        again, and its first answers do not count. Those that do are added. `failure`: why no policy is asked, and random
-        actions are played from the first step on.
+        """`begun`: what the policy has returned in this episode before it was ended from outside, which stands: it is asked
+        again, and its first answers do not count. Those that do are added. Where it has failed, too, no policy is asked, and
+        random actions follow.
         """
         self._tell = tell
-        self._taken = taken
+        self._begun = begun
         self._job = job
         self._spec = spec
         self._environment = environment
         self._policies = policies
         self._progress = progress
         self._videos = videos
-        self.failure = failure
         self.acted = False
         """Whether an action of the policy's has reached the environment."""
+
+    @property
+    def failure(self) -> PolicyFailure | None:
+        """How the policy has failed."""
+        return self._begun.failure
 
     def play(self, k: int) -> EpisodeOutcome:
         job, spec = self._job, self._spec
@@ -387,7 +418,7 @@ class _Episode:
     def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
         if self._progress.cancelled:
             raise CancelledJobError
-        self.failure = msgspec.structs.replace(failure, step_index=step)
+        self._begun.failure = msgspec.structs.replace(failure, step_index=step)
 
     def _steps(
         self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
@@ -403,11 +434,11 @@ class _Episode:
         recorded = _recorded_actions(self._spec)
         last = (self._job.max_steps or sys.maxsize) - 1
         rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
-        failed = self._job.bundle is not None and policy is None
+        failed = False
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
         total, t = 0.0, 0
-        taken = self._taken
+        taken = self._begun.taken
         n_taken, keep = len(taken), taken.append
         float_environment.reset()
         obs = environment.reset(self._spec.case)
@@ -416,23 +447,25 @@ class _Episode:
             if policy is not None:
                 try:
                     returned = policy.act(obs)
-                    if not self.acted:
-                        self.acted = True
-                        self._tell(_ACTING)
-                    if t < n_taken:
-                        returned = taken[t]
-                    else:
-                        keep(returned)
-                    action, invalid = repair(returned)
+                    if t >= n_taken:
+                        action, invalid = repair(returned)
+                        keep(Returned(returned, action))
                 except PolicyFailedError as error:
                     self._note(error.failure, t)
-                    policy, failed = None, True
+                    policy = None
                     rng = random_actions(self._spec.policy_seed)
-            if rng is not None:
+            if t < n_taken:
+                returned = taken[t].returned
+                action, invalid = repair(returned)
+            elif rng is not None:
                 action = returned = codec.sample(rng)
+                failed = self._job.bundle is not None
             elif recorded is not None:
                 returned = recorded[t]
                 action, invalid = repair(returned)
+            if not self.acted and t < len(taken):
+                self.acted = True
+                self._tell(_ACTING)
             next_obs, reward, terminated, truncated, info = step(action)
             truncated = truncated or t >= last
             told = info.get("rewards", info)
@@ -513,10 +546,6 @@ def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else 0.0
-
-
-def _framed(outcome: EpisodeOutcome) -> bytes:
-    return messages.framed(messages.Finished(outcome=outcome))
 
 
 def _blob(data: bytes) -> BlobRef:

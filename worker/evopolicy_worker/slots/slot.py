@@ -22,6 +22,8 @@ from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_worker.episodes import begun
+from evopolicy_worker.episodes.begun import HandedBack, PackedBegun
 from evopolicy_worker.episodes.monitor import is_stopped
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.slots import endings
@@ -67,6 +69,7 @@ class Slot:
         self._scratch = scratch
         self._cancelled = False
         self._sent = ""
+        self._begun: dict[int, PackedBegun] = {}
         self._process: asyncio.subprocess.Process | None = None
         self._said: deque[str] = deque(maxlen=40)
         self._listener: asyncio.Task[None] | None = None
@@ -112,8 +115,10 @@ class Slot:
         """Play a job: an outcome for each of its episodes, in order, trajectories inline.
 
         `bundle` is the unpacked bundle's folder, None for random actions; `on_progress` is told episodes and steps done.
-        A cancelled job gives nothing. Raises SlotDiedError, SandboxError or WorkerError.
+        A cancelled job gives nothing; what its policy had returned is in `begun` then, as after an error. Raises SlotDiedError,
+        SandboxError or WorkerError.
         """
+        self._begun = begun.unpack(job)
         if self._process is None:
             raise WorkerError("the slot is not started")
         if job.tier != self._start.tier:
@@ -131,7 +136,7 @@ class Slot:
                 return ()
             failure: PolicyFailure | None = None
             while True:
-                began = False
+                acted = False
                 try:
                     await self._send(
                         messages.Play(job=job, bundle=files, first=len(outcomes), failure=failure)
@@ -141,18 +146,24 @@ class Slot:
                         if isinstance(answer, messages.Told):
                             on_progress(answer.episodes_done, answer.steps)
                         elif isinstance(answer, messages.Acting):
-                            began = True
+                            acted = True
                         elif isinstance(answer, messages.Finished):
-                            began = False
+                            acted = False
+                            if answer.begun is not None:
+                                self._begun[len(outcomes)] = answer.begun
                             outcomes.append(answer.outcome)
+                        elif isinstance(answer, messages.Begun):
+                            self._begun[answer.place] = answer.begun
                         else:
                             raise _error(answer)
                     return () if answer.cancelled else tuple(outcomes)
                 except SlotDiedError as error:
-                    failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=began))
+                    failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=acted))
                     if failure is None or self._cancelled or bundle is None:
                         raise
                     log.warning("slot died on a policy's actions", job=job.job_id, error=str(error))
+                    if begun.is_kept(job):
+                        self._begun[len(outcomes)] = PackedBegun(failure=failure)
                 await self.start()
                 files = await asyncio.to_thread(bundle_files, bundle)
         except asyncio.CancelledError:
@@ -162,6 +173,11 @@ class Slot:
         finally:
             watcher.cancel()
             self._idle.set()
+
+    @property
+    def begun(self) -> HandedBack | None:
+        """What stands of the job that was played last and not finished; None for nothing."""
+        return begun.pack(self._begun)
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
         """What these environments are: their simulators are imported in the slot's process. Raises as `play`."""

@@ -8,6 +8,7 @@ import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
+from evopolicy_worker.episodes.begun import PackedBegun
 
 LENGTH = struct.Struct("<I")
 NOTE = "note: "
@@ -43,7 +44,8 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job; answered by Told, again and again, Finished for each episode, then by Played or Fault."""
+    """Play this job; answered by Told, again and again, Finished for each episode, then by Played or Fault (or, given up, by
+    Begun before these)."""
 
     job: Job
     bundle: Files | None
@@ -82,6 +84,16 @@ class Finished(Message, frozen=True, kw_only=True, tag="finished"):
     """What came of the job's next episode."""
 
     outcome: EpisodeOutcome
+    begun: PackedBegun | None = None
+    """What the policy returned in it; of jobs of several episodes only, which are given back as a whole."""
+
+
+class Begun(Message, frozen=True, kw_only=True, tag="begun"):
+    """What the policy has returned so far in the episode that is given up: told on Cancel, and before a Fault."""
+
+    place: int
+    """The episode's, counted in the job."""
+    begun: PackedBegun
 
 
 class Played(Message, frozen=True, kw_only=True, tag="played"):
@@ -105,7 +117,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 
 
 Command = Start | Play | Describe | Cancel
-Answer = Ready | Told | Acting | Finished | Played | Described | Fault
+Answer = Ready | Told | Acting | Finished | Begun | Played | Described | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)

@@ -86,9 +86,11 @@ def _hidden(
 
 
 def _played(state: State, lane: Lane, family: Family) -> bool:
-    """Whether hidden jobs of the lane's closed runs are leased."""
+    """Whether hidden jobs of the lane's closed runs are leased, or are being handed back."""
     return any(
-        stay.lease is not None and stay.lease.live and stay.lease.job.group.flow.closed
+        stay.lease is not None
+        and (stay.lease.live or stay.lease.parting)
+        and stay.lease.job.group.flow.closed
         for kernel in state.kernels.values()
         for stay in kernel.hidden.get(family, {}).values()
         if stay.lease is not None and stay.lease.job.group.flow.lane is lane

@@ -148,9 +148,9 @@ def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lea
     """The kernels that related hidden jobs keep a family's train jobs from, with what is to be stopped there; those
     with least to stop first. Nothing is to be stopped where it was already, but for what has not been let go of."""
     found = []
-    kernels = (
-        {} if family is None else {kernel: None for each in family.relatives for kernel in each.hidden_on}
-    )
+    kernels: dict[Kernel, None] = {}
+    if state.isolates and family is not None:
+        kernels = {kernel: None for each in family.relatives for kernel in each.hidden_on}
     for kernel in kernels:
         stays = all_related(kernel.hidden, family)
         if stays and not reversed_there(state, kernel, family):

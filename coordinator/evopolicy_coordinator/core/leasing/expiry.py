@@ -45,6 +45,8 @@ def look(state: State, worker: Worker, step: Step) -> None:
         if now >= overdue and lease.live:
             leases.stop(state, lease, step, "overdue")
             leases.give_back(state, lease.job, "overdue", worker, step, ran=True)
+        elif now >= overdue and lease.parting:
+            leases.parted(state, lease, worker, step)
         elif now >= due:
             live, orphan = lease.live, lease.orphan_until is not None
             leases.release(state, worker, lease, step, "no heartbeat names it")
@@ -52,7 +54,7 @@ def look(state: State, worker: Worker, step: Step) -> None:
                 mishap: Mishap = "worker_lost" if orphan else "unlisted"
                 leases.give_back(state, lease.job, mishap, worker, step, ran=orphan and lease.id in running)
         else:
-            deadlines.append(min(due, overdue) if lease.live else due)
+            deadlines.append(min(due, overdue) if lease.live or lease.parting else due)
     if deadlines:
         state.timers.arm(("worker", worker.name), min(deadlines))
 

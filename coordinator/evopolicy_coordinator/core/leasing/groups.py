@@ -23,6 +23,9 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
     for job in open_jobs(group, heads, state.first_attempt, step.now):
         state.jobs[job.job_id] = job
         if loading is not None:
+            begun = loading.begun.get((group.id, job.first))
+            if begun is not None:
+                job.begun, job.begun_attempt = begun.begun, begun.attempt
             job.move("adopting")
             state.adopting[job] = None
         else:
@@ -45,6 +48,7 @@ def close_job(state: State, job: JobState, step: Step, why: str) -> None:
     """A job is open no more."""
     if job.lease is not None:
         leases.stop(state, job.lease, step, why)
+    job.parting = None
     queue.withdraw(state, job)
     fleet.unreserve(state, job)
     state.adopting.pop(job, None)

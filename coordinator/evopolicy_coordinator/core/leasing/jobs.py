@@ -2,8 +2,8 @@
 
 Rules that this module owns:
 - A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.
-- A job's content follows from its group and its position alone, so it need not be stored, and every attempt of it is the
-  same job.
+- A job's content follows from its group and its position, so it need not be stored, and every attempt of it is the same job,
+  but for what the policy returned in an earlier one (`BegunRow`).
 - Of a finished episode only its mark is kept, and only while the group is open.
 """
 
@@ -81,4 +81,5 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         tier=template.tier,
         limits=template.limits,
         max_steps=template.max_steps,
+        begun=job.begun,
     )

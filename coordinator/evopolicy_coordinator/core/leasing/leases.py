@@ -7,6 +7,8 @@ Rules that this module owns:
 - A lease lives by heartbeats that name it. One that its worker never came to know of is given up.
 - A lease that this incarnation has not heard of is adopted from its holder's heartbeat when its job waits.
 - Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
+- A policy's job that is stopped through nobody's fault waits again only when its worker has let go of it: what its policy has
+  returned comes back with it, and the next attempt goes on from there.
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
     now = step.now
     name = lease_id(job.group.flow.secret, job.job_id, attempt, worker.name)
     lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
-    job.lease = lease
+    job.lease, job.parting = lease, None
     job.move("leased")
     worker.leases[name] = lease
     worker.n_live += 1
@@ -142,15 +144,16 @@ def hear(
     for item in held:
         named.add(item.lease_id)
         lease = worker.leases.get(item.lease_id) or _adopt(state, worker, item, step)
+        if lease is None:
+            stays.unknown(state, worker, item, step)
+        elif lease.live or lease.parting:
+            lease.doubtful = lease.doubtful or now - lease.renewed > state.settings.silence_s
+            lease.renewed = now
+            lease.orphan_until = None
         if lease is None or not lease.live:
             stop.append(item.lease_id)
-            if lease is None:
-                stays.unknown(state, worker, item, step)
             continue
-        lease.doubtful = lease.doubtful or now - lease.renewed > state.settings.silence_s
-        lease.renewed = now
         lease.named = True
-        lease.orphan_until = None
         lease.running = item.running
         if item.running and lease.started_at is None:
             lease.started_at = now
@@ -160,7 +163,8 @@ def hear(
     for lease in [each for each in worker.leases.values() if each.id not in named]:
         if not lease.live:
             sure = stays.surely(worker, lease.stay, settled)
-            _leave(state, worker, lease, step, sure=sure)
+            if sure or not lease.parting:
+                _leave(state, worker, lease, step, sure=sure)
         elif not lease.named and lease.granted_at < missing_since and now >= state.hold_until:
             sure = stays.surely(worker, lease.stay, settled)
             release(state, worker, lease, step, "it never arrived", sure=sure)
@@ -234,6 +238,14 @@ def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool
     if worker.alone is lease:
         worker.alone = None
     state.freed[worker.name] = None
+    parted(state, lease, worker, step)
+
+
+def parted(state: State, lease: Lease, worker: Worker, step: Step) -> None:
+    """A job that waited for what its worker hands back waits for it no more."""
+    if lease.parting:
+        lease.job.parting = None
+        give_back(state, lease.job, "returned", worker, step, ran=False)
 
 
 def give_back(
@@ -269,7 +281,11 @@ def give_back(
 
 
 def put_off(state: State, lease: Lease, why: str, step: Step) -> None:
-    """Stop a hidden job, through nobody's fault; it goes back into the queue."""
-    worker = state.workers[lease.worker]
+    """Stop a hidden job, through nobody's fault; it goes back into the queue, where a policy plays when its worker has let go."""
+    job = lease.job
     stop(state, lease, step, why)
-    give_back(state, lease.job, "returned", worker, step, ran=False)
+    if job.group.template.bundle is None:
+        give_back(state, job, "returned", state.workers[lease.worker], step, ran=False)
+    else:
+        job.move("parting")
+        job.since, job.parting = step.now, lease

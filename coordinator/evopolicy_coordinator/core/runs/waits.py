@@ -17,6 +17,8 @@ def waits_for(state: State, group: JobGroup) -> str:
         return missing
     if obstacle := bars.obstacle(state, group):
         return obstacle
+    if any(job.place == "parting" for job in group.jobs.values()):
+        return "workers to hand back what they were told to stop"
     if any(job.lease is None and not job.queued for job in group.jobs.values()):
         waits_to_adopt = any(job in state.adopting for job in group.jobs.values())
         return "workers to report after a restart" if waits_to_adopt else "another try after a fault of ours"

@@ -5,6 +5,8 @@ Rules that this module owns:
   counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
   stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
+- What the policy of an attempt that was given back had returned stands: no attempt after it throws the policy's dice again.
+  A worker that was silent for long is not believed that a limit ended it.
 - An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
   name proves its grant. So is one of a worker that the job's group bars.
 - An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
@@ -21,7 +23,7 @@ from evopolicy_common.messages.worker import JobResult
 from evopolicy_coordinator.core.leasing import fleet, groups, leases
 from evopolicy_coordinator.core.leasing.retry import Mishap
 from evopolicy_coordinator.core.model import JobState, Lease, Worker, mark_of
-from evopolicy_coordinator.core.records import OutcomeRow
+from evopolicy_coordinator.core.records import BegunRow, OutcomeRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import EpisodesDone, HandedIn, ResultsDiffered, Step
 
@@ -39,16 +41,28 @@ def take(state: State, news: HandedIn, step: Step) -> None:
         step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
         return
     live = lease is not None and lease.live and job.lease is lease
+    counts = live or (lease is not None and lease.parting)
     silent = lease is None or _silent(state, lease, step.now)
+    if result.kind != "done":
+        _goes_on(job, lease, result, step, silent=silent)
     if lease is not None:
         leases.release(state, worker, lease, step, f"handed in: {result.kind}", sure=True)
     if result.kind == "done":
-        _done(state, worker, job, result, step, live=live, silent=silent)
+        _done(state, worker, job, result, step, live=live, silent=silent or not counts)
     elif live:
         if result.kind != "returned":
             fleet.failed(state, worker, step)
         mishap: Mishap = "returned" if result.kind == "returned" else "failed"
         leases.give_back(state, job, mishap, worker, step, ran=True, error=result.error)
+
+
+def _goes_on(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
+    """What the policy of an unfinished attempt has returned stands for the next one, unless that plays already."""
+    told = result.begun is not None and not (silent and result.limit_verdict)
+    if told and job.lease in (None, lease) and result.attempt > job.begun_attempt:
+        job.begun, job.begun_attempt = result.begun, result.attempt
+        group = job.group.id
+        step.persist(BegunRow(group=group, first=job.first, attempt=result.attempt, begun=result.begun))
 
 
 def _closed(
@@ -129,7 +143,7 @@ def _done(
             fleet.failed(state, worker, step)
             leases.give_back(state, job, "failed", worker, step, ran=True, error=fault)
         return
-    if (silent or not live) and any(_limit_verdict(outcome) for outcome in result.episodes):
+    if silent and any(_limit_verdict(outcome) for outcome in result.episodes):
         state.story.tell(step.now, step.stimulus_id, result.lease_id, "late limit verdict, not counted")
         if live:
             leases.give_back(
@@ -144,6 +158,8 @@ def commit(state: State, worker: Worker, job: JobState, result: JobResult, step:
     """Make the outcomes durable and the job done."""
     group = job.group
     groups.close_job(state, job, step, "done by another attempt")
+    if job.begun is not None:
+        step.persist(BegunRow(group=group.id, first=job.first, attempt=result.attempt, begun=None))
     for outcome in result.episodes:
         row = OutcomeRow(
             group=group.id,

@@ -22,7 +22,6 @@ from evopolicy_coordinator.core.model import (
     JobState,
     Lane,
     Lease,
-    Worker,
 )
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
@@ -62,7 +61,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                 if not may_stop(state, job):
                     del hidden[lease]
                     continue
-                stop_hidden(state, lease, worker, f"preempted for {lane.key[0]}", step)
+                stop_hidden(state, lease, f"preempted for {lane.key[0]}", step)
                 if worker.n_live < worker.slots:
                     # Only now a slot comes free by it: what was stopped before had still to wait for one.
                     wanted -= 1
@@ -86,8 +85,7 @@ def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, 
         lasting = any(not may_stop(state, lease.job) for lease in playing)
         for lease in playing:
             if not lasting or lease.job.priority != HELDOUT:
-                worker = state.workers[lease.worker]
-                stop_hidden(state, lease, worker, f"preempted for {lane.key[0]}", step)
+                stop_hidden(state, lease, f"preempted for {lane.key[0]}", step)
         if not lasting:
             slots += room
     return slots
@@ -99,8 +97,7 @@ def may_stop(state: State, job: JobState) -> bool:
     return not bounded or job.preemptions < state.settings.preemptions_max
 
 
-def stop_hidden(state: State, lease: Lease, worker: Worker, why: str, step: Step) -> None:
+def stop_hidden(state: State, lease: Lease, why: str, step: Step) -> None:
     """Stop a hidden job for the sake of train jobs; it goes back into the queue."""
     lease.job.preemptions += 1
-    leases.stop(state, lease, step, why)
-    leases.give_back(state, lease.job, "returned", worker, step, ran=False)
+    leases.put_off(state, lease, why, step)

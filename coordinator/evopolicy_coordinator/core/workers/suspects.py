@@ -69,7 +69,7 @@ def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
                 and not first
                 and preemption.may_stop(state, lease.job)
             ):
-                preemption.stop_hidden(state, lease, worker, f"preempted for {job.job_id}", step)
+                preemption.stop_hidden(state, lease, f"preempted for {job.job_id}", step)
 
 
 def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:

@@ -33,6 +33,7 @@ from evopolicy_coordinator.core.effects import (
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import (
     AuditRow,
+    BegunRow,
     EvaluationRow,
     FinishedRow,
     KernelRow,
@@ -85,6 +86,8 @@ def key_of(row: Row) -> tuple[Any, ...]:
             return (SubmitRow, row.run, row.submit_index)
         case OutcomeRow():
             return (OutcomeRow, row.group, row.index)
+        case BegunRow():
+            return (BegunRow, row.group, row.first)
         case EvaluationRow():
             return (EvaluationRow, row.evaluation)
         case WorkerRow():
@@ -131,6 +134,7 @@ class Rig:
             states=of(RunStateRow),
             submits=of(SubmitRow),
             outcomes=tuple(head_of(row) for row in of(OutcomeRow)),
+            begun=of(BegunRow),
             evaluations=of(EvaluationRow),
             workers=of(WorkerRow),
             audits=of(AuditRow),

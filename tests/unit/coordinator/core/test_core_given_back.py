@@ -1,0 +1,168 @@
+"""What the policy of a hidden job had returned when the job was stopped stands: the next attempt goes on from there."""
+
+from __future__ import annotations
+
+import pytest
+from core_rig import Rig, done, result, split_of
+
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_coordinator.core.records import BegunRow
+
+HERE = "kernel-of-w1"
+BEGUN = BlobRef(digest="b" * 64, size=5000)
+LONGER = BlobRef(digest="c" * 64, size=6000)
+
+
+def playing(rig: Rig, *, n_valid: int = 1) -> tuple[str, wire.Lease]:
+    """A worker that plays hidden validation of an open run, whose agent is on another kernel."""
+    session = rig.register()
+    rig.create(n_valid=n_valid)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session))
+    (lease,) = rig.poll(session, n=1)
+    assert split_of(lease.job) == "validation"
+    assert lease.job.begun is None
+    return session, lease
+
+
+def given_back(rig: Rig, session: str, lease: wire.Lease, begun: BlobRef | None, **more: bool) -> None:
+    rig.hand_in(session, result(lease, "returned", begun=begun, **more))
+
+
+def the_hidden_one(rig: Rig, session: str) -> wire.Lease:
+    """The next lease on it, once the train jobs are done."""
+    for _ in range(4):
+        for lease in rig.poll(session, n=2):
+            if split_of(lease.job) == "validation":
+                return lease
+            rig.play(session, lease)
+    raise AssertionError("it is not leased")
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_job_that_a_submit_stops_goes_on_from_what_its_policy_had_returned(restart: bool) -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session))
+    (lease,) = rig.poll(session, n=1)
+    for number, begun in enumerate((BEGUN, LONGER)):
+        rig.submit(0, key=f"again-{number}")
+        assert rig.beat(session, lease).cancelled == (lease.lease_id,)
+        given_back(rig, session, lease, begun)
+        if restart:
+            rig.load()
+            session = rig.register(slots=1)
+            rig.pass_time(rig.settings.adoption_s)
+        lease = the_hidden_one(rig, session)
+        assert lease.job.begun == begun
+        assert rig.core.state.jobs[lease.job.job_id].names_blob(begun.digest)
+    rig.hand_in(session, done(lease))
+    assert rig.row(BegunRow, "r1/s0/validation", 0).begun is None
+
+
+def test_a_job_that_a_permit_stops_waits_until_its_worker_has_handed_back() -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    other = rig.register("w2")
+    rig.create("r2", agent=None)
+    assert rig.permit("r2", HERE, wait_s=20.0) is None
+    # It is not to be thrown again elsewhere meanwhile.
+    assert rig.poll(other) == []
+    rig.beat(session, lease)
+    assert rig.poll(other) == []
+    assert "hand back" in rig.core.status(rig.now).runs[0].waits_for
+    given_back(rig, session, lease, BEGUN)
+    assert [each.job.begun for each in rig.poll(other)] == [BEGUN]
+
+
+def test_a_worker_that_does_not_name_it_any_more_has_nothing_to_hand_back() -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    other = rig.register("w2")
+    rig.create("r2", agent=None)
+    rig.permit("r2", HERE, wait_s=20.0)
+    rig.beat(session)
+    (again,) = rig.poll(other)
+    assert (again.job.job_id, again.job.begun) == (lease.job.job_id, None)
+    # Too late: it is played already.
+    given_back(rig, session, lease, BEGUN)
+    assert rig.core.state.jobs[lease.job.job_id].begun is None
+
+
+def test_a_worker_that_falls_silent_or_never_lets_go_holds_it_up_for_a_while_only() -> None:
+    for beats in (False, True):
+        rig = Rig(job_deadline_s=30.0)
+        session, lease = playing(rig)
+        other = rig.register("w2")
+        rig.create("r2", agent=None)
+        rig.permit("r2", HERE, wait_s=20.0)
+        waited_s = 0.0
+        while not (again := rig.poll(other)):
+            if beats:
+                rig.beat(session, lease)
+            rig.beat(other)
+            rig.pass_time(2.0)
+            waited_s += 2.0
+            assert waited_s < 2000.0
+        assert again[0].job.job_id == lease.job.job_id
+        assert (waited_s > 100.0) == beats
+
+
+def test_an_earlier_attempt_does_not_replace_what_a_later_one_handed_back() -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    rig.create("r2", agent=None)
+    rig.permit("r2", HERE, wait_s=20.0)
+    given_back(rig, session, lease, BEGUN)
+    given_back(rig, session, lease, LONGER)
+    assert rig.core.state.jobs[lease.job.job_id].begun == BEGUN
+
+
+def test_another_worker_cannot_hand_back_what_it_was_not_given() -> None:
+    rig = Rig()
+    _, lease = playing(rig)
+    other = rig.register("w2")
+    given_back(rig, other, lease, BEGUN)
+    assert rig.core.state.jobs[lease.job.job_id].begun is None
+
+
+@pytest.mark.parametrize("limit", [False, True])
+def test_a_worker_that_was_silent_for_long_is_not_believed_that_a_limit_ended_the_policy(limit: bool) -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    rig.pass_time(rig.settings.silence_s + 1.0)
+    given_back(rig, session, lease, BEGUN, limit_verdict=limit)
+    assert (rig.core.state.jobs[lease.job.job_id].begun is None) == limit
+
+
+def test_what_a_worker_in_trouble_can_still_tell_stands_too() -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    rig.hand_in(session, result(lease, "failed", begun=BEGUN))
+    rig.pass_time(10.0)
+    assert [each.job.begun for each in rig.poll(session)] == [BEGUN]
+
+
+def test_a_job_that_was_done_when_it_was_stopped_is_done() -> None:
+    rig = Rig()
+    session, lease = playing(rig)
+    rig.create("r2", agent=None)
+    rig.permit("r2", HERE, wait_s=20.0)
+    rig.hand_in(session, done(lease, failure="act_timeout"))
+    assert lease.job.job_id not in rig.core.state.jobs
+
+
+def test_random_actions_are_not_waited_for() -> None:
+    rig = Rig(hidden_isolation="off")
+    session = rig.register(slots=4)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    rig.play(session, *rig.poll(session))
+    rig.create("r2", agent=None)
+    rig.close("r1")
+    random = next(lease for lease in rig.poll(session, n=4) if lease.job.bundle is None)
+    rig.submit(*range(4), run="r2")
+    assert rig.core.state.jobs[random.job.job_id].queued

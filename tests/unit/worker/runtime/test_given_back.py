@@ -1,0 +1,175 @@
+"""A hidden episode that is given back unfinished: what its policy had returned, and how it had failed, stands in the next attempt."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from typing import Any
+
+import msgspec
+import pytest
+from slots import HONEST, QUICK, STUCK, Slots, make_job, rows
+
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_worker.episodes import begun
+from evopolicy_worker.slots.slot import Slot
+
+PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)
+
+CLOCKED = """
+import time
+
+class Policy:
+    def __init__(self, *spaces):
+        self.n = 0
+
+    def reset(self, episode_index):
+        self.n, self.e = 0, episode_index
+
+    def act(self, obs):
+        self.n += 1
+        AHEAD
+        return [(time.time_ns() // 1000 % 1_000_000) / 1e6]
+"""
+SLOW = CLOCKED.replace("AHEAD", "time.sleep(0.03)")
+
+
+def hidden(**options: Any) -> Job:
+    return make_job(**{"record": "actions", "limits": PATIENT, **options})
+
+
+def going_on(job: Job, slot: Slot) -> Job:
+    """The job as it is leased the next time."""
+    back = slot.begun
+    if back is None:
+        return job
+    ref = BlobRef(digest=digest_of(back.data), size=len(back.data), inline=back.data)
+    return msgspec.structs.replace(job, begun=ref)
+
+
+async def stopped(
+    slots: Slots, slot: Slot, job: Job, source: str, steps: int, episodes: int = 0
+) -> tuple[EpisodeOutcome, ...]:
+    """Plays the job, and stops it after some steps."""
+    reached = asyncio.Event()
+
+    def told(episodes_done: int, n_steps: int) -> None:
+        if episodes_done >= episodes and n_steps >= steps:
+            reached.set()
+
+    task = asyncio.create_task(slot.play(job, slots.bundle(source), told))
+    await asyncio.wait({task, asyncio.create_task(reached.wait())}, return_when=asyncio.FIRST_COMPLETED)
+    await slot.cancel()
+    return await asyncio.wait_for(task, 60)
+
+
+def actions(outcome: EpisodeOutcome) -> list[float]:
+    return [float(row.action[0]) for row in rows(outcome)]
+
+
+def prefix(job: Job, place: int = 0) -> list[float]:
+    """The actions that the job goes on from."""
+    packed = begun.unpack(job).get(place)
+    return [] if packed is None else [float(each.action[0]) for each in packed.unpacked().taken]
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
+def test_a_policy_whose_luck_is_the_clock_throws_once_however_often_it_is_stopped(
+    slots: Slots, tier: str
+) -> None:
+    slot = slots.slot(tier)  # type: ignore[arg-type]
+    job = hidden(tier=tier)
+    thrown: list[list[float]] = []
+    for _ in range(4):
+        # A stop that comes before what stands is played again takes nothing away from it.
+        assert slots.run(stopped(slots, slot, job, SLOW, 12)) == ()
+        job = going_on(job, slot)
+        thrown.append(prefix(job))
+    (outcome,) = slots.run(slot.play(job, slots.bundle(SLOW), lambda *told: None))
+    assert outcome.failure is None
+    assert len(thrown[0]) >= 12
+    for shorter, longer in itertools.pairwise([*thrown, actions(outcome)]):
+        assert longer[: len(shorter)] == shorter
+
+
+def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None:
+    until = time.time() + 60.0
+    fails = f"if self.e == 1 and self.n == 5 and time.time() < {until}: raise ValueError('unlucky')"
+    source = SLOW.replace("time.sleep", f"{fails}\n        time.sleep")
+    slot = slots.slot()
+    job = hidden(n=3, policy_scope="submit")
+    assert slots.run(stopped(slots, slot, job, source, 70, episodes=1)) == ()
+    job = going_on(job, slot)
+    known = begun.unpack(job)
+    assert known[0].failure is not None
+    # Now it would not fail any more.
+    lucky = source.replace(str(until), "0")
+    outcomes = slots.run(slot.play(job, slots.bundle(lucky), lambda *told: None))
+    assert outcomes[0].failure is not None
+    assert (outcomes[0].failure.category, outcomes[0].failure.step_index) == ("act_error", 4)
+    assert actions(outcomes[0])[:4] == prefix(job, 0)
+    assert actions(outcomes[1])[: len(prefix(job, 1))] == prefix(job, 1)
+    assert outcomes[2].failure is None
+
+
+def test_a_policy_that_fails_while_its_actions_are_played_again_keeps_them(slots: Slots) -> None:
+    slot = slots.slot()
+    job = hidden()
+    assert slots.run(stopped(slots, slot, job, SLOW, 10)) == ()
+    job = going_on(job, slot)
+    stands = prefix(job)
+    fails = SLOW.replace("self.n += 1", "raise ValueError('I know what comes')")
+    (outcome,) = slots.run(slot.play(job, slots.bundle(fails), lambda *told: None))
+    assert outcome.failure is not None
+    assert actions(outcome)[: len(stands)] == stands
+    # What follows are the random actions of any policy that fails.
+    (other,) = slots.play_all(fails, record="actions", limits=PATIENT)
+    follow = actions(outcome)[len(stands) :]
+    assert follow == actions(other)[: len(follow)]
+
+
+def test_an_honest_policy_comes_to_the_same_when_it_is_stopped(slots: Slots) -> None:
+    source = HONEST.replace("return [", "import time; time.sleep(0.03); return [")
+    slot = slots.slot()
+    job = hidden()
+    assert slots.run(stopped(slots, slot, job, source, 10)) == ()
+    (outcome,) = slots.run(slot.play(going_on(job, slot), slots.bundle(source), lambda *told: None))
+    (whole,) = slots.play_all(HONEST, record="actions", limits=PATIENT)
+    assert outcome.trajectory == whole.trajectory
+    assert outcome.episode_return == whole.episode_return
+
+
+def test_nothing_stands_of_a_policy_that_has_returned_nothing_or_plays_for_training(slots: Slots) -> None:
+    slot = slots.slot()
+
+    async def at_once(job: Job, source: str) -> None:
+        task = asyncio.create_task(slot.play(job, slots.bundle(source), lambda *told: None))
+        await asyncio.sleep(1.0)
+        await slot.cancel()
+        assert await task == ()
+
+    slots.run(at_once(hidden(), STUCK))
+    assert slot.begun is None
+    slots.run(at_once(hidden(record="full"), CLOCKED.replace("AHEAD", "time.sleep(0.1)")))
+    assert slot.begun is None
+    assert slots.play(HONEST).failure is None
+
+
+def test_a_failure_by_a_limit_is_told_as_one(slots: Slots) -> None:
+    limits = msgspec.structs.replace(PATIENT, act_wall_s=0.5)
+    source = CLOCKED.replace("AHEAD", "time.sleep(9.0 if self.e == 1 and self.n == 3 else 0.03)")
+    slot = slots.slot()
+    job = hidden(n=2, policy_scope="submit", limits=limits)
+    assert slots.run(stopped(slots, slot, job, source, 65, episodes=1)) == ()
+    back = slot.begun
+    assert back is not None
+    assert back.limit_verdict
+
+
+def test_what_cannot_be_read_is_begun_anew(slots: Slots) -> None:
+    data = b"\xc1 none of it"
+    job = hidden(begun=BlobRef(digest=digest_of(data), size=len(data), inline=data))
+    (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *told: None))
+    assert outcome.failure is None
