@@ -51,14 +51,16 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
     heldout: tuple[Case, ...]
     secret: bool
     """Whether the hidden cases cannot be guessed from public facts."""
+    files: dict[str, str] = {}
+    """SHA-256 (hex) of the bytes of the files that the cases come from, by file name."""
 
     def cases(self, split: Split) -> tuple[Case, ...]:
         """The cases of `split`, in order of their ids."""
         return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 (hex) of each split's cases, by split name."""
-        return {split: cases_hash(self.cases(split)) for split in SPLITS}
+        """SHA-256 (hex) of each split's cases by split name, and of the files that they come from by file name."""
+        return {split: cases_hash(self.cases(split)) for split in SPLITS} | self.files
 
 
 def folder_name(env: str) -> str:
@@ -168,10 +170,11 @@ def _create_secret(path: Path) -> bytes:
     return data
 
 
-def read_split_file(path: Path) -> SplitFile:
-    """The file's content; ConfigError naming the file and what is wrong in it."""
+def read_split_file(path: Path) -> tuple[SplitFile, str]:
+    """The file's content and the SHA-256 (hex) of its bytes; ConfigError naming the file and what is wrong in it."""
     try:
-        content = msgspec.json.decode(path.read_bytes(), type=SplitFile)
+        data = path.read_bytes()
+        content = msgspec.json.decode(data, type=SplitFile)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
@@ -179,16 +182,18 @@ def read_split_file(path: Path) -> SplitFile:
     for number, case in enumerate(content.cases):
         if not 0 <= case.seed < _SEED_LIMIT:
             raise ConfigError(f"{path}: case {number} has seed {case.seed}; seeds are 0 to {_SEED_LIMIT - 1}")
-    return content
+    return content, hashlib.sha256(data).hexdigest()
 
 
 def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
     """The splits in one environment's folder, and what is wrong with them (None when they cannot be read at all)."""
     findings: list[str] = []
     contents: dict[Split, SplitFile] = {}
+    hashes: dict[str, str] = {}
     for split in SPLITS:
+        name = f"{FILE_STEMS[split]}.json"
         try:
-            contents[split] = read_split_file(folder / f"{FILE_STEMS[split]}.json")
+            contents[split], hashes[name] = read_split_file(folder / name)
         except ConfigError as error:
             findings.append(str(error))
     if len(contents) < len(SPLITS):
@@ -202,6 +207,7 @@ def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
         validation=contents["validation"].cases,
         heldout=contents["heldout"].cases,
         secret=all(content.secret is True for content in contents.values()),
+        files=hashes,
     )
     return splits, findings
 
@@ -265,7 +271,7 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
-            return EnvironmentSplits(env=env, secret=True, **_by_field(cases))
+            return _splits(env, cases, secret=True)
         if own:
             raise ConfigError(
                 "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes them from"
@@ -281,11 +287,20 @@ class SplitSource:
         if splits.env != env:
             raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
         cut = {split: _cut(folder, split, splits.cases(split), counts.get(split)) for split in SPLITS}
-        return EnvironmentSplits(env=env, secret=splits.secret, **_by_field(cut))
+        return _splits(env, cut, secret=splits.secret, files=splits.files)
 
 
-def _by_field(cases: dict[Split, tuple[Case, ...]]) -> dict[str, tuple[Case, ...]]:
-    return {str(split): members for split, members in cases.items()}
+def _splits(
+    env: str, cases: dict[Split, tuple[Case, ...]], *, secret: bool, files: dict[str, str] | None = None
+) -> EnvironmentSplits:
+    return EnvironmentSplits(
+        env=env,
+        train=cases["train"],
+        validation=cases["validation"],
+        heldout=cases["heldout"],
+        secret=secret,
+        files=files or {},
+    )
 
 
 def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:

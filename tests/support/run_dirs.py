@@ -13,10 +13,12 @@ import msgspec
 from agent_logs import LOGS
 from invented_policies import Version
 
+from evopolicy_common.records import checkpoints
+from evopolicy_common.records.bundles import BundleFile, pack
+from evopolicy_common.records.checkpoints import CheckpointMeta
 from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
-    CheckpointMetrics,
     ExperimentDimensions,
     Outcome,
     ReferenceScore,
@@ -26,10 +28,9 @@ from evopolicy_common.records.run_record import (
     Timing,
     Tokens,
     Versions,
-    encode_checkpoint_metrics,
     encode_run_record,
 )
-from evopolicy_common.records.summary import Summary, utc_text
+from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
 
 START = 1_760_000_000.0
 
@@ -109,9 +110,9 @@ def write_run(
             hidden_cases=hidden_cases,  # type: ignore[arg-type]
         ),
         timing=Timing(
-            started_at=utc_text(START),
-            finished_at=utc_text(clock + 90.0),
-            wall_s=clock + 90.0 - START,
+            start_time=utc_text(START),
+            end_time=utc_text(clock + 90.0),
+            wall_time_seconds=clock + 90.0 - START,
             agent_s=60.0 * len(versions),
             queue_s=1.5 * len(versions),
             rollout_s=16.0 * len(versions),
@@ -139,7 +140,10 @@ def write_run(
             RejectedSubmit(status="budget_invalid", message="asks for 200 of 128 episodes", after_submits=i)
             for i in range(rejected)
         ),
-        artifacts=Artifacts(replays=replay_records),
+        artifacts=Artifacts(
+            **{name: name for name in ("workspace", "checkpoints")}, logs_agent="logs/agent.jsonl"
+        ),
+        replays=replay_records,
         versions=Versions(
             harness="0.1.0",
             env=f"{env} (test)",
@@ -172,13 +176,13 @@ def _write_submit(
     ok = version.status == "ok"
     returns = tuple(float(value) for value in version.returns)
     summary = Summary(
-        schema_version=1,
+        schema_version=SCHEMA_VERSION,
         submit_index=index,
         env=env,
         status=version.status,  # type: ignore[arg-type]
         n_episodes=len(returns),
-        first_global_episode=first,
-        env_instances=tuple(range(len(returns))) if ok else None,
+        first_global_episode=first if ok else None,
+        env_instances=tuple(range(len(returns))),
         remaining_budget=remaining,
         submit_started_at=utc_text(clock),
         submit_completed_at=utc_text(clock + 20.0),
@@ -197,25 +201,18 @@ def _write_submit(
     feedback.mkdir(parents=True)
     (feedback / "summary.json").write_bytes(msgspec.json.encode(summary))
     checkpoint = folder / "checkpoints" / f"submit_{index:03d}"
-    digest = hashlib.sha256()
-    for name, data in sorted({**{k: v.encode() for k, v in version.files.items()}, **version.images}.items()):
-        path = checkpoint / "system" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-        digest.update(name.encode() + b"\0" + data)
-    checkpoint.mkdir(parents=True, exist_ok=True)
-    metrics = CheckpointMetrics(
+    files = {**{name: text.encode() for name, text in version.files.items()}, **version.images}
+    meta = CheckpointMeta(
         submit_index=index,
-        status=version.status,  # type: ignore[arg-type]
-        digest=digest.hexdigest(),
-        n_episodes=len(returns),
-        consumed_budget=budget - remaining,
+        submit_time=utc_text(clock),
+        n_episodes_requested=len(returns),
+        remaining_budget_before=remaining + len(returns),
+        remaining_budget_after=remaining,
+        validation_status=version.status,
         mean_return=summary.mean_return,
         val_mean=version.val,
-        policy_files=len(version.files),
-        policy_bytes=sum(len(text) for text in version.files.values()),
     )
-    (checkpoint / "metrics.json").write_bytes(encode_checkpoint_metrics(metrics))
+    checkpoints.write(checkpoint, meta, pack([BundleFile(name, False, data) for name, data in files.items()]))
 
 
 def _write_replays(folder: Path, replays: Mapping[str, bytes], best: int) -> tuple[Replay, ...]:

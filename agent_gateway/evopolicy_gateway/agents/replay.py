@@ -1,7 +1,7 @@
 """`replay`: submits given policies one after another, dividing the budget evenly.
 
 Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is a
-folder with a `policy.py`, or with a `system/` that has one (as a run's `checkpoints/submit_NNN/`). DIR is one itself, or
+folder with a `policy.py` (as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (as a workspace). DIR is one itself, or
 its subfolders are, and are played in sorted order. Where DIR has a folder named like the environment, with `/` as `_`, it
 is played instead: one DIR for many environments, such as `examples/policies`.
 """
@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+
+METADATA = frozenset({"_meta.json", "metrics.json"})
 
 
 def policies_in(folder: Path) -> list[Path]:
@@ -45,16 +47,20 @@ def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
 
 
 def stage(policy: Path, system: Path) -> None:
-    """Makes `system` a copy of `policy`; links are copied as links, for the service to judge."""
+    """Makes `system` a copy of `policy`, without what a run has put beside a checkpoint's files; links are copied as links,
+    for the service to judge."""
     system.mkdir(exist_ok=True)
     for old in system.iterdir():
         if old.is_dir() and not old.is_symlink():
             shutil.rmtree(old)
         else:
             old.unlink()
-    shutil.copytree(
-        policy, system, symlinks=True, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
-    )
+    metadata = METADATA if (policy / "_meta.json").exists() else frozenset()
+
+    def ignored(folder: str, names: list[str]) -> set[str]:
+        return {"__pycache__"} | (metadata if Path(folder) == policy else frozenset())
+
+    shutil.copytree(policy, system, symlinks=True, dirs_exist_ok=True, ignore=ignored)
 
 
 def play(client: Client, folder: Path, workspace: Path) -> int:

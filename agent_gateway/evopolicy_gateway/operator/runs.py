@@ -242,13 +242,13 @@ def _result(plan: Plan, record: RunRecord) -> RunResult:
         run_directory=str(plan.folder.root),
         status=outcome.status,
         error=outcome.error,
-        final_score=outcome.final_score,
+        final_score=outcome.score,
         random_score=None if reference is None else reference.mean_return,
         best_submit_index=outcome.best_submit_index,
         n_submits=len(list(plan.folder.checkpoints.glob("submit_*"))),
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
-        wall_s=record.timing.wall_s,
+        wall_s=record.timing.wall_time_seconds,
         in_question=record.audit is not None and record.audit.in_question,
     )
 

@@ -21,6 +21,7 @@ from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records import bundles
+from evopolicy_common.records.checkpoints import bundle_of
 from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.runs import Cluster, connected
@@ -207,7 +208,7 @@ def _bundle(policy: Path) -> bundles.Bundle:
     if not (folder / "policy.py").is_file():
         raise ConfigError(f"{policy} holds no policy.py")
     try:
-        return bundles.snapshot(folder)
+        return bundle_of(folder)
     except BundleError as error:
         raise ConfigError(f"{folder}: {error}") from error
 

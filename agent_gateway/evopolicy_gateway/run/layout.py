@@ -14,6 +14,7 @@ import msgspec
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.wire import keys
 
 _ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
@@ -63,6 +64,24 @@ class RunFolder(msgspec.Struct, frozen=True):
     def agent_log(self) -> Path:
         """All that the agent's programs say, and what they were told."""
         return self.root / "logs" / "agent.jsonl"
+
+    @property
+    def env_log(self) -> Path:
+        """What was played and what came of it, written at the end."""
+        return self.root / "logs" / "env.log"
+
+    def artifacts(self) -> Artifacts:
+        """What there is of a finished run, as `run.json` names it."""
+        places = {
+            "workspace": self.workspace,
+            "feedback": self.feedback,
+            "checkpoints": self.checkpoints,
+            "logs_harness": self.harness_log,
+            "logs_agent": self.agent_log,
+            "logs_env": self.env_log,
+        }
+        found = {name: path for name, path in places.items() if path.exists()}
+        return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in found.items()})
 
     @property
     def state(self) -> Path:
@@ -168,6 +187,8 @@ class Staged(msgspec.Struct, frozen=True, kw_only=True):
 
     agents_md_hash: str
     """Of the rules, with placeholders for the URLs: equal for runs with equal rules."""
+    agents_md_file_hash: str = ""
+    """Of `AGENTS.md`; empty in a workspace of an earlier version."""
     initial_policy_hash: str
     """Of `system/policy.py`."""
     n_train: int

@@ -1,4 +1,5 @@
-"""What a finished run leaves: `checkpoints/`, `replays/`, the selected policy in `workspace/system/`; `run.json` comes last.
+"""What a finished run leaves: `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`;
+`run.json` comes last.
 
 Holds hidden scores, so it is called only when the agent and all its children are gone.
 """
@@ -7,8 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -17,15 +17,18 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import StorageError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
-from evopolicy_common.records import bundles
+from evopolicy_common.records import bundles, checkpoints
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.bundles import Bundle
+from evopolicy_common.records.checkpoints import CheckpointMeta
+from evopolicy_common.records.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
-    CheckpointMetrics,
     ExperimentDimensions,
     Outcome,
     ReferenceScore,
@@ -36,8 +39,8 @@ from evopolicy_common.records.run_record import (
     Timing,
     Tokens,
     Versions,
-    encode_checkpoint_metrics,
     encode_run_record,
+    sha256_text,
 )
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.operator.operations import Operations
@@ -62,17 +65,21 @@ async def write(
     `error` tells why this command gave the run up, when it was not the operator who cancelled it.
     """
     selected: Bundle | None = None
+    code: dict[int, CodeMetrics] = {}
+    folder.checkpoints.mkdir(exist_ok=True)
     for submit in finished.submits:
         bundle = None if submit.bundle is None else await _bundle(folder, submit.bundle, operations)
-        await asyncio.to_thread(_write_checkpoint, folder, finished, submit, bundle)
+        code[submit.submit_index] = await asyncio.to_thread(
+            _write_checkpoint, folder, finished, submit, bundle
+        )
         if submit.submit_index == finished.best_submit_index:
             selected = bundle
     if selected is not None:
-        await asyncio.to_thread(_put_in_place, folder.system, selected)
+        await asyncio.to_thread(_put_in_place, folder.system, checkpoints.without_metadata(selected.files))
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, status="error", error=error)
     recorded = await replays.fetch(folder.root, finished, operations)
-    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded)
+    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded, code)
 
 
 def run_record(
@@ -82,8 +89,10 @@ def run_record(
     rejected: Sequence[Rejected],
     times: Times,
     recorded: tuple[Replay, ...] = (),
+    code: Mapping[int, CodeMetrics] | None = None,
+    artifacts: Artifacts | None = None,
 ) -> RunRecord:
-    """The record of a finished run; pure. `staged` None: it ended before its workspace was made."""
+    """The record of a finished run; pure. `staged` None: it ended before its workspace was made. `code`: by submit."""
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns
@@ -118,9 +127,9 @@ def run_record(
             hidden_cases=settings.hidden_cases,
         ),
         timing=Timing(
-            started_at=utc_text(finished.created_at),
-            finished_at=utc_text(finished.finished_at),
-            wall_s=round(finished.finished_at - finished.created_at, 3),
+            start_time=utc_text(finished.created_at),
+            end_time=utc_text(finished.finished_at),
+            wall_time_seconds=round(finished.finished_at - finished.created_at, 3),
             agent_s=round(max(0.0, times.open_s - times.in_flight_s), 3),
             queue_s=round(finished.wall_s.get("queue", 0.0), 3),
             rollout_s=round(finished.wall_s.get("rollout", 0.0), 3),
@@ -129,7 +138,7 @@ def run_record(
             permit_s=round(times.permit_s, 3),
             finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
         ),
-        outcome=_outcome(finished),
+        outcome=_outcome(finished, code or {}),
         rejected_submits=tuple(
             RejectedSubmit(
                 status=cast(RejectedStatus, one.status),
@@ -140,12 +149,8 @@ def run_record(
             for one in rejected
             if one.status in get_args(RejectedStatus)
         ),
-        artifacts=Artifacts(
-            workspace="workspace" if staged else None,
-            checkpoints="checkpoints" if finished.submits else None,
-            agent_log="logs/agent.jsonl" if staged else None,
-            replays=recorded,
-        ),
+        artifacts=artifacts or Artifacts(),
+        replays=recorded,
         versions=_versions(finished, staged),
         audit=finished.audit,
     )
@@ -171,13 +176,20 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
     )
 
 
-def _outcome(finished: RunFinished) -> Outcome:
+def _outcome(finished: RunFinished, code: Mapping[int, CodeMetrics]) -> Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
     error = finished.error
     if finished.status == "cancelled" and error is None:
         error = "cancelled by the operator"
+    best = finished.best_submit_index if completed else None
     auxiliary: dict[str, Any] = {
+        "code_metrics_best": None if best is None else code.get(best),
+        "code_metrics_by_submit": {str(index): metrics for index, metrics in code.items()},
+        "code_metrics_trend": {
+            "submits": list(code),
+            **{name: [getattr(metrics, name) for metrics in code.values()] for name in TREND},
+        },
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,
         "nondeterministic_results": finished.nondeterministic_results,
@@ -185,9 +197,10 @@ def _outcome(finished: RunFinished) -> Outcome:
     return Outcome(
         status=finished.status,
         error=error,
-        final_score=finished.final_score if completed else None,
-        best_submit_index=finished.best_submit_index if completed else None,
-        val_scores={str(index): mean for index, mean in finished.val_scores.items()} if completed else {},
+        # As published: a run without an ok submit has the score 0.0.
+        final_score=finished.final_score if completed else 0.0 if finished.status == "no_ok_submit" else None,
+        best_submit_index=best,
+        val_scores={str(index): mean for index, mean in finished.val_scores.items()} if completed else None,
         heldout_mean_return=finished.final_score if completed else None,
         heldout_std_return=_std(heldout) if completed and heldout else None,
         heldout_returns=heldout if completed else (),
@@ -208,17 +221,21 @@ def _outcome(finished: RunFinished) -> Outcome:
 
 def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
     fingerprint = finished.fingerprint
+    hashes = {name: sha256_text(digest) for name, digest in finished.split_hashes.items()}
+    cases: dict[Split, str] = {split: hashes.get(split, "") for split in ("train", "validation", "heldout")}
     return Versions(
         harness=f"evopolicy {version('evopolicy')}",
         env=finished.env_version,
-        agents_md_hash=staged.agents_md_hash if staged else "",
-        data_train_hash=finished.split_hashes.get("train", ""),
-        data_valid_hash=finished.split_hashes.get("validation", ""),
-        data_heldout_hash=finished.split_hashes.get("heldout", ""),
+        agents_md_hash=sha256_text(staged.agents_md_file_hash) if staged else "",
+        data_train_hash=hashes.get("train.json", cases["train"]),
+        data_valid_hash=hashes.get("valid.json", cases["validation"]),
+        data_heldout_hash=hashes.get("heldout.json", cases["heldout"]),
+        rules_hash=sha256_text(staged.agents_md_hash) if staged else "",
+        cases_hashes=cases,
         fingerprint={} if fingerprint is None else fingerprint.flat(),
         fingerprint_overrides=finished.fingerprint_overrides,
         data_secret=finished.split_secret,
-        initial_policy_hash=staged.initial_policy_hash if staged else None,
+        initial_policy_hash=sha256_text(staged.initial_policy_hash) if staged else None,
         env_deterministic=finished.deterministic,
     )
 
@@ -241,30 +258,58 @@ async def _bundle(folder: RunFolder, digest: str, operations: Operations) -> Bun
 
 def _write_checkpoint(
     folder: RunFolder, finished: RunFinished, submit: SubmitRecord, bundle: Bundle | None
-) -> None:
+) -> CodeMetrics:
     """`checkpoints/submit_NNN/`: the policy as it was submitted, unchangeable, and its numbers."""
-    target = folder.checkpoints / submit_id(submit.submit_index, finished.episode_budget)
-    if target.exists():
-        shutil.rmtree(target)
-    target.mkdir(parents=True)
-    files = () if bundle is None else bundle.files
-    if bundle is not None:
-        bundles.unpack(bundle, target / "system")
-        for path in (target / "system").rglob("*"):
-            if path.is_file():
-                path.chmod(path.stat().st_mode & 0o555)
-    metrics = CheckpointMetrics(
+    requested = len(submit.env_instances)
+    charged = 0 if submit.status == CANCELLED else requested
+    meta = CheckpointMeta(
         submit_index=submit.submit_index,
-        status=submit.status,
-        digest=submit.bundle or "",
-        n_episodes=len(submit.env_instances),
-        consumed_budget=finished.episode_budget - submit.remaining_budget,
+        submit_time=utc_text(submit.started_at),
+        n_episodes_requested=requested,
+        remaining_budget_before=submit.remaining_budget + charged,
+        remaining_budget_after=submit.remaining_budget,
+        validation_status=submit.status,
         mean_return=submit.mean_return,
         val_mean=submit.val_mean,
-        policy_files=len(files),
-        policy_bytes=sum(len(file.data) for file in files),
     )
-    write_atomically(target / "metrics.json", encode_checkpoint_metrics(metrics))
+    return checkpoints.write(
+        folder.checkpoints / submit_id(submit.submit_index, finished.episode_budget), meta, bundle
+    )
+
+
+def _env_log(finished: RunFinished) -> bytes:
+    """JSON lines: what was played in which version of the environment, and what came of it."""
+    lines: list[dict[str, Any]] = [
+        {"event": "environment", "env": finished.settings.env, "version": finished.env_version}
+    ]
+    for submit in finished.submits:
+        lines.append(
+            {
+                "event": "train",
+                "submit_index": submit.submit_index,
+                "started_at": utc_text(submit.started_at),
+                "completed_at": utc_text(submit.completed_at),
+                "env_instances": submit.env_instances,
+                "status": submit.status,
+                "mean_return": submit.mean_return,
+            }
+        )
+    for index, mean in finished.val_scores.items():
+        lines.append({"event": "validation", "submit_index": index, "mean_return": mean})
+    for index, why in finished.validation_ineligible.items():
+        lines.append({"event": "not_eligible", "submit_index": index, "reason": why})
+    if finished.heldout_returns:
+        lines.append(
+            {
+                "event": "heldout",
+                "submit_index": finished.best_submit_index,
+                "returns": finished.heldout_returns,
+            }
+        )
+    if finished.random_heldout_returns:
+        lines.append({"event": "random_reference", "returns": finished.random_heldout_returns})
+    lines.append({"event": "finished", "at": utc_text(finished.finished_at), "status": finished.status})
+    return b"".join(msgspec.json.encode(line) + b"\n" for line in lines)
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
@@ -284,16 +329,20 @@ def _write_record(
     finished: RunFinished,
     times: Times,
     recorded: tuple[Replay, ...],
+    code: Mapping[int, CodeMetrics],
 ) -> RunRecord:
     staged = None
     if folder.staged.exists():
         staged = msgspec.json.decode(folder.staged.read_bytes(), type=Staged)
+        # The agent's log is there also where nothing was said.
+        folder.agent_log.touch()
+    write_atomically(folder.env_log, _env_log(finished))
     rejected: list[Rejected] = []
     if folder.journal.exists():
         journal = Journal(folder.journal)
         rejected = [entry for entry in journal.entries if isinstance(entry, Rejected)]
         journal.close()
-    done = run_record(plan, finished, staged, rejected, times, recorded)
+    done = run_record(plan, finished, staged, rejected, times, recorded, code, folder.artifacts())
     write_atomically(folder.run_json, encode_run_record(done))
     remove_tree(folder.state)
     return done

@@ -34,9 +34,11 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
     folder.feedback.mkdir(exist_ok=True)
     policy = initial_policy(run.env.action_space).encode()
     write_atomically(folder.system / "policy.py", policy)
-    write_atomically(folder.agents_md, agents_md(run, urls).encode(), mode=0o444)
+    rules = agents_md(run, urls).encode()
+    write_atomically(folder.agents_md, rules, mode=0o444)
     staged = Staged(
         agents_md_hash=digest_of(agents_md(run, NO_URLS).encode()),
+        agents_md_file_hash=digest_of(rules),
         initial_policy_hash=digest_of(policy),
         n_train=run.n_env_instances,
         min_episodes_per_submit=run.min_episodes_per_submit,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import os
 import stat
+from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -50,13 +51,13 @@ class Bundle(msgspec.Struct, frozen=True):
 _files_decoder = msgspec.msgpack.Decoder(tuple[BundleFile, ...])
 
 
-def snapshot(folder: Path) -> Bundle:
-    """The bundle of `folder` as it is now.
+def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
+    """The bundle of `folder` as it is now, without its entries of these names.
 
     Raises BundleError naming the path, the value and the limit for links, devices, sockets, names that cannot travel,
     and what is over a limit. Nothing outside `folder` is read, whatever is changed in it meanwhile.
     """
-    reader = _Reader()
+    reader = _Reader(leave_out)
     try:
         root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError as error:
@@ -104,8 +105,9 @@ def unpack(bundle: Bundle, folder: Path) -> None:
 class _Reader:
     """Reads a folder tree under the limits."""
 
-    def __init__(self) -> None:
+    def __init__(self, leave_out: Collection[str]) -> None:
         self.files: list[BundleFile] = []
+        self._leave_out = leave_out
         self._left = MAX_BYTES
         self._entries_left = MAX_ENTRIES
 
@@ -119,6 +121,8 @@ class _Reader:
             raise BundleError(f"system/ holds more than {MAX_ENTRIES} files and folders; remove some")
         for name in names:
             path = base / name
+            if name in self._leave_out and not base.parts:
+                continue
             _check_path(_text(path))
             mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
             if stat.S_ISDIR(mode):

@@ -1,7 +1,8 @@
 """Where two run directories differ, leaving out the published list of what may: `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
 
 What is left must be equal byte for byte, JSON files up to the excluded fields: the same agent on the same cases comes to
-the same run whatever the number of workers, their order, and the failures on the way.
+the same run whatever the number of workers, their order, and the failures on the way. A run that an earlier version wrote is
+compared with one of this version up to `OLD_FILES` and `OLD_FIELDS`, which only one of the two tells.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import filecmp
 import fnmatch
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.run_record import upgraded
 
 EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",
@@ -37,10 +40,25 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "submit_completed_at": "a time",
         "wall_time_seconds": "a time",
     },
+    "_meta.json": {"submit_time": "a time"},
     "errors.txt": {"timestamp": "a time"},
     "error.txt": {"timestamp": "a time"},
 }
 """Fields that are not compared, by the name of their file, and why. The text files hold JSON lines."""
+
+OLD_FILES = ("checkpoints/*/_meta.json", "checkpoints/*/metrics.json")
+OLD_FIELDS = {
+    "run.json": (
+        *("outcome.auxiliary.code_metrics_best", "outcome.auxiliary.code_metrics_by_submit"),
+        *("outcome.auxiliary.code_metrics_trend", "artifacts", "versions"),
+    ),
+    "summary.json": ("schema_version", "env_instances", "first_global_episode"),
+    "errors.txt": ("schema_version",),
+    "error.txt": ("schema_version",),
+}
+"""What earlier versions wrote otherwise or not at all."""
+
+_OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
 
 MAX_PARSED_BYTES = 64 << 20
 """A file above this is an agent's, whatever its name, and compared as it is."""
@@ -57,31 +75,49 @@ def left_out() -> list[str]:
 
 def differences(left: Path, right: Path) -> list[str]:
     """One line for each file or field in which two run directories differ; empty when they are the same run."""
-    ours, theirs = _files(left), _files(right)
+    old = _is_old(left) != _is_old(right)
+    ours, theirs = _files(left, old), _files(right, old)
     found = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
     found += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
     for name in sorted(ours.keys() & theirs.keys()):
-        found += _file_differences(name, ours[name], theirs[name])
+        found += _file_differences(name, ours[name], theirs[name], old)
     return found
 
 
-def _files(root: Path) -> dict[str, Path]:
-    """Regular files by their path in the run, those that are excluded aside."""
+def _is_old(root: Path) -> bool:
+    """Whether an earlier version wrote the run."""
+    try:
+        told = json.loads((root / "run.json").read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(told, dict) and told.get("schema_version") == 1
+
+
+def _files(root: Path, old: bool) -> dict[str, Path]:
+    """Regular files by their path in the run, those that are excluded aside. `old`: one of the two runs is old."""
     paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
+    if old and _is_old(root):
+        paths = {_OLD_SYSTEM.sub(r"\1", name): path for name, path in paths.items()}
+    excluded = (*EXCLUDED_FILES, *(OLD_FILES if old else ()))
     return {
         name: path
         for name, path in paths.items()
-        if not any(fnmatch.fnmatchcase(name, pattern) for pattern in EXCLUDED_FILES)
+        if not any(fnmatch.fnmatchcase(name, pattern) for pattern in excluded)
     }
 
 
-def _file_differences(name: str, left: Path, right: Path) -> list[str]:
+def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str]:
     sizes = [path.stat().st_size for path in (left, right)]
     if min(sizes) > MAX_COMPARED_BYTES:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes, too many to compare"]
     if filecmp.cmp(left, right, shallow=False):
         return []
-    excluded = EXCLUDED_FIELDS.get(name.rpartition("/")[2])
+    file = name.rpartition("/")[2]
+    excluded = (
+        None
+        if file not in EXCLUDED_FIELDS
+        else (*EXCLUDED_FIELDS[file], *(OLD_FIELDS.get(file, ()) if old else ()))
+    )
     if excluded is None or max(sizes) > MAX_PARSED_BYTES:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
     try:
@@ -92,7 +128,7 @@ def _file_differences(name: str, left: Path, right: Path) -> list[str]:
             if not any(path == each or path.startswith(f"{each}.") for each in excluded)
             and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
         ]
-    except ValueError as error:
+    except (ValueError, TypeError, AttributeError) as error:
         return [f"{name}: cannot be read: {error}"]
     except RecursionError:
         return [
@@ -103,7 +139,9 @@ def _file_differences(name: str, left: Path, right: Path) -> list[str]:
 def _parse(name: str, data: bytes) -> Any:
     if name.endswith(".txt"):
         return dict(enumerate(map(json.loads, data.splitlines())))
-    return json.loads(data)
+    told = json.loads(data)
+    is_old = name == "run.json" and isinstance(told, dict) and told.get("schema_version") == 1
+    return upgraded(told) if is_old else told
 
 
 def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any, Any]]:

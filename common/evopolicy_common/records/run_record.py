@@ -1,9 +1,10 @@
-"""`run.json` and `checkpoints/submit_NNN/metrics.json`: what a run leaves behind, typed.
+"""`run.json`: what a run leaves behind, typed.
 
-The run's finaliser writes them, reports and `verify` read them. `run.json` is written once, last, after the agent and
-its children are gone: it holds hidden scores. Reading skips unknown fields and a field added later has a default; a
-file whose `schema_version` is higher than ours is refused. Paths are relative to the run directory. Instants are UTC
-texts as `summary.utc_text` writes them; durations are seconds and end in `_s`.
+The run's finaliser writes it, reports and `verify` read it. It is written once, last, after the agent and its children are
+gone: it holds hidden scores. It has the published fields in their published meaning, and more. Reading skips unknown
+fields and a field added later has a default; a file whose `record_version` is higher than ours is refused. Files of version
+1, whose `schema_version` is the number 1, are read as if they were of this version. Paths are relative to the run directory.
+Instants are UTC texts as `summary.utc_text` writes them; durations are seconds.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, SubmitStatus, VideoOption
+from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
-SCHEMA_VERSION = 1
-"""Raised only when an older reader would misunderstand a file; fields may be added without it."""
+RECORD_VERSION = 2
+"""Of the fields that are ours. Raised only when an older reader would misunderstand a file; fields may be added without it."""
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
@@ -90,11 +92,11 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the wall time went. The phases need not add up to `wall_s`."""
+    """Where the wall time went. The phases need not add up to `wall_time_seconds`."""
 
-    started_at: str
-    finished_at: str
-    wall_s: float
+    start_time: str
+    end_time: str
+    wall_time_seconds: float
     """From the run's opening to `run.json`."""
     agent_s: float = 0.0
     """Agent alone: no submit of it in flight."""
@@ -137,16 +139,17 @@ class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run came to. Every score is None unless `status` is `completed`."""
+    """What the run came to. Every score is None unless `status` is `completed`, but for `final_score`."""
 
     status: RunStatus
     error: str | None = None
     """Why the status is `error` or `cancelled`, for the operator."""
     final_score: float | None = None
-    """The held-out mean return: the run's number in the paper's table."""
+    """The held-out mean return: the run's number in the paper's table. As published, 0.0 for `no_ok_submit`, where it means
+    nothing; see `score`."""
     best_submit_index: int | None = None
     """The selected checkpoint's submit."""
-    val_scores: dict[str, float] = {}
+    val_scores: dict[str, float] | None = None
     """Submit index (decimal text) to mean return on validation, for every eligible `ok` checkpoint."""
     heldout_mean_return: float | None = None
     heldout_std_return: float | None = None
@@ -162,7 +165,12 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}
-    """What an environment reports beside the return, such as means of reward components."""
+    """`code_metrics_best`, `code_metrics_by_submit` and `code_metrics_trend` as published, and counts of ours."""
+
+    @property
+    def score(self) -> float | None:
+        """The held-out mean return; None unless the run completed."""
+        return self.final_score if self.status == "completed" else None
 
     @property
     def agent_never_played(self) -> bool:
@@ -201,28 +209,35 @@ class Replay(msgspec.Struct, frozen=True, kw_only=True):
     """A PNG with a few of its frames side by side; None when there is none."""
 
 
-class Artifacts(msgspec.Struct, frozen=True, kw_only=True):
-    """Where things are, relative to the run directory; None for what this run does not have."""
+class Artifacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Where things are, relative to the run directory; what this run does not have is left out (None)."""
 
-    workspace: str | None = "workspace"
-    checkpoints: str | None = "checkpoints"
-    harness_log: str | None = "logs/harness.log"
-    agent_log: str | None = "logs/agent.jsonl"
-    replays: tuple[Replay, ...] = ()
+    workspace: str | None = None
+    feedback: str | None = None
+    checkpoints: str | None = None
+    logs_harness: str | None = None
+    logs_agent: str | None = None
+    logs_env: str | None = None
 
 
 class Versions(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run was made with. Hashes are SHA-256, lowercase hex."""
+    """What the run was made with. Hashes are `sha256:` and lowercase hex; empty where unknown."""
 
     harness: str
     """Version of this software."""
     env: str
     """Name and version of what was played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
     agents_md_hash: str
+    """Of `AGENTS.md` as it was put into the workspace, with this run's URLs."""
     data_train_hash: str
+    """Of the bytes of `train.json`; where cases come from no file, of the cases as canonical JSON."""
     data_valid_hash: str
     data_heldout_hash: str
-    fingerprint: dict[str, str]
+    rules_hash: str = ""
+    """Of `AGENTS.md` with placeholders for its URLs: equal for runs with equal rules."""
+    cases_hashes: dict[Split, str] = {}
+    """Of the cases that the run had, as canonical JSON, by split."""
+    fingerprint: dict[str, str] = {}
     """Library to version, as the workers that it began with reported."""
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let it go on with workers of other versions; empty where one class
@@ -234,11 +249,21 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     env_deterministic: bool = True
     """False when the environment does not repeat an episode from its seed and actions."""
 
+    def cases_hash(self, split: Split) -> str:
+        """What tells apart the cases of a split: `cases_hashes`, or the file's where that is all there is."""
+        files: dict[Split, str] = {
+            "train": self.data_train_hash,
+            "validation": self.data_valid_hash,
+            "heldout": self.data_heldout_hash,
+        }
+        return self.cases_hashes.get(split, files[split])
+
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The whole of `run.json`."""
 
-    schema_version: int = SCHEMA_VERSION
+    schema_version: str = PUBLISHED_SCHEMA
+    record_version: int = RECORD_VERSION
     protocol_version: str = PROTOCOL_VERSION
     model: str
     env: str
@@ -262,33 +287,21 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     outcome: Outcome
     rejected_submits: tuple[RejectedSubmit, ...] = ()
     artifacts: Artifacts = Artifacts()
+    replays: tuple[Replay, ...] = ()
     versions: Versions
     audit: AuditRecord | None = None
     """What was played again on other workers; None where nothing was."""
 
 
-class CheckpointMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """`checkpoints/submit_NNN/metrics.json`; the policy itself is beside it in `system/`."""
+class _Header(msgspec.Struct, frozen=True, kw_only=True):
+    """What tells who has written a `run.json`, and when."""
 
-    schema_version: int = SCHEMA_VERSION
-    submit_index: int
-    status: SubmitStatus
-    digest: str
-    """Of the bundle."""
-    n_episodes: int
-    consumed_budget: int
-    """Episodes charged up to and with this submit."""
-    mean_return: float | None = None
-    """Visible train mean; None when not ok."""
-    val_mean: float | None = None
-    """Hidden validation mean; None before finalisation or when not ok."""
-    policy_files: int = 0
-    policy_bytes: int = 0
-    """Files of the bundle and their sizes added up, bytes."""
+    schema_version: int | str
+    record_version: int | None = None
 
 
+_headers = msgspec.json.Decoder(_Header)
 _runs = msgspec.json.Decoder(RunRecord)
-_metrics = msgspec.json.Decoder(CheckpointMetrics)
 
 
 def encode_run_record(record: RunRecord) -> bytes:
@@ -297,32 +310,65 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 
 def decode_run_record(data: bytes) -> RunRecord:
-    """The record in `data`; ProtocolError when it is none that this version reads."""
+    """The record in `data`; ProtocolError when it is none that this version reads, such as the published software's."""
     try:
-        record = _runs.decode(data)
-    except DECODE_ERRORS as error:
+        header = _headers.decode(data)
+        if header.schema_version == 1:
+            return msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord)
+        if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
+            return _runs.decode(data)
+    except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
         raise ProtocolError(f"not a run record: {error}") from error
-    _refuse_newer("run.json", record.schema_version)
-    return record
-
-
-def encode_checkpoint_metrics(metrics: CheckpointMetrics) -> bytes:
-    """The bytes of `metrics.json`."""
-    return msgspec.json.format(msgspec.json.encode(metrics), indent=2) + b"\n"
-
-
-def decode_checkpoint_metrics(data: bytes) -> CheckpointMetrics:
-    """The metrics in `data`; ProtocolError when they are none that this version reads."""
-    try:
-        metrics = _metrics.decode(data)
-    except DECODE_ERRORS as error:
-        raise ProtocolError(f"not a checkpoint's metrics: {error}") from error
-    _refuse_newer("metrics.json", metrics.schema_version)
-    return metrics
-
-
-def _refuse_newer(name: str, version: int) -> None:
-    if version > SCHEMA_VERSION:
+    if header.schema_version == PUBLISHED_SCHEMA and header.record_version is None:
         raise ProtocolError(
-            f"{name} has schema_version {version}, this version reads up to {SCHEMA_VERSION}: update evopolicy"
+            "run.json was written by the published software, not by evopolicy: only `evopolicy report` reads it"
         )
+    raise ProtocolError(
+        f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
+        f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: update evopolicy"
+    )
+
+
+def sha256_text(digest: str) -> str:
+    """A hash as `versions` tells it, of its hex digits; empty for an unknown one."""
+    return f"sha256:{digest}" if digest else ""
+
+
+def upgraded(old: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a `run.json` of version 1 as this version has them. AttributeError, TypeError or ValueError where it is none."""
+    timing, artifacts, versions = (dict(old.get(name) or {}) for name in ("timing", "artifacts", "versions"))
+    outcome = dict(old.get("outcome") or {})
+    if outcome.get("status") == "no_ok_submit":
+        outcome["final_score"] = 0.0
+    if not outcome.get("val_scores"):
+        outcome["val_scores"] = None
+    data = {split: sha256_text(str(versions.get(f"data_{name}_hash", ""))) for split, name in _DATA.items()}
+    initial = versions.get("initial_policy_hash")
+    places = {
+        "workspace": artifacts.get("workspace"),
+        "feedback": artifacts.get("workspace") and f"{artifacts['workspace']}/feedback",
+        "checkpoints": artifacts.get("checkpoints"),
+        "logs_harness": artifacts.get("harness_log"),
+        "logs_agent": artifacts.get("agent_log"),
+    }
+    return {
+        **old,
+        "schema_version": PUBLISHED_SCHEMA,
+        "record_version": RECORD_VERSION,
+        "timing": {_TIMING.get(name, name): value for name, value in timing.items()},
+        "outcome": outcome,
+        "artifacts": {name: place for name, place in places.items() if place is not None},
+        "replays": artifacts.get("replays", []),
+        "versions": {
+            **versions,
+            "agents_md_hash": "",
+            "rules_hash": sha256_text(str(versions.get("agents_md_hash", ""))),
+            **{f"data_{name}_hash": data[split] for split, name in _DATA.items()},
+            "cases_hashes": data,
+            "initial_policy_hash": None if initial is None else sha256_text(str(initial)),
+        },
+    }
+
+
+_TIMING = {"started_at": "start_time", "finished_at": "end_time", "wall_s": "wall_time_seconds"}
+_DATA: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}

@@ -2,7 +2,8 @@
 
 The gateway writes it last in a submit's folder and answers `POST /submit` with the same bytes; the analysis reads it.
 Nothing in it is hidden: no seed, no hidden score. A submit that is not `ok` has every array and aggregate null, while
-`n_episodes` and `remaining_budget` still tell what was charged.
+`env_instances`, `n_episodes` and `remaining_budget` still tell what was asked for and charged. Earlier versions wrote
+`schema_version` 1, and null for `env_instances` in its place; their summaries are read too.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.gateway import SubmitStatus
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
-SCHEMA_VERSION = 1
-"""Raised only when an older reader would misunderstand a file; fields may be added without it."""
+SCHEMA_VERSION = PUBLISHED_SCHEMA
+_READ = (SCHEMA_VERSION, 1)
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One submit's summary. Fields with defaults may be left out."""
 
-    schema_version: int
+    schema_version: str | int
     submit_index: int
     """Counts accepted submits from 0."""
     env: str
@@ -29,10 +31,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     status: SubmitStatus
     n_episodes: int
     """Episodes charged; 0 when `cancelled`."""
-    first_global_episode: int
-    """Number of its first episode, counting attempted episodes through the run from 0."""
+    first_global_episode: int | None
+    """Number of its first episode, counting attempted episodes through the run from 0; null when not ok."""
     env_instances: tuple[int, ...] | None
-    """Train ids in request order, repeats kept; null when not ok."""
+    """Train ids in request order, repeats kept."""
     remaining_budget: int
     """Episodes left after this submit."""
     submit_started_at: str
@@ -72,9 +74,9 @@ def decode_summary(data: bytes) -> Summary:
         summary = _decoder.decode(data)
     except DECODE_ERRORS as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
-    if summary.schema_version > SCHEMA_VERSION:
+    if summary.schema_version not in _READ:
         raise ProtocolError(
-            f"summary has schema_version {summary.schema_version}, this version reads up to {SCHEMA_VERSION}"
+            f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: update evopolicy"
         )
     return summary
 

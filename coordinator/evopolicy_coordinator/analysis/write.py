@@ -210,7 +210,7 @@ def _copy(path: Path, target: Path) -> bool:
 def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
     by_env: dict[str, list[PlayedEpisode]] = {}
     for run in study.runs:
-        for number, replay in enumerate(run.record.artifacts.replays):
+        for number, replay in enumerate(run.record.replays):
             stem = f"media/{slug(run)}-{number:03d}"
             video = _copied(run, replay.path, out / "replays", stem)
             strip = _copied(run, replay.filmstrip, out / "replays", stem) if replay.filmstrip else None

@@ -26,19 +26,15 @@ from evopolicy_common.messages.operator import (
     Evaluate,
     PlayedAs,
 )
-from evopolicy_common.records import bundles
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.checkpoints import bundle_of
 from evopolicy_common.records.trajectory import Trajectory, decode
 from evopolicy_common.wire.operator_client import PATIENCE_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.verify import compare as verify_compare
 from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
 
-_HASHES: dict[Split, str] = {
-    "train": "data_train_hash",
-    "validation": "data_valid_hash",
-    "heldout": "data_heldout_hash",
-}
+_SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 
 Tell = Callable[[int, str], None]
 """Is told each time how many episodes have come, and what the cluster waits for (empty: nothing)."""
@@ -108,8 +104,9 @@ class Verifier:
         """Whether the coordinator still knows the run. ConfigError when its cases are not the run's."""
         state = await self._describe()
         versions = self._run.record.versions
-        for split, field in _HASHES.items():
-            ours, theirs = getattr(versions, field), state.split_hashes.get(split, "")
+        for split in _SPLITS:
+            ours = versions.cases_hash(split).removeprefix("sha256:")
+            theirs = state.split_hashes.get(split, "")
             if ours and ours != theirs:
                 raise ConfigError(
                     f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
@@ -161,12 +158,12 @@ class Verifier:
             return
         assert played.checkpoint is not None
         try:
-            bundle = bundles.snapshot(played.checkpoint / "system")
+            bundle = bundle_of(played.checkpoint)
         except BundleError as error:
             self.report.differs(name, f"its checkpoint cannot be read: {error}")
             return
         if bundle.digest != played.digest:
-            self.report.differs(name, "its checkpoint does not hold the policy that metrics.json names")
+            self.report.differs(name, "its checkpoint does not hold the policy that _meta.json names")
             return
         await self._ask.upload(bundle.digest, bundle.packed)
         message = self._evaluate(played, indexes, "full", bundle=bundle.digest)

@@ -14,12 +14,8 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.records.run_record import (
-    CheckpointMetrics,
-    RunRecord,
-    decode_checkpoint_metrics,
-    decode_run_record,
-)
+from evopolicy_common.records.checkpoints import CheckpointMeta, read_meta
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 
 RANDOM = -1
@@ -47,7 +43,7 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
     checkpoint: Path | None = None
     """`checkpoints/submit_NNN` of the policy; None for the random reference."""
     digest: str = ""
-    """Of the policy's bundle, as `metrics.json` has it."""
+    """Of the policy's bundle, as the checkpoint tells it."""
 
     def name(self, index: int) -> str:
         """How an episode is called in what is told of it."""
@@ -97,12 +93,12 @@ def read_run(root: Path) -> RunUnderTest:
 def _train(root: Path, record: RunRecord, folder: Path) -> Played | None:
     """An ok submit; None for any other."""
     summary = _summary(folder)
-    if summary is None or summary.env_instances is None:
+    if summary is None or summary.env_instances is None or summary.first_global_episode is None:
         return None
     width = max(3, len(str(record.experiment_dimensions.episode_budget)))
     first = summary.first_global_episode
     checkpoint = root / "checkpoints" / folder.name
-    metrics = _metrics(checkpoint)
+    meta = _meta(checkpoint, record.experiment_dimensions.episode_budget)
     return Played(
         split="train",
         submit_index=summary.submit_index,
@@ -116,7 +112,7 @@ def _train(root: Path, record: RunRecord, folder: Path) -> Played | None:
             for index in range(len(summary.env_instances))
         ),
         checkpoint=checkpoint,
-        digest="" if metrics is None else metrics.digest,
+        digest="" if meta is None else meta.bundle,
     )
 
 
@@ -137,7 +133,7 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
             )
         )
 
-    for text, mean in outcome.val_scores.items():
+    for text, mean in (outcome.val_scores or {}).items():
         index = int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else -1
         if (own := train.get(index)) is not None:
             add("validation", own, dimensions.n_validation, None, mean)
@@ -172,13 +168,11 @@ def _summary(folder: Path) -> Summary | None:
         raise ConfigError(f"{path} cannot be read: {error}") from error
 
 
-def _metrics(checkpoint: Path) -> CheckpointMetrics | None:
+def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
     try:
-        return decode_checkpoint_metrics((checkpoint / "metrics.json").read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ProtocolError) as error:
-        raise ConfigError(f"{checkpoint}/metrics.json cannot be read: {error}") from error
+        return read_meta(checkpoint, episode_budget)
+    except ProtocolError as error:
+        raise ConfigError(f"{checkpoint} is damaged: {error}") from error
 
 
 def sample(lists: list[Played], n: int | None, seed: int) -> list[tuple[Played, tuple[int, ...]]]:

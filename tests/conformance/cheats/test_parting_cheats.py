@@ -11,6 +11,7 @@ import pytest
 from cheated import PATIENCE_S, Cheated
 
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.checkpoints import METADATA
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_record import decode_run_record
 
@@ -36,7 +37,9 @@ def test_traps_that_an_agent_leaves_catch_nobody(
     workspace = folder / "workspace"
     assert stat.S_IMODE(workspace.stat().st_mode) & 0o700 == 0o700
     submitted = {
-        path.name: path.read_bytes() for path in (folder / "checkpoints/submit_000/system").iterdir()
+        path.name: path.read_bytes()
+        for path in (folder / "checkpoints/submit_000").iterdir()
+        if path.name not in METADATA
     }
     assert {path.name: path.read_bytes() for path in (workspace / "system").iterdir()} == submitted
     assert set(submitted) == {"policy.py", ".bashrc"}

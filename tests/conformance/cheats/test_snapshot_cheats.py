@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from cheated import SECRET, Cheated
 
+from evopolicy_common.records.checkpoints import METADATA
 from evopolicy_common.records.run_record import decode_run_record
 
 AGENT = Path(__file__).parent / "swapping_agent.py"
@@ -41,9 +42,13 @@ def swapped(request: pytest.FixtureRequest, cheated: Cheated) -> Swapped:
 
 
 def test_no_submit_holds_what_its_agent_has_not_written(swapped: Swapped) -> None:
-    first = swapped.folder / "checkpoints" / "submit_000" / "system" / "policy.py"
+    first = swapped.folder / "checkpoints" / "submit_000" / "policy.py"
     written = {first.read_bytes(), b"# mine\n"}
-    taken = [path for path in (swapped.folder / "checkpoints").glob("*/system/**/*") if not path.is_dir()]
+    taken = [
+        path
+        for path in (swapped.folder / "checkpoints").glob("*/**/*")
+        if not path.is_dir() and path.name not in METADATA
+    ]
     assert {path.read_bytes() for path in taken} == written
     assert not any(path.is_symlink() for path in taken)
     for path in (swapped.folder / "workspace" / "feedback").rglob("*"):

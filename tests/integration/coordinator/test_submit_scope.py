@@ -73,7 +73,7 @@ class Played:
 
     def told(self, scope: str) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(
-            (self.runs[scope] / "checkpoints/submit_000/system/told.json").read_text()
+            (self.runs[scope] / "checkpoints/submit_000/told.json").read_text()
         )
         return found
 

@@ -12,7 +12,7 @@ from commands import SMALL, agent, command, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.processes import scratch
-from evopolicy_common.records.run_record import decode_checkpoint_metrics
+from evopolicy_common.records.checkpoints import read_meta
 from evopolicy_common.records.summary import decode_summary
 
 
@@ -37,11 +37,11 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert record.versions.fingerprint["numpy"]
     assert sorted(path.name for path in folder.iterdir()) == ["checkpoints", "logs", "run.json", "workspace"]
     best = folder / "checkpoints" / f"submit_{record.outcome.best_submit_index:03d}"
-    assert (best / "system" / "policy.py").read_bytes() == (
-        folder / "workspace/system/policy.py"
-    ).read_bytes()
-    metrics = decode_checkpoint_metrics((best / "metrics.json").read_bytes())
-    assert metrics.val_mean == record.outcome.val_scores[str(record.outcome.best_submit_index)]
+    assert (best / "policy.py").read_bytes() == (folder / "workspace/system/policy.py").read_bytes()
+    meta = read_meta(best, 6)
+    assert meta is not None
+    assert record.outcome.val_scores is not None
+    assert meta.val_mean == record.outcome.val_scores[str(record.outcome.best_submit_index)]
     summary = decode_summary((folder / "workspace/feedback/submit_000/summary.json").read_bytes())
     assert summary.env == "toy/line"
     assert "submit_000 ok" in err

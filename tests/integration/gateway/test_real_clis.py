@@ -153,5 +153,5 @@ def test_the_real_cli_plays_a_whole_run_in_its_jail_and_is_resumed_there(
     record = record_in(run_dir(tmp_path))
     assert (record.jail, record.outcome.budget_used, record.agent.retries) == ("bwrap", 4, 1)
     assert "first" in str(api.requests[-1])
-    policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "system" / "policy.py"
+    policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "policy.py"
     assert policy.read_text().count("# better") == 2

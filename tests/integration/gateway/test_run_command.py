@@ -186,7 +186,7 @@ def test_replay_submits_the_given_policies_in_order_with_even_shares(
     assert exit_code == 0, err
     folder = run_dir(tmp_path)
     assert folder.parts[-3] == "replay-given"
-    sources = [(folder / f"checkpoints/submit_00{i}/system/policy.py").read_text() for i in range(2)]
+    sources = [(folder / f"checkpoints/submit_00{i}/policy.py").read_text() for i in range(2)]
     assert "-0.5" in sources[0]
     assert "-0.5" not in sources[1]
     summaries = [

@@ -140,7 +140,7 @@ def n_frames(path: Path) -> int:
 def test_recordings_are_in_the_run_directory_and_run_json_names_them(runs: Path, env: str) -> None:
     folder = run_dir(runs, "filmed", env)
     record = record_in(folder)
-    replays = record.artifacts.replays
+    replays = record.replays
     assert [replay.path for replay in replays] == [
         "replays/heldout_000/video.mp4",
         "replays/heldout_001/video.mp4",
@@ -159,7 +159,7 @@ def test_recording_changes_no_score_and_no_byte_of_the_run(runs: Path, env: str)
     assert not (plain / "replays").exists()
     found = differences(plain, filmed)
     # Names of the two entries, and random actions, which are every run's own.
-    own = ("model", "agent.entry", "artifacts.replays", "outcome.random_reference")
+    own = ("model", "agent.entry", "replays", "outcome.random_reference")
     left = [
         line
         for line in found
@@ -180,8 +180,8 @@ def test_feedback_has_videos_of_the_first_episode_or_of_all(runs: Path) -> None:
 
 def test_held_out_recordings_follow_the_feedbacks_option_unless_they_have_their_own(runs: Path) -> None:
     shown = record_in(run_dir(runs, "shown", "toy/line"))
-    assert [replay.episode for replay in shown.artifacts.replays] == [0]
-    assert record_in(run_dir(runs, "shown all", "toy/line")).artifacts.replays == ()
+    assert [replay.episode for replay in shown.replays] == [0]
+    assert record_in(run_dir(runs, "shown all", "toy/line")).replays == ()
 
 
 def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Path, tmp_path: Path) -> None:

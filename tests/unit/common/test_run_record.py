@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import msgspec
 import pytest
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records.checkpoints import read_meta
 from evopolicy_common.records.run_record import (
     Agent,
     ExperimentDimensions,
@@ -15,11 +17,10 @@ from evopolicy_common.records.run_record import (
     RunRecord,
     Timing,
     Versions,
-    decode_checkpoint_metrics,
     decode_run_record,
     encode_run_record,
 )
-from evopolicy_common.records.summary import Summary, decode_summary, utc_text
+from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, decode_summary, utc_text
 
 FIELDS = [
     "schema_version",
@@ -45,13 +46,13 @@ FIELDS = [
 ]
 
 NOT_OK = Summary(
-    schema_version=1,
+    schema_version=SCHEMA_VERSION,
     submit_index=3,
     env="toy/line",
     status="import_error",
     n_episodes=4,
-    first_global_episode=9,
-    env_instances=None,
+    first_global_episode=None,
+    env_instances=(2, 2, 0, 1),
     remaining_budget=100,
     submit_started_at=utc_text(0.0),
     submit_completed_at=utc_text(1.25),
@@ -84,7 +85,7 @@ RECORD = RunRecord(
         n_validation=2,
         n_heldout=2,
     ),
-    timing=Timing(started_at=utc_text(0.0), finished_at=utc_text(9.0), wall_s=9.0),
+    timing=Timing(start_time=utc_text(0.0), end_time=utc_text(9.0), wall_time_seconds=9.0),
     outcome=Outcome(status="completed", final_score=1.5, best_submit_index=0, val_scores={"0": 1.0}),
     versions=Versions(
         harness="0.1.0",
@@ -102,7 +103,8 @@ def test_summary_has_its_fields_in_order_and_nulls_when_not_ok() -> None:
     found = msgspec.to_builtins(NOT_OK)
     assert list(found) == FIELDS
     assert found["returns"] is None
-    assert found["env_instances"] is None
+    assert found["first_global_episode"] is None
+    assert tuple(found["env_instances"]) == (2, 2, 0, 1)
     assert found["submit_completed_at"] == "1970-01-01T00:00:01.250000Z"
     assert decode_summary(msgspec.json.encode(NOT_OK)) == NOT_OK
 
@@ -125,14 +127,23 @@ def test_run_record_survives_a_round_trip_and_skips_unknown_fields() -> None:
     assert decode_run_record(json.dumps(more).encode()) == RECORD
 
 
-def test_file_of_a_newer_schema_is_refused_by_name() -> None:
-    newer = json.loads(encode_run_record(RECORD)) | {"schema_version": 2}
-    with pytest.raises(ProtocolError, match=r"run\.json has schema_version 2"):
-        decode_run_record(json.dumps(newer).encode())
+def test_file_of_a_newer_version_is_refused_by_name() -> None:
+    told = json.loads(encode_run_record(RECORD))
+    for newer in ({"schema_version": 2}, {"schema_version": "0.2"}, {"record_version": 3}):
+        with pytest.raises(ProtocolError, match=r"run\.json has schema_version .*update evopolicy"):
+            decode_run_record(json.dumps(told | newer).encode())
+    with pytest.raises(ProtocolError, match="schema_version 2"):
+        decode_summary(json.dumps(json.loads(msgspec.json.encode(NOT_OK)) | {"schema_version": 2}).encode())
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"{}", b"\xff", b"[" * 100_000, b'{"submit_index": "one"}'])
-def test_bytes_that_are_no_record_are_refused(data: bytes) -> None:
-    for decode in (decode_run_record, decode_summary, decode_checkpoint_metrics):
+def test_bytes_that_are_no_record_are_refused(tmp_path: Path, data: bytes) -> None:
+    for decode in (decode_run_record, decode_summary):
         with pytest.raises(ProtocolError, match="not a"):
             decode(data)
+    for name in ("_meta.json", "metrics.json"):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_bytes(data)
+        with pytest.raises(ProtocolError, match="not a"):
+            read_meta(folder, 8)

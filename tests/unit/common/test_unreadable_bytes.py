@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records.bundles import BundleFile, digest_of, load, pack
-from evopolicy_common.records.run_record import decode_checkpoint_metrics, decode_run_record
+from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.records.summary import decode_summary
 from evopolicy_common.wire import codec
 
 NO_TEXT = b"\xd6 "
 
 
-@pytest.mark.parametrize("decode", [decode_run_record, decode_checkpoint_metrics, decode_summary])
+@pytest.mark.parametrize("decode", [decode_run_record, decode_summary])
 @pytest.mark.parametrize("where", ['{"status": "%"}', '{"%": 1}', '{"env": "%"}', "%"])
 def test_file_with_a_text_that_is_none_is_refused(decode: Callable[[bytes], Any], where: str) -> None:
     with pytest.raises(ProtocolError):

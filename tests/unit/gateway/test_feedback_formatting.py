@@ -141,7 +141,7 @@ def test_a_summary_that_is_not_ok_has_every_array_and_aggregate_null() -> None:
     assert document["remaining_budget"] == 7
     told = {key for key, value in document.items() if value is not None}
     assert told == {
-        *("schema_version", "submit_index", "env", "status", "n_episodes", "first_global_episode"),
+        *("schema_version", "submit_index", "env", "status", "n_episodes", "env_instances"),
         *("remaining_budget", "submit_started_at", "submit_completed_at", "wall_time_seconds"),
     }
 

@@ -75,7 +75,11 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     assert record.outcome.random_reference.mean_return == 0.5
     assert (record.agent.turns, record.agent.retries) == (2, 1)
     assert record.agent.settings["effort"] == "high"
-    assert (record.timing.wall_s, record.timing.agent_s, record.timing.feedback_s) == (12.5, 5.0, 0.5)
+    assert (record.timing.wall_time_seconds, record.timing.agent_s, record.timing.feedback_s) == (
+        12.5,
+        5.0,
+        0.5,
+    )
     assert [one.message for one in record.rejected_submits] == ["no"]
     assert record.experiment_dimensions.n_heldout == 2
     assert record.versions.fingerprint["numpy"] == "2.4"
@@ -93,7 +97,9 @@ def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> Non
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
     outcome = run_record(plan(tmp_path), done, None, [], Times()).outcome
     assert outcome.status == status
-    assert outcome.final_score is None
+    assert outcome.final_score == (0.0 if status == "no_ok_submit" else None)
+    assert outcome.score is None
+    assert outcome.val_scores is None
     assert outcome.heldout_returns == ()
     assert (outcome.error is not None) == (status == "cancelled")
 

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from statistics import fmean
+from typing import TypeVar
 
 import msgspec
 
 from evopolicy_coordinator.analysis.behaviour.edits import classify
 from evopolicy_coordinator.analysis.reading.records import Run
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
+
+_Value = TypeVar("_Value")
 
 
 class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
@@ -23,8 +26,8 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     accepted: int
     """Submits that were charged."""
-    rejected: int
-    """Requests refused before the snapshot, not charged."""
+    rejected: int | None
+    """Requests refused before the snapshot, not charged. None where the run does not tell, as in the next fields."""
     not_ok: int
     """Accepted submits that are not ok."""
     invalid_rate: float | None
@@ -41,14 +44,14 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     selected_index: int | None
     complexity_growth: float | None
     """AST nodes of the selected source bundle over those of the first score-bearing one."""
-    retries: int
-    turns: int
+    retries: int | None
+    turns: int | None
     wall_s: float
-    agent_s: float
-    queue_s: float
-    rollout_s: float
-    feedback_s: float
-    finalise_s: float
+    agent_s: float | None
+    queue_s: float | None
+    rollout_s: float | None
+    feedback_s: float | None
+    finalise_s: float | None
     secret_splits: bool
     """False when the splits came from a small public seed."""
     jail: str
@@ -99,7 +102,7 @@ def _signals(run: Run) -> AuditSignals:
         entry=run.entry,
         env=run.env,
         accepted=accepted,
-        rejected=len(run.record.rejected_submits),
+        rejected=_told(run, len(run.record.rejected_submits)),
         not_ok=not_ok,
         invalid_rate=not_ok / accepted if accepted else None,
         budget=run.budget,
@@ -109,14 +112,14 @@ def _signals(run: Run) -> AuditSignals:
         score_drops=sum(t.val_drop for t in transitions),
         selected_index=run.record.outcome.best_submit_index,
         complexity_growth=growth,
-        retries=run.record.agent.retries,
-        turns=run.record.agent.turns,
-        wall_s=timing.wall_s,
-        agent_s=timing.agent_s,
-        queue_s=timing.queue_s,
-        rollout_s=timing.rollout_s,
-        feedback_s=timing.feedback_s,
-        finalise_s=timing.finalise_s,
+        retries=_told(run, run.record.agent.retries),
+        turns=_told(run, run.record.agent.turns),
+        wall_s=timing.wall_time_seconds,
+        agent_s=_told(run, timing.agent_s),
+        queue_s=_told(run, timing.queue_s),
+        rollout_s=_told(run, timing.rollout_s),
+        feedback_s=_told(run, timing.feedback_s),
+        finalise_s=_told(run, timing.finalise_s),
         secret_splits=run.record.versions.data_secret,
         jail=run.record.jail,
         hidden_isolation=run.record.hidden_isolation,
@@ -124,6 +127,11 @@ def _signals(run: Run) -> AuditSignals:
         simulation=run.record.experiment_dimensions.simulation,
         simulator_flags=None if run.simulation_allowed else len(run.simulator_flags),
     )
+
+
+def _told(run: Run, value: _Value) -> _Value | None:
+    """What only run directories of ours tell."""
+    return None if run.is_published else value
 
 
 def token_use(runs: Sequence[Run]) -> list[TokenUse]:

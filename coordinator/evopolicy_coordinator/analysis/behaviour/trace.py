@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.checkpoints import policy_folder
 from evopolicy_coordinator.analysis.behaviour.edits import Transition, classify
 from evopolicy_coordinator.analysis.behaviour.line_diff import unified
 from evopolicy_coordinator.analysis.reading.agent_log import Evidence, LogReading, read_agent_log
@@ -60,7 +61,7 @@ class Trace(msgspec.Struct, frozen=True, kw_only=True):
 
 def trace(run: Run) -> Trace:
     """Reads the run's log and finds its images."""
-    log = run.record.artifacts.agent_log
+    log = run.record.artifacts.logs_agent
     reading = read_agent_log(run.path / log, run.submits) if log else LogReading()
     transitions = {t.index: t for t in classify(run.submits)}
     images = _images(run, reading)
@@ -85,7 +86,7 @@ def _first_video(run: Run, submit: Submit) -> Path | None:
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:
     """Text of a checkpoint's source bundle by path: `policy.py` first. All its Python files when it has no bundle."""
-    system = run.checkpoint(submit.index) / "system"
+    system = policy_folder(run.checkpoint(submit.index))
     try:
         if submit.source is not None:
             found = {path: (system / path).read_bytes() for path in submit.source.files}
@@ -122,7 +123,7 @@ def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
     known: set[tuple[str, int]] = set()
     total = 0
     for submit in run.submits:
-        for path in _image_files(run.checkpoint(submit.index) / "system", MAX_IMAGES):
+        for path in _image_files(policy_folder(run.checkpoint(submit.index)), MAX_IMAGES):
             key = (path.name, path.stat().st_size)
             if key not in known and total < MAX_IMAGES:
                 known.add(key)

@@ -127,9 +127,10 @@ def _decades(panel: matplotlib.axes.Axes) -> float:
 
 def wall_time(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Stacked bars: mean wall time of a run by phase, a bar an agent."""
-    entries = sorted({row.entry for row in study.audit}, key=str.casefold)
+    told = [row for row in study.audit if row.agent_s is not None]
+    entries = sorted({row.entry for row in told}, key=str.casefold)
     means = {
-        entry: {key: fmean(getattr(r, key) for r in study.audit if r.entry == entry) for key, *_ in _PHASES}
+        entry: {key: fmean(getattr(r, key) for r in told if r.entry == entry) for key, *_ in _PHASES}
         for entry in entries
     }
     if not any(value for phases in means.values() for value in phases.values()):

@@ -143,7 +143,7 @@ def index_page(
             ["None of these runs has recorded episodes of its selected checkpoint."],
             links=[(title_of(env), href) for env, href in replay_links.items()],
         ),
-        _section("setup", "Setup", tables=shown_tables("agents", "environments")),
+        _section("setup", "Setup", tables=shown_tables("agents", "environments", "not_told")),
         _section(
             "left-out", "Left out",
             tables=shown_tables("left_out") if study.left_out else [],
@@ -290,7 +290,7 @@ def trace_page(
         ("selected", "–" if outcome.best_submit_index is None else f"s{outcome.best_submit_index:03d}"),
         ("submits", len(run.submits)),
         ("episodes used", f"{run.submits[-1].consumed if run.submits else 0} of {run.budget}"),
-        ("rejected requests", len(run.record.rejected_submits)),
+        ("rejected requests", "–" if run.is_published else len(run.record.rejected_submits)),
     ]
     svg = small_timeline(transitions, run.submits, run.budget, "t-") if transitions else ""
     closed = outcome.closed_reason.replace("_", " ")

@@ -15,6 +15,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.environment import Split
 from evopolicy_coordinator.analysis.reading.records import Run
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, suites_of
 
@@ -59,9 +60,9 @@ _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "hidden cases": lambda run: run.record.experiment_dimensions.hidden_cases,
 }
 _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
-    "train split": lambda run: run.record.versions.data_train_hash[:12],
-    "validation split": lambda run: _hidden_split(run, run.record.versions.data_valid_hash),
-    "held-out split": lambda run: _hidden_split(run, run.record.versions.data_heldout_hash),
+    "train split": lambda run: _split(run, "train"),
+    "validation split": lambda run: _split(run, "validation"),
+    "held-out split": lambda run: _split(run, "heldout"),
     "environment version": lambda run: run.record.versions.env,
     "episodes a submit": lambda run: run.submit_size,
     "policy limits": lambda run: _limits(run),
@@ -70,8 +71,10 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
 }
 
 
-def _hidden_split(run: Run, digest: str) -> str:
-    return "its own" if run.record.experiment_dimensions.hidden_cases == "per_run" else digest[:12]
+def _split(run: Run, split: Split) -> str:
+    if split != "train" and run.record.experiment_dimensions.hidden_cases == "per_run":
+        return "its own"
+    return run.record.versions.cases_hash(split).removeprefix("sha256:")[:12]
 
 
 def _step_limit(run: Run) -> str:

@@ -2,7 +2,7 @@
 
 A run is complete when its `run.json` can be read and says `completed` or `no_ok_submit`. Everything else in the folder
 is read from what the agent saw (`summary.json`) and from the immutable checkpoints; `run.json` alone brings the hidden
-scores. Policies are parsed, never run.
+scores. Policies are parsed, never run. Runs of the published software are read too (`published`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
-from evopolicy_common.records.run_record import RunRecord, decode_checkpoint_metrics, decode_run_record
+from evopolicy_common.records.checkpoints import policy_folder, read_meta
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
 from evopolicy_coordinator.analysis.behaviour.topology import describe
+from evopolicy_coordinator.analysis.reading import published
 from evopolicy_coordinator.analysis.reading.parallel import in_processes
+from evopolicy_coordinator.analysis.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_coordinator.analysis.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
 from evopolicy_coordinator.analysis.reading.sources import reachable_modules, read_python_files, source_digest
 from evopolicy_coordinator.analysis.simulators.look import Flag, flags_of
@@ -149,12 +152,12 @@ def read_run(folder: Path) -> Run:
 def _simulators(run: Run) -> tuple[Flag, ...]:
     def files_of(submit: Submit) -> Files:
         try:
-            return read_python_files(run.checkpoint(submit.index) / "system")
+            return read_python_files(policy_folder(run.checkpoint(submit.index)))
         except OSError:
             return {}
 
     artifacts = run.record.artifacts
-    log = run.path / artifacts.agent_log if artifacts.agent_log else None
+    log = run.path / artifacts.logs_agent if artifacts.logs_agent else None
     workspace = run.path / (artifacts.workspace or "workspace")
     return flags_of(((submit.index, files_of(submit)) for submit in run.submits), workspace, log, run.env)
 
@@ -178,8 +181,12 @@ def _read_record(folder: Path) -> RunRecord:
         raise UnreadableRunError("half-finished: there is no run.json")
     if path.stat().st_size > _MAX_RUN_JSON_BYTES:
         raise UnreadableRunError(f"run.json is larger than {_MAX_RUN_JSON_BYTES >> 20} MiB")
+    data = path.read_bytes()
     try:
-        return decode_run_record(path.read_bytes())
+        told = published.decode(data)
+        return (
+            published.read_record(folder, told) if published.is_published(told) else decode_run_record(data)
+        )
     except ProtocolError as error:
         raise UnreadableRunError(f"run.json: {error}") from error
 
@@ -193,34 +200,26 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
     previous: Files | None = None
     consumed = 0
     for index in indices:
-        summary = _read_summary(checkpoint_folder(feedback.parent, "feedback", index))
+        summary = _read_summary(checkpoint_folder(feedback.parent, "feedback", index), record)
         checkpoint = checkpoint_folder(folder, record.artifacts.checkpoints or "checkpoints", index)
-        metrics_path = checkpoint / "metrics.json"
         try:
-            metrics = decode_checkpoint_metrics(metrics_path.read_bytes()) if metrics_path.is_file() else None
+            meta = read_meta(checkpoint, budget)
         except ProtocolError as error:
-            raise UnreadableRunError(f"{metrics_path.relative_to(folder)}: {error}") from error
-        if summary is None and metrics is None:
-            raise UnreadableRunError(f"submit {index} has neither summary.json nor metrics.json")
-        status = summary.status if summary is not None else metrics.status if metrics is not None else ""
-        n_episodes = (
-            summary.n_episodes if summary is not None else metrics.n_episodes if metrics is not None else 0
-        )
-        before = consumed
+            raise UnreadableRunError(f"{checkpoint.relative_to(folder)}: {error}") from error
         if summary is not None:
-            consumed = budget - summary.remaining_budget
-        elif metrics is not None:
-            consumed = metrics.consumed_budget
+            status: str = summary.status
+            n_episodes, mean = summary.n_episodes, summary.mean_return
+            left = summary.remaining_budget
+            after = budget - consumed - n_episodes if left is None else left
+        elif meta is not None:
+            status, n_episodes, mean = meta.validation_status, meta.n_episodes_requested, meta.mean_return
+            after = meta.remaining_budget_after
+        else:
+            raise UnreadableRunError(f"submit {index} has neither summary.json nor _meta.json")
+        before, consumed = consumed, budget - after
         files, source = _read_source(checkpoint) if status == "ok" else (None, None)
         changed = None if files is None or previous is None else count_changed_lines(previous, files)
         previous = files if files is not None else previous
-        mean = (
-            summary.mean_return
-            if summary is not None
-            else metrics.mean_return
-            if metrics is not None
-            else None
-        )
         submits.append(
             Submit(
                 index=index,
@@ -230,12 +229,12 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
                 consumed=consumed,
                 mean_return=mean,
                 std_return=summary.std_return if summary is not None else None,
-                val_mean=record.outcome.val_scores.get(str(index)),
+                val_mean=(record.outcome.val_scores or {}).get(str(index)),
                 n_failed_episodes=len(summary.errors or ()) if summary is not None else 0,
                 started_at=summary.submit_started_at if summary is not None else "",
                 completed_at=summary.submit_completed_at if summary is not None else "",
                 wall_s=summary.wall_time_seconds if summary is not None else 0.0,
-                bundle_digest=metrics.digest if metrics is not None else "",
+                bundle_digest=meta.bundle if meta is not None else "",
                 source=source,
                 changed_lines=changed,
             )
@@ -250,11 +249,13 @@ def _indices(folder: Path) -> set[int]:
     return {int(match[1]) for match in matches if match}
 
 
-def _read_summary(folder: Path) -> Summary | None:
+def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary | None:
     path = folder / "summary.json"
     if not path.is_file():
         return None
     try:
+        if record.record_version == PUBLISHED:
+            return published.read_summary(path)
         return decode_summary(path.read_bytes())
     except ProtocolError as error:
         raise UnreadableRunError(f"{folder.name}/summary.json: {error}") from error
@@ -265,10 +266,9 @@ _MAX_DESCRIBED = 4096
 
 
 def _read_source(checkpoint: Path) -> tuple[Files | None, Source | None]:
-    system = checkpoint / "system"
-    if not system.is_dir():
+    if not checkpoint.is_dir():
         return None, None
-    return describe_files(read_python_files(system))
+    return describe_files(read_python_files(policy_folder(checkpoint)))
 
 
 def describe_files(files: Files) -> tuple[Files, Source | None]:

@@ -15,6 +15,7 @@ import msgspec
 
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_coordinator.analysis.behaviour.topology import Features
+from evopolicy_coordinator.analysis.reading.published import PUBLISHED
 from evopolicy_coordinator.analysis.simulators.look import Flag
 
 EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "data"]
@@ -105,15 +106,22 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         return self.record.experiment_dimensions.episode_budget
 
     @property
+    def is_published(self) -> bool:
+        """The published software wrote it: it tells less (`published`)."""
+        return self.record.record_version == PUBLISHED
+
+    @property
     def submit_size(self) -> str:
-        """Fewest and most train episodes of a submit, such as `1 to 128`."""
+        """Fewest and most train episodes of a submit, such as `1 to 128`; empty where unknown."""
+        if self.is_published:
+            return ""
         dimensions = self.record.experiment_dimensions
         return f"{dimensions.min_episodes_per_submit} to {dimensions.max_episodes_per_submit}"
 
     @property
     def score(self) -> float | None:
         """Held-out mean return of the selected checkpoint; None with no ok submit."""
-        return self.record.outcome.final_score
+        return self.record.outcome.score
 
     @property
     def scored(self) -> tuple[Submit, ...]:

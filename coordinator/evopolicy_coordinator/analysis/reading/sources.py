@@ -10,18 +10,15 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
-import re
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
+
+from evopolicy_common.records.code_metrics import parse
 
 MAX_FILE_BYTES = 1 << 20
 """Python files above this are not parsed: they are data in disguise, and would stall a report."""
 
 MAX_FILES = 400
-
-# CPython's parser makes a new text of each beginning of `a.a.a…`: gigabytes for an import of fifty thousand parts.
-_ENDLESS_NAME = re.compile(rb"\b(?:\w++[ \t\f\r\n\\]*+\.[ \t\f\r\n\\]*+){100}")
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
@@ -42,18 +39,6 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
             if len(found) >= MAX_FILES:
                 return found
     return dict(sorted(found.items()))
-
-
-def parse(source: bytes) -> ast.Module | None:
-    """The module's tree, or None when this Python cannot parse it, or only with memory by the square of its length."""
-    if _ENDLESS_NAME.search(source) is not None:
-        return None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return None
 
 
 class Module:

@@ -158,7 +158,9 @@ def references(runs: Iterable[Run]) -> dict[str, float]:
     for run in runs:
         found = run.record.outcome.random_reference
         if found is not None and math.isfinite(found.mean_return):
-            by_seeding = told.setdefault(run.env, {}).setdefault(run.record.versions.data_heldout_hash, {})
+            by_seeding = told.setdefault(run.env, {}).setdefault(
+                run.record.versions.cases_hash("heldout"), {}
+            )
             by_seeding.setdefault(found.seeded_by, []).append(found.mean_return)
     return {
         env: _one_mean(

@@ -43,6 +43,7 @@ def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
         _simulators(study, link_of),
         _agents(study),
         _environments(study),
+        _not_told(study),
         _left_out(study),
     ]
 
@@ -166,8 +167,8 @@ def _environments(study: Study) -> Table:
                 "steps": known.max_episode_steps if known is not None else None,
                 "budget": told(runs, lambda run: run.budget),
                 "submit": told(runs, lambda run: run.submit_size),
-                "validation": told(runs, lambda run: run.record.experiment_dimensions.n_validation),
-                "heldout": told(runs, lambda run: run.record.experiment_dimensions.n_heldout),
+                "validation": told(runs, lambda run: run.record.experiment_dimensions.n_validation or None),
+                "heldout": told(runs, lambda run: run.record.experiment_dimensions.n_heldout or None),
                 "scope": told(runs, lambda run: run.record.experiment_dimensions.policy_scope),
             }
         )
@@ -360,6 +361,53 @@ def submits_text(indices: Iterable[int]) -> str:
         else:
             spans.append([index, index])
     return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
+
+
+def _no_reference(run: Run) -> bool:
+    return run.record.outcome.random_reference is None
+
+
+def _no_validation(run: Run) -> bool:
+    return not run.record.outcome.val_scores
+
+
+_NOT_TOLD: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
+    ("Normalised performance", "the random reference on the held-out cases", _no_reference),
+    (
+        "Score evolution",
+        "the random reference: the scale begins at the lowest first score instead",
+        _no_reference,
+    ),
+    ("Score evolution", "validation means, so no curve", _no_validation),
+    ("Edit types, edit size", "validation means, so no hits", _no_validation),
+    (
+        "Realised structure",
+        "the selected policy's source",
+        lambda run: run.selected is None or run.selected.source is None,
+    ),
+    ("Tokens and cost", "tokens and cost", lambda run: run.record.agent.tokens is None),
+    ("Audit signals", "refused requests, turns, retries, the phases of the wall time", lambda run: True),
+    ("Agents", "harness, version, settings, jail, hidden isolation", lambda run: True),
+    ("Environments", "the bounds of a submit, the number of validation cases", lambda run: True),
+)
+"""Table, what it lacks of a run of the published software, and of which."""
+
+
+def _not_told(study: Study) -> Table:
+    """What the published software's run directories lack, table by table."""
+    runs = [run for run in study.runs if run.is_published]
+    counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _NOT_TOLD]
+    return Table(
+        name="not_told",
+        title="Not told",
+        caption="What run directories of the published software do not tell, by the table that lacks it. Nothing is put in its place.",
+        columns=(
+            Column(key="table", title="Table"),
+            Column(key="what", title="Not told"),
+            Column(key="runs", title="Runs", kind="integer"),
+        ),
+        rows=tuple({"table": table, "what": what, "runs": n} for table, what, n in counts if n),
+    )
 
 
 def _left_out(study: Study) -> Table:

@@ -85,7 +85,7 @@ def test_ok_submit_without_validation_is_no_transition(tmp_path: Path) -> None:
 def test_unchanged_source_with_an_unknown_digest_counts_as_a_retest(tmp_path: Path) -> None:
     folder = write_run(tmp_path, [VERSIONS[-2], VERSIONS[-1]])
     assert [t.edit for t in classify(read_run(folder).submits)] == ["first", "data"]
-    (folder / "checkpoints/submit_001/metrics.json").unlink()
+    (folder / "checkpoints/submit_001/_meta.json").unlink()
     assert [t.edit for t in classify(read_run(folder).submits)] == ["first", "retest"]
 
 

@@ -111,7 +111,7 @@ def damage(folder: Path, how: str) -> None:
         case "truncated summary":
             (folder / "workspace/feedback/submit_000/summary.json").write_text('{"schema_version": 1,')
         case "damaged metrics":
-            (folder / "checkpoints/submit_000/metrics.json").write_text("[]")
+            (folder / "checkpoints/submit_000/_meta.json").write_text("[]")
         case "run.json is a folder":
             path.unlink()
             path.mkdir()
@@ -131,7 +131,7 @@ def damage(folder: Path, how: str) -> None:
         ("completed without score", "no final_score"),
         ("selected submit is gone", "selected submit 77"),
         ("truncated summary", "submit_000/summary.json"),
-        ("damaged metrics", "metrics.json"),
+        ("damaged metrics", "_meta.json"),
         ("run.json is a folder", "half-finished"),
         ("deeply nested", "run.json"),
     ],

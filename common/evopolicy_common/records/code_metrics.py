@@ -1,0 +1,171 @@
+"""`metrics.json`: how large and how branched a policy's source is, by the published definitions. Nothing is run.
+
+Sources are an agent's, so the work is bounded: beyond `MAX_PARSED_BYTES` of Python source in one policy, and where the
+parser would need memory by the square of the length, a file counts as one that cannot be parsed.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+
+import msgspec
+
+PUBLISHED_SCHEMA = "0.1"
+"""`schema_version` of the published software's files, and of ours, which hold their fields and more."""
+MAX_PARSED_BYTES = 8 << 20
+_UNCOUNTED_NAMES = frozenset({".keep", "_meta.json", "metrics.json"})
+_UNCOUNTED_FOLDERS = frozenset({"__pycache__", ".pytest_cache", ".mypy_cache", ".ruff_cache"})
+
+# CPython's parser makes a new text of each beginning of `a.a.a…`: gigabytes for an import of fifty thousand parts.
+_ENDLESS_NAME = re.compile(rb"\b(?:\w++[ \t\f\r\n\\]*+\.[ \t\f\r\n\\]*+){100}")
+
+
+class CodeMetrics(msgspec.Struct, frozen=True, kw_only=True):
+    """The whole of `metrics.json`."""
+
+    schema_version: str = PUBLISHED_SCHEMA
+    files: int
+    python_files: int
+    bytes: int
+    """Of all files."""
+    policy_bytes: int
+    """Of `policy.py`; 0 without one."""
+    lines: int
+    """Of the Python files."""
+    source_lines: int
+    """Lines that are neither blank nor begin with `#`."""
+    classes: int
+    functions: int
+    imports: tuple[str, ...]
+    """Top-level names of absolute imports, sorted."""
+    import_count: int
+    cyclomatic_total: int
+    """Sum over all functions, nested ones counted in their parents too; of the module where a file has no function."""
+    cyclomatic_max: int
+    parse_errors: tuple[str, ...]
+    """Paths of the Python files that cannot be parsed."""
+    test_files: int
+    """Python files whose name begins with `test_`."""
+    tree_hash: str
+    """`sha256:` of, for each file in path order, its path, NUL, its bytes, NUL."""
+
+
+TREND = (
+    "source_lines",
+    "python_files",
+    "functions",
+    "classes",
+    "cyclomatic_total",
+    "cyclomatic_max",
+    "tree_hash",
+)
+"""What `code_metrics_trend` follows over the submits."""
+
+
+def code_metrics(files: Mapping[str, bytes]) -> CodeMetrics:
+    """The metrics of a policy's files, by their path relative to `system/`."""
+    counted = {path: data for path, data in sorted(files.items()) if _counts(PurePosixPath(path))}
+    sources = {
+        path: data.decode("utf-8", "replace") for path, data in counted.items() if path.endswith(".py")
+    }
+    lines = [line.strip() for text in sources.values() for line in text.splitlines()]
+    shapes: list[_Shape] = []
+    errors: list[str] = []
+    left = MAX_PARSED_BYTES
+    for path, text in sources.items():
+        left -= len(counted[path])
+        tree = parse(text) if left >= 0 else None
+        if tree is None:
+            errors.append(path)
+        else:
+            shapes.append(_Shape(tree))
+    complexities = [each for shape in shapes for each in shape.complexities]
+    imports = sorted({name for shape in shapes for name in shape.imports})
+    tree_hash = hashlib.sha256()
+    for path, data in counted.items():
+        tree_hash.update(path.encode() + b"\0" + data + b"\0")
+    return CodeMetrics(
+        files=len(counted),
+        python_files=len(sources),
+        bytes=sum(map(len, counted.values())),
+        policy_bytes=len(counted.get("policy.py", b"")),
+        lines=len(lines),
+        source_lines=sum(1 for line in lines if line and not line.startswith("#")),
+        classes=sum(shape.classes for shape in shapes),
+        functions=sum(shape.functions for shape in shapes),
+        imports=tuple(imports),
+        import_count=len(imports),
+        cyclomatic_total=sum(complexities),
+        cyclomatic_max=max(complexities, default=0),
+        parse_errors=tuple(errors),
+        test_files=sum(PurePosixPath(path).name.startswith("test_") for path in sources),
+        tree_hash=f"sha256:{tree_hash.hexdigest()}",
+    )
+
+
+def parse(source: bytes | str) -> ast.Module | None:
+    """The module's tree, or None when this Python cannot parse it, or only with memory by the square of its length."""
+    data = source if isinstance(source, bytes) else source.encode()
+    if _ENDLESS_NAME.search(data) is not None:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
+
+
+def _counts(path: PurePosixPath) -> bool:
+    return path.name not in _UNCOUNTED_NAMES and _UNCOUNTED_FOLDERS.isdisjoint(path.parts[:-1])
+
+
+class _Shape:
+    """What one walk over a module finds. The walk keeps its own stack: an agent's nesting has no bound."""
+
+    def __init__(self, tree: ast.Module) -> None:
+        self.classes = self.functions = 0
+        self.imports: set[str] = set()
+        self.complexities: list[int] = []
+        """Of each function; of the module where it has none."""
+        points = 0
+        # A function's points are those that the walk finds between its beginning and its end.
+        stack: list[tuple[ast.AST, int | None]] = [(tree, None)]
+        while stack:
+            node, before = stack.pop()
+            if before is not None:
+                self.complexities.append(1 + points - before)
+                continue
+            points += _points(node)
+            self.classes += isinstance(node, ast.ClassDef)
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                self.functions += 1
+                stack.append((node, points))
+            elif isinstance(node, ast.Import):
+                self.imports.update(alias.name.partition(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                self.imports.add(node.module.partition(".")[0])
+            stack += [(child, None) for child in ast.iter_child_nodes(node)]
+        if not self.functions:
+            self.complexities = [1 + points]
+
+
+def _points(node: ast.AST) -> int:
+    """What a node adds to the complexity of what it is in."""
+    match node:
+        case ast.If() | ast.For() | ast.AsyncFor() | ast.While() | ast.IfExp() | ast.ExceptHandler():
+            return 1
+        case ast.BoolOp():
+            return len(node.values) - 1
+        case ast.Try() | ast.TryStar():
+            return len(node.handlers)
+        case ast.comprehension():
+            return len(node.ifs)
+        case ast.Match():
+            return len(node.cases)
+    return 0

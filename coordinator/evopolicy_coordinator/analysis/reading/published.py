@@ -1,0 +1,198 @@
+"""Run directories of the published software, read as ours: what they do not tell is left unknown, never guessed.
+
+`run.json` there has `schema_version` 0.1 and no `record_version`. Only fields that the published protocol names are relied
+on, and each may be missing: names come from the path then, the budget from the first checkpoint, the selected submit from
+`code_metrics_best`. What holds for every published run is stamped: one policy for all episodes of a submit, list
+observations, no simulation outside submits, its step limits, no early finish, public cases.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.records.checkpoints import read_meta
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.run_record import (
+    Agent,
+    Artifacts,
+    ExperimentDimensions,
+    Outcome,
+    RunRecord,
+    Timing,
+    Versions,
+)
+
+PUBLISHED = 0
+"""`record_version` of a record that was read from the published software's files."""
+HARNESS = "published software"
+UNKNOWN = "unknown"
+
+_ARTIFACTS = ("workspace", "feedback", "checkpoints", "logs_harness", "logs_agent", "logs_env")
+
+
+class PublishedSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What a report takes from a `summary.json` of the published software; each field may be missing."""
+
+    status: str = ""
+    env: str = ""
+    env_instances: tuple[int, ...] = ()
+    remaining_budget: int | None = None
+    mean_return: float | None = None
+    std_return: float | None = None
+    errors: tuple[int, ...] | None = None
+    submit_started_at: str = ""
+    submit_completed_at: str = ""
+    wall_time_seconds: float = 0.0
+
+    @property
+    def n_episodes(self) -> int:
+        return len(self.env_instances)
+
+
+_summary = msgspec.json.Decoder(PublishedSummary)
+
+
+def is_published(told: Any) -> bool:
+    """Whether a `run.json`, decoded, is the published software's."""
+    return (
+        isinstance(told, dict)
+        and told.get("schema_version") == PUBLISHED_SCHEMA
+        and "record_version" not in told
+    )
+
+
+def read_summary(path: Path) -> PublishedSummary | None:
+    """A submit's summary; None where there is none. ProtocolError when it is damaged."""
+    try:
+        return _summary.decode(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, *DECODE_ERRORS) as error:
+        raise ProtocolError(f"not a submit summary: {error}") from error
+
+
+def read_record(folder: Path, told: dict[str, Any]) -> RunRecord:
+    """`run.json` of the published software, decoded, as a record of ours. ProtocolError where it is damaged."""
+    outcome, timing, versions = (_object(told, name) for name in ("outcome", "timing", "versions"))
+    artifacts = {name: place for name, place in _object(told, "artifacts").items() if name in _ARTIFACTS}
+    feedback = folder / str(artifacts.get("feedback", "workspace/feedback"))
+    summaries = [
+        found for path in sorted(feedback.glob("submit_*/summary.json")) if (found := read_summary(path))
+    ]
+    model, env = _names(folder, told, summaries)
+    heldout = outcome.get("heldout_returns") or ()
+    try:
+        return RunRecord(
+            record_version=PUBLISHED,
+            protocol_version=str(told.get("protocol_version", UNKNOWN)),
+            model=model,
+            env=env,
+            exp_id=str(told.get("exp_id", folder.name)),
+            agent=Agent(entry=model, harness=HARNESS),
+            sandbox_tier="none",
+            jail=UNKNOWN,
+            experiment_dimensions=ExperimentDimensions(
+                episode_budget=_budget(folder, told, summaries),
+                min_episodes_per_submit=0,
+                max_episodes_per_submit=0,
+                policy_scope="submit",
+                observations="lists",
+                n_train=0,
+                n_validation=0,
+                n_heldout=len(heldout),
+                simulation="forbidden",
+                finish="budget",
+                step_limit="published",
+                profile="published",
+            ),
+            timing=msgspec.convert(timing, Timing),
+            outcome=msgspec.convert(
+                {
+                    "status": outcome.get("status") or "error",
+                    "error": outcome.get("error"),
+                    "final_score": outcome.get("final_score"),
+                    "best_submit_index": _best(outcome),
+                    "val_scores": outcome.get("val_scores"),
+                    "heldout_returns": heldout,
+                },
+                Outcome,
+            ),
+            artifacts=msgspec.convert(artifacts, Artifacts),
+            versions=Versions(
+                harness=str(versions.get("harness", UNKNOWN)),
+                env=str(versions.get("env", UNKNOWN)),
+                data_secret=False,
+                agents_md_hash=str(versions.get("agents_md_hash", "")),
+                data_train_hash=str(versions.get("data_train_hash", "")),
+                data_valid_hash=str(versions.get("data_valid_hash", "")),
+                data_heldout_hash=str(versions.get("data_heldout_hash", "")),
+            ),
+        )
+    except (msgspec.ValidationError, TypeError) as error:
+        raise ProtocolError(f"not a published run record: {error}") from error
+
+
+def _object(told: dict[str, Any], name: str) -> dict[str, Any]:
+    value = told.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _names(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary]) -> tuple[str, str]:
+    """Model and environment: as told, or from `runs/<model>/<env>/<exp-id>`, where a `/` of the environment may be a `_`."""
+    above = folder.parent
+    by_path = {env: above.parent.name for env in catalogue.entries() if env.replace("/", "_") == above.name}
+    by_path |= {
+        env: above.parent.parent.name
+        for env in catalogue.entries()
+        if env == f"{above.parent.name}/{above.name}"
+    }
+    told_env = told.get("env") or next((one.env for one in summaries if one.env), None)
+    env = str(told_env or next(iter(by_path), above.name))
+    return str(told.get("model") or by_path.get(env, above.parent.name)), env
+
+
+def _budget(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary]) -> int:
+    """The episode budget: as told, or what was left before the first submit."""
+    budget = _object(told, "experiment_dimensions").get("episode_budget")
+    if isinstance(budget, int):
+        return budget
+    first = next(iter(sorted((folder / "checkpoints").glob("submit_*"))), None)
+    meta = None if first is None else read_meta(first, 0)
+    if meta is not None:
+        return meta.remaining_budget_before
+    return next(
+        (one.remaining_budget + one.n_episodes for one in summaries if one.remaining_budget is not None), 0
+    )
+
+
+def _best(outcome: dict[str, Any]) -> int | None:
+    """The selected submit: as told, or the last one whose code metrics are those of the best checkpoint."""
+    best = outcome.get("best_submit_index")
+    if best is not None:
+        return int(best)
+    auxiliary = _object(outcome, "auxiliary")
+    wanted, by_submit = auxiliary.get("code_metrics_best"), _object(auxiliary, "code_metrics_by_submit")
+    if wanted is None:
+        return None
+    scores = _object(outcome, "val_scores")
+    found = [int(index) for index, metrics in by_submit.items() if metrics == wanted and index.isdecimal()]
+    return max(found, key=lambda index: (_number(scores.get(str(index))), index), default=None)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else -math.inf
+
+
+def decode(data: bytes) -> Any:
+    """`run.json` as plain values; None when it is no JSON."""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError):
+        return None

@@ -1,0 +1,135 @@
+"""`evopolicy report` reads run directories of the published software, and says what they do not tell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from invented_policies import Version, policy
+from published_checker import check_run
+from published_runs import SUBMITS, write_published_run
+from run_dirs import write_run
+from typer.testing import CliRunner
+
+from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_coordinator.analysis.reading.reader import read_or_explain, read_run
+from evopolicy_coordinator.analysis.reading.records import LeftOut
+from evopolicy_coordinator.cli.report import app
+from evopolicy_coordinator.verify.source import read_run as read_for_verify
+
+
+def test_the_fixture_is_what_the_published_checker_passes(tmp_path: Path) -> None:
+    assert check_run(write_published_run(tmp_path)) == []
+    assert check_run(write_published_run(tmp_path, exp_id="none", submits=SUBMITS[2:3])) == []
+
+
+@pytest.mark.parametrize("env", ["gym/acrobot", "gym_acrobot"])
+def test_a_published_run_is_read_with_what_it_tells(tmp_path: Path, env: str) -> None:
+    folder = write_published_run(tmp_path, env=env)
+    for path in folder.glob("workspace/feedback/*/summary.json"):
+        if env == "gym_acrobot":  # the environment is in the path alone
+            path.write_text(json.dumps(json.loads(path.read_bytes()) | {"env": ""}))
+    run = read_run(folder)
+    assert (run.entry, run.env, run.record.exp_id) == ("model-a", "gym/acrobot", "exp-1")
+    assert (run.score, run.budget, run.record.outcome.best_submit_index) == (-95.0, 32, 3)
+    assert [submit.status for submit in run.submits] == ["ok", "ok", "init_error", "ok"]
+    assert [submit.consumed for submit in run.submits] == [8, 16, 24, 32]
+    assert [submit.val_mean for submit in run.submits] == [-300.0, -150.0, None, -90.0]
+    assert run.submits[0].mean_return == -306.5
+    assert all(submit.source is not None for submit in run.scored)
+    dimensions = run.record.experiment_dimensions
+    assert (dimensions.policy_scope, dimensions.observations, dimensions.simulation) == (
+        "submit",
+        "lists",
+        "forbidden",
+    )
+    assert run.record.versions.data_secret is False
+    assert run.record.hidden_isolation == "unknown"
+
+
+def test_the_selected_submit_is_found_by_its_code_where_it_is_not_told(tmp_path: Path) -> None:
+    folder = write_published_run(tmp_path)
+    told = json.loads((folder / "run.json").read_bytes())
+    del told["outcome"]["best_submit_index"]
+    (folder / "run.json").write_text(json.dumps(told))
+    assert read_run(folder).record.outcome.best_submit_index == 3
+
+
+def test_a_published_run_without_an_ok_submit_has_no_score(tmp_path: Path) -> None:
+    run = read_run(write_published_run(tmp_path, submits=SUBMITS[2:3]))
+    assert run.record.outcome.final_score == 0.0
+    assert run.score is None
+
+
+def report(tmp_path: Path, *arguments: str) -> dict[str, Any]:
+    out = tmp_path / "report"
+    result = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    found: dict[str, Any] = json.loads((out / "report.json").read_bytes())["tables"]
+    return found
+
+
+def test_a_report_of_published_runs_fills_its_tables_and_tells_the_gaps(tmp_path: Path) -> None:
+    for model, submits in (("model-a", SUBMITS), ("model-b", SUBMITS[:2])):
+        write_published_run(tmp_path / "runs", model=model, submits=submits)
+    tables = report(tmp_path, str(tmp_path / "runs"))
+    board = {row["entry"]: row for row in tables["leaderboard_core16"]["rows"]}
+    assert {entry: row["rank"] for entry, row in board.items()} == {"model-a": 1, "model-b": 2}
+    assert [row["improvements"] for row in tables["evolution"]["rows"]] == [2, 1]
+    edits = {row["entry"]: row for row in tables["edit_types"]["rows"]}
+    assert (
+        edits["model-a"]["n_parametric"],
+        edits["model-a"]["n_synthesis"],
+        edits["model-a"]["n_not_ok"],
+    ) == (1, 1, 1)
+    assert {row["entry"] for row in tables["structure"]["rows"]} == {"model-a", "model-b"}
+    assert "tokens" not in tables
+    gaps = {(row["table"], row["runs"]) for row in tables["not_told"]["rows"]}
+    assert {("Normalised performance", 2), ("Tokens and cost", 2), ("Audit signals", 2)} <= gaps
+    assert ("Realised structure", 2) not in gaps
+    for row in tables["audit"]["rows"]:
+        assert row["wall_s"] == 600.0
+        assert [row[name] for name in ("rejected", "turns", "agent_s", "rollout_s")] == [None] * 4
+    assert tables["left_out"]["rows"] == []
+
+
+def test_published_runs_and_ours_are_compared_only_where_that_is_allowed(tmp_path: Path) -> None:
+    write_published_run(tmp_path / "runs")
+    write_run(tmp_path / "runs", [Version(policy(), (0.0,) * 8, -200.0)])
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code != 0
+    assert "policy scope" in result.output
+    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed", "--allow-unknown")
+    assert {row["runs"] for row in tables["not_told"]["rows"]} == {1}
+
+
+def test_only_reports_read_published_runs(tmp_path: Path) -> None:
+    folder = write_published_run(tmp_path)
+    with pytest.raises(ProtocolError, match="published software"):
+        decode_run_record((folder / "run.json").read_bytes())
+    with pytest.raises(ConfigError, match="published software"):
+        read_for_verify(folder)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"outcome": None},
+        {"timing": {}},
+        {"outcome": {"status": "completed", "final_score": "high"}},
+        {"outcome": {"status": "completed", "final_score": 1.0, "auxiliary": {"code_metrics_best": 1}}},
+        {"versions": 3, "artifacts": {"workspace": 7}},
+        {"model": ["x"], "outcome": {"status": "completed", "best_submit_index": "x"}},
+        {"experiment_dimensions": {"episode_budget": -1}, "outcome": {"val_scores": [1]}},
+    ],
+)
+def test_a_damaged_published_run_is_left_out_with_its_reason(tmp_path: Path, damage: dict[str, Any]) -> None:
+    folder = write_published_run(tmp_path)
+    told = json.loads((folder / "run.json").read_bytes())
+    (folder / "run.json").write_text(json.dumps(told | damage))
+    found = read_or_explain(folder)
+    assert isinstance(found, LeftOut)
+    assert found.reason

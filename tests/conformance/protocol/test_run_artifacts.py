@@ -1,0 +1,77 @@
+"""Run directories of all Core16 environments pass the published checker, and hold the documented artifacts to the letter."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from published_checker import check_run
+
+from evopolicy_common import catalogue
+
+CORE16 = catalogue.suites()["core16"].environments
+AGENT = """
+import json, os, urllib.request
+from pathlib import Path
+
+def submit(ids):
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
+    )
+    with urllib.request.urlopen(request) as answer:
+        return json.load(answer)
+
+system = Path("system")
+good = (system / "policy.py").read_text()
+(system / "helpers").mkdir()
+(system / "helpers" / "test_shape.py").write_text("def shape(x):\\n    # long?\\n    return [1 for y in x if y and x] or 0\\n")
+(system / "helpers" / ".keep").write_text("")
+(system / "weights.json").write_text("[1, 2]")
+(system / "metrics.json").write_text("the agent's own")
+submit("0")
+(system / "policy.py").write_text("import numpy\\nraise RuntimeError('never imported')\\n")
+submit([1])
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One small run of each environment, on one cluster."""
+    root = tmp_path_factory.mktemp("core16")
+    (root / "agent.py").write_text(AGENT)
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "evopolicy_gateway.cli", "local", "--env", "core16", "--entry", "small"),
+            *("--agent", f"command:{sys.executable} {root / 'agent.py'}", "--jail", "none", "--exp-id", "t"),
+            *("--budget", "2", "--validation", "1", "--heldout", "1", "--hidden-isolation", "off"),
+            *("--parallel", "4", "--json"),
+        ],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=1200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return root / "runs" / "small"
+
+
+@pytest.mark.parametrize("env", CORE16)
+def test_run_directory_passes_the_published_checker(runs: Path, env: str) -> None:
+    folder = runs / env.replace("/", "_") / "t"
+    assert check_run(folder) == []
+    first, second = (read(folder / "checkpoints" / f"submit_00{index}" / "_meta.json") for index in (0, 1))
+    assert first["validation_status"] == "ok"
+    assert second["validation_status"] == "import_error"
+    assert (first["remaining_budget_before"], second["remaining_budget_after"]) == (2, 0)
+    summary = read(folder / "workspace" / "feedback" / "submit_001" / "summary.json")
+    assert summary["env_instances"] == [1]
+
+
+def read(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(path.read_bytes())
+    return found
