@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn, TextIO, cast
 import structlog
 import typer
 
-from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
+from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
 from evopolicy_common.terminal import end_without_reader, harmless, one_line, say
 
@@ -122,6 +122,8 @@ def fail_on_our_errors() -> Iterator[None]:
         yield
     except ConfigError as error:
         fail(str(error), code_of(error))
+    except DamagedStoreError as error:
+        fail(str(error), USAGE_ERROR)
     except EvopolicyError as error:
         fail(str(error), FAILURE)
     except OSError as error:

@@ -16,8 +16,8 @@ import structlog
 import typer
 
 from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, run_app, setup_logging
-from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.processes.preflight import explained
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.http.door import AgentPlace, place_of
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.alone import alone
@@ -91,13 +91,11 @@ def _failures_in_the_log() -> Iterator[None]:
         log.error("the gateway cannot serve", error=str(error))
         raise SystemExit(code_of(error)) from error
     except Exception as error:
-        foreseen = explained(error) if isinstance(error, OSError) else None
-        if foreseen is None and isinstance(error, EvopolicyError):
-            foreseen = str(error)
-        if foreseen is None:
+        why = foreseen(error)
+        if why is None:
             log.exception("the gateway failed", error=str(error))
         else:
-            log.error("the gateway failed", error=foreseen)
+            log.error("the gateway failed", error=why)
         raise SystemExit(FAILURE) from error
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import traceback
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +13,11 @@ import msgspec
 from rich.table import Table
 
 from evopolicy_common.cli import end_on_sigterm
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
-from evopolicy_common.processes.preflight import explained
+from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.terminal import Terminal, say_lines
 from evopolicy_common.wire import transport
@@ -224,14 +225,24 @@ async def _play(
             error=str(error),
             wrong_option=True,
         )
-    except (EvopolicyError, OSError) as error:
-        why = explained(error) if isinstance(error, OSError) else str(error)
-        if why is None:
-            raise
+    except Exception as error:
+        why = why_failed(error, plan.folder.harness_log)
         watch.note(plan.settings.env, f"failed: {why}")
         return RunResult(
             env=plan.settings.env, run_directory=str(plan.folder.root), status="error", error=why
         )
+
+
+def why_failed(error: Exception, log: Path) -> str:
+    """Why a run failed, in a line. The other runs of a command go on after a bug, too, whose traceback is in the run's log."""
+    why = foreseen(error)
+    if why is None:
+        why = f"{type(error).__name__}: {error}; the traceback is in {log}"
+        with contextlib.suppress(OSError):
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("a") as file:
+                traceback.print_exception(error, file=file)
+    return why
 
 
 def _result(plan: Plan, record: RunRecord) -> RunResult:

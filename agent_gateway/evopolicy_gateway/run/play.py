@@ -299,7 +299,7 @@ class RunPlay:
             quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
             if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
                 raise RunError(
-                    f"the gateway cannot serve (exit status {code}): {self._gateway.last_words()};"
+                    f"the gateway cannot serve (exit status {code}): {child_process.last_words(self._gateway.log)};"
                     f" see {self._folder.harness_log}"
                 )
             self._watch.note(self._name, f"the gateway ended with status {code}; starting it again")

@@ -26,7 +26,6 @@ import msgspec
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
-from evopolicy_common.processes.preflight import explained
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.wire.credentials import Credentials
@@ -35,6 +34,7 @@ from evopolicy_gateway.harnesses import session
 from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.operator.runs import why_failed
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.play import RunPlay
@@ -258,11 +258,10 @@ class Sweep:
                 settings=entry.settings,
                 earlier=entry.earlier,
             )
-        except (EvopolicyError, OSError) as error:
-            why = explained(error) if isinstance(error, OSError) else str(error)
-            if why is None:
-                raise
-            known = self._index.runs[run.name].tokens
+        except _TakenOverError:
+            raise
+        except Exception as error:
+            why, known = why_failed(error, folder.harness_log), self._index.runs[run.name].tokens
             done = msgspec.structs.replace(entry, state="error", error=why, tokens=known)
         finally:
             self._plays.pop(run.name, None)

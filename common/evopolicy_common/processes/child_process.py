@@ -88,19 +88,20 @@ class ChildProcess:
                 self._signal(signal.SIGKILL)
         await self.ended()
 
-    def last_words(self) -> str:
-        """The last line of its log, for a message about why it ended."""
-        try:
-            with self.log.open("rb") as file:
-                file.seek(max(0, self.log.stat().st_size - 4096))
-                lines = file.read().decode("utf-8", "replace").strip().splitlines()
-        except OSError:
-            return ""
-        return _said(lines[-1]) if lines else ""
-
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
+
+
+def last_words(log: Path) -> str:
+    """The last line of a log, for a message about why its process ended; empty where there is none."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - 4096))
+            lines = file.read().decode("utf-8", "replace").strip().splitlines()
+    except OSError:
+        return ""
+    return _said(lines[-1]) if lines else ""
 
 
 class _LogLine(msgspec.Struct):

@@ -17,7 +17,7 @@ from pathlib import Path
 from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes.child_process import ChildProcess
+from evopolicy_common.processes.child_process import ChildProcess, last_words
 from evopolicy_common.processes.notices import told_if_slow
 from evopolicy_common.processes.preflight import check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
@@ -104,8 +104,9 @@ async def local_cluster(
                     async with asyncio.timeout(START_PATIENCE_S):
                         ready = await read_ready(ready_file, processes.failed)
             except TimeoutError as error:
+                why = last_words(processes.log("coordinator")) or "it has said nothing"
                 raise ConfigError(
-                    f"the local coordinator did not start within {START_PATIENCE_S:g} s"
+                    f"the local coordinator did not start within {START_PATIENCE_S:g} s: {why}"
                 ) from error
             yield LocalCluster(ready, processes, audited=bool(audit))
         finally:
@@ -135,6 +136,10 @@ class _Processes:
         self._running: list[ChildProcess] = []
         self._keepers: list[asyncio.Task[None]] = []
 
+    def log(self, name: str) -> Path:
+        """Where that process writes."""
+        return self._logs / f"{self._kind}-{name}.log"
+
     async def keep_up(self, name: str, program: Sequence[str]) -> None:
         child = await self._start(name, program)
         keeper = asyncio.create_task(self._keep_up(child, name, program))
@@ -156,7 +161,7 @@ class _Processes:
             code = await child.ended()
             self._running.remove(child)
             deaths = deaths + 1 if time.monotonic() - began < _SOON_S else 1
-            said = child.last_words() or f"see {child.log}"
+            said = last_words(child.log) or f"see {child.log}"
             if code == USAGE_ERROR:
                 raise ConfigError(said)
             if deaths == _MAX_DEATHS:
@@ -166,7 +171,7 @@ class _Processes:
             child = await self._start(name, program)
 
     async def _start(self, name: str, program: Sequence[str]) -> ChildProcess:
-        child = await ChildProcess.start(program, self._logs / f"{self._kind}-{name}.log")
+        child = await ChildProcess.start(program, self.log(name))
         self._running.append(child)
         return child
 

@@ -8,7 +8,7 @@ import socket
 import tempfile
 from pathlib import Path
 
-from evopolicy_common.errors import ConfigError, MachineError
+from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
 
 LOOPBACK = "127.0.0.1"
 LEAST_BYTES = 1 << 20
@@ -43,6 +43,13 @@ def explained(error: OSError) -> str | None:
         return None
     where = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else "a file"
     return f"{where}: {os.strerror(error.errno or 0)}: {remedy}"
+
+
+def foreseen(error: Exception) -> str | None:
+    """Why something failed, in a line, where that is one of our errors or the machine's fault; None for a bug."""
+    if isinstance(error, OSError):
+        return explained(error)
+    return str(error) if isinstance(error, EvopolicyError) else None
 
 
 def refused(error: OSError, message: str) -> ConfigError:

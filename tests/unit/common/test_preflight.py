@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from evopolicy_common.cli import fail_on_our_errors
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, DamagedStoreError
 from evopolicy_common.processes.preflight import check_text, check_writable, explained
 
 
@@ -41,6 +41,12 @@ def test_only_what_may_pass_ends_a_program_so_that_it_is_started_again(
     with pytest.raises(SystemExit) as ended, fail_on_our_errors():
         check_writable(tmp_path, "--state")
     assert ended.value.code == code
+
+
+def test_a_damaged_store_is_no_reason_to_start_a_program_again() -> None:
+    with pytest.raises(SystemExit) as ended, fail_on_our_errors():
+        raise DamagedStoreError("table runs, row (run) = ('r',): this row cannot be read")
+    assert ended.value.code == 2
 
 
 def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -417,6 +417,23 @@ def test_our_own_failure_gives_the_claim_back_and_is_told(
     assert stage.cluster.told[-1][2] is None
 
 
+def test_a_bug_in_one_run_ends_that_run_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(tmp_path, HEAD + CODEX.format("a") + CODEX.format("b"), monkeypatch)
+
+    async def stumbles(name: str) -> None:
+        if name.startswith("a/"):
+            raise LookupError("a bug")
+
+    stage.act = stumbles
+    index = stage.play()
+    by_agent = {entry.agent: entry for entry in index.runs.values()}
+    assert (by_agent["a"].state, by_agent["b"].state) == ("error", "completed")
+    assert by_agent["a"].error is not None
+    log = Path(by_agent["a"].error.rpartition(" ")[2])
+    assert "LookupError: a bug; the traceback is in" in by_agent["a"].error
+    assert "Traceback" in log.read_text()
+
+
 def test_a_sweep_that_renews_no_claims_ends_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
