@@ -16,7 +16,7 @@ import typer
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
-from evopolicy_common.terminal import end_without_reader, harmless, one_line, say
+from evopolicy_common.terminal import harmless, one_line, say
 
 Connect = Annotated[
     list[str] | None,
@@ -35,9 +35,6 @@ CredentialsFile = Annotated[
 
 USAGE_ERROR = 2
 FAILURE = 1
-
-# typer brings click with it, under a name of its own in newer versions: only its public exceptions lead there.
-_ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 
 class _Stderr:
@@ -142,17 +139,3 @@ def end_on_sigterm() -> None:
     assert main is not None
     with contextlib.suppress(RuntimeError, ValueError):  # not on the main thread: there are no signals here
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
-
-
-def run_app(app: typer.Typer) -> None:
-    """Runs the command that `sys.argv` names, and exits."""
-    setup_notices()
-    end_without_reader()
-    try:
-        with fail_on_our_errors():
-            code = typer.main.get_command(app).main(standalone_mode=False)
-    except _ClickError as error:
-        fail(" ".join(error.format_message().split()) or "wrong usage; see --help", USAGE_ERROR)
-    except (typer.Abort, KeyboardInterrupt):
-        fail("interrupted", 130)
-    raise SystemExit(code if isinstance(code, int) else 0)

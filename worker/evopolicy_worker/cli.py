@@ -17,7 +17,8 @@ import typer
 from rich.table import Table
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import fail, fail_on_our_errors, run_app, setup_logging
+from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
+from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError, MachineError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
@@ -34,7 +35,7 @@ from evopolicy_worker.slots.cores import Cores
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
 
-app = typer.Typer(add_completion=False, no_args_is_help=False)
+app = App(add_completion=True)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 DESCRIBE_TRIES = 5
@@ -86,6 +87,7 @@ def work(
     grace: Annotated[
         float, typer.Option(min=0.0, help="Seconds that running episodes get on SIGTERM.")
     ] = 10.0,
+    _: Version = False,
 ) -> None:
     """Leases episodes from a coordinator and plays them, each policy locked in a sandbox.
 

@@ -7,6 +7,7 @@ failed, 5 a run was cancelled, 130 Ctrl-C.
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 from collections.abc import Coroutine
 from importlib.metadata import EntryPoint, entry_points
@@ -16,8 +17,11 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_app
+from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors
+from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.records.run_difference import differences, left_out
 from evopolicy_common.terminal import say_json, say_lines, terminal
 from evopolicy_gateway.cli import options
@@ -30,18 +34,18 @@ from evopolicy_gateway.operator import trials
 from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
 from evopolicy_gateway.operator.runs import report as report_runs
 from evopolicy_gateway.run import processes
-from evopolicy_gateway.run.gateway import folder_of
+from evopolicy_gateway.run.layout import folder_of
 from evopolicy_gateway.run.plan import Plan
 
 T = TypeVar("T")
 
 COMMANDS_GROUP = "evopolicy.commands"
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+app = App(no_args_is_help=True, add_completion=True)
 
 
 @app.callback()
-def evopolicy() -> None:
+def evopolicy(_: Version = False) -> None:
     """Evaluates agents that evolve policies: opens runs, plays them, and tells what they came to.
 
     Exit codes of commands that play runs: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without
@@ -53,12 +57,19 @@ def evopolicy() -> None:
 @spread
 def run(
     *,
-    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
+    env: Annotated[
+        str,
+        typer.Option(help="Suite id, such as gym/acrobot.", show_default=False, rich_help_panel=options.RUN),
+    ],
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
     local: Annotated[
         bool,
-        typer.Option("--local", help="Bring up a coordinator and a worker here, as `evopolicy local` does."),
+        typer.Option(
+            "--local",
+            help="Bring up a coordinator and a worker here, as `evopolicy local` does.",
+            rich_help_panel=options.CLUSTER,
+        ),
     ] = False,
     given: RunOptions,
     jail: JailOptions,
@@ -78,12 +89,12 @@ def run(
             raise ConfigError(
                 "--data goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --data"
             )
-        isolation = options.isolation_of(hidden_isolation, local=local)
+        options.check_isolation(hidden_isolation, local=local)
         held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
         plans = _plans(given, [options.one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots, data=data, hidden_isolation=isolation)
+            where = Cluster(local_slots=slots, data=data, hidden_isolation=hidden_isolation)
         _play(plans, where, 1, as_json)
 
 
@@ -95,11 +106,14 @@ def local(
         typer.Option(
             help="Suite (core16), suite id or glob (gymnasium/MiniGrid-*); may be repeated.",
             show_default=False,
+            rich_help_panel=options.RUN,
         ),
     ],
     given: RunOptions,
     jail: JailOptions,
-    parallel: Annotated[int, typer.Option(min=1, max=64, help="Runs at once.")] = 1,
+    parallel: Annotated[
+        int, typer.Option(min=1, max=64, help="Runs at once.", rich_help_panel=options.RUN)
+    ] = 1,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
     data: options.DataFolder = None,
@@ -110,8 +124,9 @@ def local(
     """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
     with fail_on_our_errors():
         plans = _plans(given, catalogue.resolve(env), jail.settings())
-        isolation = options.isolation_of(hidden_isolation, local=True)
-        where = Cluster(local_slots=slots, state=state, data=data, audit=audit, hidden_isolation=isolation)
+        where = Cluster(
+            local_slots=slots, state=state, data=data, audit=audit, hidden_isolation=hidden_isolation
+        )
         _play(plans, where, parallel, as_json)
 
 
@@ -151,7 +166,7 @@ def try_policy(
             split="train",
             cases=options.cases_of(cases),
             out=out,
-            tier=options.tier_of(tier),
+            tier=tier,
             limits=options.limits_of(limit or ()),
         )
         where = _trial_cluster(connect, credentials_file, slots, state, data)
@@ -163,7 +178,7 @@ def play_random(
     env: Annotated[
         list[str], typer.Option(help="Suite, suite id or glob; may be repeated.", show_default=False)
     ],
-    split: Annotated[str, typer.Option(help="train, validation or heldout.")] = "heldout",
+    split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
     cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
@@ -175,8 +190,6 @@ def play_random(
     """Plays uniform random actions on a split: the reference that scores are held against."""
     with fail_on_our_errors():
         chosen = None if cases is None else options.cases_of(cases)
-        if split not in ("train", "validation", "heldout"):
-            raise ConfigError(f"--split {split!r}: there are train, validation, heldout")
         where = _trial_cluster(connect, credentials_file, slots, state, data)
         _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
 
@@ -288,17 +301,24 @@ def _exit(code: int) -> None:
 
 def _add_commands_of_other_rooms(arguments: list[str]) -> None:
     """Loads a subcommand when it is named, and all of them for the help: what they import may be large, or missing."""
+    if (
+        "_EVOPOLICY_COMPLETE" in os.environ
+    ):  # a shell asks how a line may go on; each passes the line in its own way
+        line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
+        arguments = line.split()[1:]
     found: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=COMMANDS_GROUP)}
-    named = arguments[0] if arguments else "--help"
-    wanted = [found[named]] if named in found else list(found.values()) if named == "--help" else []
-    for point in wanted:
+    named = arguments[0] if arguments else ""
+    if named in {
+        command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
+    }:
+        return
+    for point in [found[named]] if named in found else found.values():
         try:
             _mount(point.load(), point.name)
-        except ImportError as error:
+        except ModuleNotFoundError as error:
+            module = error.name or ""
             if named == point.name:
-                fail(
-                    f"evopolicy {named} is not installed here ({error}): pip install 'evopolicy[coordinator]'"
-                )
+                fail(missing(EXTRAS.get(module.partition(".")[0], "coordinator"), module))
 
 
 def _mount(other: typer.Typer, name: str) -> None:

@@ -17,56 +17,83 @@ from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.messages.operator import PUBLISHED
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
 
+RUN, SCORE, POLICY, AGENT, JAIL, REMOTE, CLUSTER = (
+    "Run",
+    "Score",
+    "Policy and feedback",
+    "Agent",
+    "Agent's jail",
+    "Remote agent (--agent remote)",
+    "Local cluster",
+)
+"""Groups of options in the commands' help, in the order in which they stand there."""
+
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
-Slots = Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.")]
+Slots = Annotated[
+    int, typer.Option(min=1, max=1024, help="Episodes at once of the local worker.", rich_help_panel=CLUSTER)
+]
 Limits = Annotated[
     list[str] | None,
     typer.Option(
-        "--limit", help="A policy's limit, such as act_wall_s=5 or memory_bytes=2e9; may be repeated."
+        "--limit",
+        metavar="NAME=VALUE",
+        help="A policy's limit, such as act_wall_s=5 or memory_bytes=2e9; may be repeated.",
+        rich_help_panel=POLICY,
     ),
 ]
 DataFolder = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of split files (`evopolicy data make`); default: derived from the state's secret."
+        help="Folder of split files (`evopolicy data make`); default: derived from the state's secret.",
+        rich_help_panel=CLUSTER,
     ),
 ]
 StateFolder = Annotated[
-    Path | None, typer.Option(help="Keep the coordinator's state here; default: thrown away at the end.")
+    Path | None,
+    typer.Option(
+        help="Keep the coordinator's state here; default: thrown away at the end.", rich_help_panel=CLUSTER
+    ),
 ]
-TierName = Annotated[str, typer.Option(help="Sandbox tier that the run demands: bwrap, landlock, none.")]
+TierName = Annotated[Tier, typer.Option(help="Sandbox around the policy.", rich_help_panel=POLICY)]
 Audit = Annotated[
     float,
     typer.Option(
         min=0.0,
         max=1.0,
         metavar="SHARE",
+        rich_help_panel=CLUSTER,
         help="Share of the episodes that a second local worker plays again from their actions, compared bit for bit.",
     ),
 ]
 
 HiddenIsolation = Literal["related", "strict", "off"]
 Isolation = Annotated[
-    str | None,
+    HiddenIsolation | None,
     typer.Option(
         "--hidden-isolation",
-        help="Of the cluster brought up here: related (default), no hidden episode shares a kernel with an agent whose run "
-        "shares its cases; strict, with any agent; off.",
+        help="No hidden episode shares a kernel with an agent whose run shares its cases (related, the default), or with any "
+        "agent (strict).",
+        rich_help_panel=CLUSTER,
+        show_default=False,
     ),
 ]
 HiddenCasesOption = Annotated[
-    str | None,
+    Literal["shared", "per-run"] | None,
     typer.Option(
         "--hidden-cases",
-        help="Validation and held-out cases: shared by all runs of an environment (default), or per-run (nothing can be paired).",
+        help="Shared by all runs of an environment (default), or the run's own (then nothing can be paired).",
+        rich_help_panel=SCORE,
+        show_default=False,
     ),
 ]
 
 
 ProfileOption = Annotated[
-    str | None,
+    Literal["published"] | None,
     typer.Option(
-        help="published: every choice of the published protocol (docs/reference/protocol.md), with its case files in --data."
+        help="Every choice of the published protocol (docs/reference/protocol.md), with its case files in --data.",
+        rich_help_panel=RUN,
+        show_default=False,
     ),
 ]
 OWN = {
@@ -93,11 +120,6 @@ def settings_of(profile: str | None, **told: str | None) -> dict[str, str]:
                 f"profile published has {name} = {usual[name]}, and {value} is asked for: leave out one of them"
             )
     return usual | {name: value for name, value in told.items() if value is not None} | {"profile": chosen}
-
-
-def tier_of(text: str) -> Tier:
-    """The sandbox tier that `--tier` names. ConfigError when there is none of that name."""
-    return one_of("--tier", text, Tier)  # type: ignore[return-value]
 
 
 def default_exp_id() -> str:
@@ -147,14 +169,13 @@ def cases_of(text: str) -> tuple[int, ...]:
     return ids
 
 
-def isolation_of(text: str | None, *, local: bool) -> str | None:
-    """What `--hidden-isolation` asks of a cluster brought up here; None for its default. ConfigError where it is wrong."""
-    if text is not None and not local:
+def check_isolation(asked: HiddenIsolation | None, *, local: bool) -> None:
+    """ConfigError where `--hidden-isolation` is given for a cluster that is not brought up here."""
+    if asked is not None and not local:
         raise ConfigError(
             "--hidden-isolation goes with a cluster brought up here; elsewhere it is the coordinator's:"
             " evopolicy-coordinator --hidden-isolation"
         )
-    return None if text is None else one_of("--hidden-isolation", text, HiddenIsolation)
 
 
 def hidden_cases_of(text: str | None) -> str | None:

@@ -15,15 +15,19 @@ from evopolicy_common.messages.operator import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
 from evopolicy_gateway.cli.options import (
+    AGENT,
+    JAIL,
+    POLICY,
+    REMOTE,
+    RUN,
+    SCORE,
     HiddenCasesOption,
     Limits,
     ProfileOption,
     TierName,
     hidden_cases_of,
     limits_of,
-    one_of,
     settings_of,
-    tier_of,
 )
 from evopolicy_gateway.http.door import Door, agent_host_of, door_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
@@ -34,15 +38,6 @@ Several = list[str] | None
 """An option that may be repeated."""
 
 
-_CHOICES: dict[str, object] = {
-    "policy_scope": PolicyScope,
-    "observations": ObservationForm,
-    "simulation": SimulationRule,
-    "finish": FinishRule,
-    "step_limit": StepLimit,
-}
-
-
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """The run itself."""
 
@@ -51,69 +46,117 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
         typer.Option(
             help="evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, file:AGENT.toml, remote",
             show_default=False,
+            rich_help_panel=RUN,
         ),
     ]
-    budget: Annotated[int | None, typer.Option(min=1, help="Train episodes; default: the suite's.")] = None
-    model: Annotated[
-        str | None, typer.Option(help="Name of the model behind the agent; default: the entry's.")
+    budget: Annotated[
+        int | None, typer.Option(min=1, help="Train episodes; default: the suite's.", rich_help_panel=RUN)
     ] = None
-    entry: Annotated[
-        str | None, typer.Option(help="Name of the leaderboard entry; default: the agent's.")
-    ] = None
-    exp_id: Annotated[str | None, typer.Option(help="Name of this experiment; default: the time.")] = None
-    repeat: Annotated[
-        int, typer.Option(min=0, help="Which repeat of the same agent and environment this is.")
-    ] = 0
-    min_episodes: Annotated[int | None, typer.Option(min=1, help="Fewest episodes of a submit.")] = None
-    max_episodes: Annotated[int | None, typer.Option(min=1, help="Most episodes of a submit.")] = None
-    validation: Annotated[int | None, typer.Option(min=1, help="Hidden validation cases.")] = None
-    heldout: Annotated[int | None, typer.Option(min=1, help="Hidden held-out cases.")] = None
     profile: ProfileOption = None
-    hidden_cases: HiddenCasesOption = None
-    policy_scope: Annotated[
-        str | None,
-        typer.Option(help="episode: a fresh Policy each (default); submit: one through a submit."),
+    runs: Annotated[Path, typer.Option(help="Folder of run directories.", rich_help_panel=RUN)] = Path("runs")
+    exp_id: Annotated[
+        str | None, typer.Option(help="Name of this experiment; default: the time.", rich_help_panel=RUN)
     ] = None
-    observations: Annotated[str | None, typer.Option(help="arrays (default), or lists as published.")] = None
-    simulation: Annotated[
-        str | None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run of that name.", rich_help_panel=RUN)
+    ] = False
+    resume: Annotated[
+        bool,
         typer.Option(
-            help="forbidden: only submits play the environment (default); allowed: the agent may simulate it."
+            "--resume",
+            help="Go on with the run of that --exp-id, whose command was killed.",
+            rich_help_panel=RUN,
+        ),
+    ] = False
+    entry: Annotated[
+        str | None,
+        typer.Option(help="Name of the leaderboard entry; default: the agent's.", rich_help_panel=RUN),
+    ] = None
+    model: Annotated[
+        str | None,
+        typer.Option(help="Name of the model behind the agent; default: the entry's.", rich_help_panel=RUN),
+    ] = None
+    repeat: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Which repeat of the same agent and environment this is.", rich_help_panel=RUN
+        ),
+    ] = 0
+    validation: Annotated[
+        int | None, typer.Option(min=1, help="Hidden validation cases.", rich_help_panel=SCORE)
+    ] = None
+    heldout: Annotated[
+        int | None, typer.Option(min=1, help="Hidden held-out cases.", rich_help_panel=SCORE)
+    ] = None
+    hidden_cases: HiddenCasesOption = None
+    replays: Annotated[
+        VideoOption | None,
+        typer.Option(
+            help="Videos of the score's held-out episodes; default: as --video.",
+            rich_help_panel=SCORE,
+            show_default=False,
         ),
     ] = None
-    finish: Annotated[
-        str | None,
+    min_episodes: Annotated[
+        int | None, typer.Option(min=1, help="Fewest episodes of a submit.", rich_help_panel=POLICY)
+    ] = None
+    max_episodes: Annotated[
+        int | None, typer.Option(min=1, help="Most episodes of a submit.", rich_help_panel=POLICY)
+    ] = None
+    policy_scope: Annotated[
+        PolicyScope | None,
         typer.Option(
-            help="early: an agent may stop before its budget is spent (default); budget: that is an error, as published."
+            help="A fresh Policy for each episode (default), or one through a submit.",
+            rich_help_panel=POLICY,
+            show_default=False,
+        ),
+    ] = None
+    observations: Annotated[
+        ObservationForm | None,
+        typer.Option(
+            help="arrays (default), or lists as published.", rich_help_panel=POLICY, show_default=False
         ),
     ] = None
     step_limit: Annotated[
-        str | None,
+        StepLimit | None,
         typer.Option(
-            help="published: episodes are cut where the published software cuts them (default); natural: by their"
-            " environment alone."
+            help="Episodes are cut where the published software cuts them (default), or by their environment alone.",
+            rich_help_panel=POLICY,
+            show_default=False,
         ),
     ] = None
     tier: TierName = "bwrap"
-    video: Annotated[str, typer.Option(help="Videos in the feedback: off, first, all.")] = "off"
-    replays: Annotated[
-        str | None,
-        typer.Option(help="Videos of the score's held-out episodes: off, first, all; default: as --video."),
-    ] = None
     limit: Limits = None
-    agent_wall_s: Annotated[float, typer.Option(min=1.0, help="Seconds that the agent may take.")] = WALL_S
+    video: Annotated[VideoOption, typer.Option(help="Videos in the feedback.", rich_help_panel=POLICY)] = (
+        "off"
+    )
+    simulation: Annotated[
+        SimulationRule | None,
+        typer.Option(
+            help="forbidden: only submits play the environment (default); allowed: the agent may simulate it.",
+            rich_help_panel=AGENT,
+            show_default=False,
+        ),
+    ] = None
+    finish: Annotated[
+        FinishRule | None,
+        typer.Option(
+            help="early: an agent may stop before its budget is spent (default); budget: that is an error, as published.",
+            rich_help_panel=AGENT,
+            show_default=False,
+        ),
+    ] = None
+    agent_wall_s: Annotated[
+        float, typer.Option(min=1.0, help="Seconds that the agent may take.", rich_help_panel=AGENT)
+    ] = WALL_S
     agent_silence_s: Annotated[
         float,
         typer.Option(
             min=1.0,
             help="A program that asks for no submit, changes no file and takes no processor time for so long is ended.",
+            rich_help_panel=AGENT,
         ),
     ] = SILENCE_S
-    runs: Annotated[Path, typer.Option(help="Folder of run directories.")] = Path("runs")
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of that name.")] = False
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the run of that --exp-id, whose command was killed.")
-    ] = False
 
     def settings(self, env: str, exp_id: str, agent_host: str = "") -> RunSettings:
         """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
@@ -133,45 +176,63 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             **settings_of(
                 self.profile,
                 hidden_cases=hidden_cases_of(self.hidden_cases),
-                **{name: self._one_of(name, kind) for name, kind in _CHOICES.items()},
+                policy_scope=self.policy_scope,
+                observations=self.observations,
+                simulation=self.simulation,
+                finish=self.finish,
+                step_limit=self.step_limit,
             ),  # type: ignore[arg-type]
-            sandbox_tier=tier_of(self.tier),
-            video=one_of("--video", self.video, VideoOption),  # type: ignore[arg-type]
-            replays=None if self.replays is None else one_of("--replays", self.replays, VideoOption),  # type: ignore[arg-type]
+            sandbox_tier=self.tier,
+            video=self.video,
+            replays=self.replays,
             limits=limits_of(self.limit or ()),
         )
-
-    def _one_of(self, name: str, kind: object) -> str | None:
-        told = getattr(self, name)
-        return None if told is None else one_of(f"--{name.replace('_', '-')}", told, kind)
 
 
 class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What the agent sees and reaches."""
 
     jail: Annotated[
-        str,
+        Mode,
         typer.Option(
-            help="Around the agent: bwrap, open-network (jailed, with this machine's network), none. Recorded in run.json."
+            help="Around the agent; open-network: jailed, with this machine's network. Recorded in run.json.",
+            rich_help_panel=JAIL,
         ),
     ] = "bwrap"
     jail_bind: Annotated[
-        Several, typer.Option(help="File or folder that the agent sees, read-only; may be repeated.")
+        Several,
+        typer.Option(
+            metavar="PATH",
+            help="File or folder that the agent sees, read-only; may be repeated.",
+            rich_help_panel=JAIL,
+        ),
     ] = None
-    jail_bind_rw: Annotated[Several, typer.Option(help="File or folder that it may also change.")] = None
+    jail_bind_rw: Annotated[
+        Several,
+        typer.Option(metavar="PATH", help="File or folder that it may also change.", rich_help_panel=JAIL),
+    ] = None
     jail_env: Annotated[
-        Several, typer.Option(help="Variable that is passed on to it, such as an API key's.")
+        Several,
+        typer.Option(
+            metavar="NAME",
+            help="Variable that is passed on to it, such as an API key's.",
+            rich_help_panel=JAIL,
+        ),
     ] = None
     allow_host: Annotated[
         Several,
-        typer.Option(help="HOST or HOST:PORT that it reaches besides its harness's own; may be repeated."),
+        typer.Option(
+            metavar="HOST[:PORT]",
+            help="Host that it reaches besides its harness's own; may be repeated.",
+            rich_help_panel=JAIL,
+        ),
     ] = None
 
     def settings(self) -> JailSettings:
         """The jail that is asked for. ConfigError naming the option that is wrong, or what this machine lacks."""
         started_in = Path.cwd()
         settings = JailSettings(
-            mode=one_of("--jail", self.jail, Mode),  # type: ignore[arg-type]
+            mode=self.jail,
             read=tuple(absolute(path, started_in) for path in self.jail_bind or ()),
             write=tuple(absolute(path, started_in) for path in self.jail_bind_rw or ()),
             environment=tuple(self.jail_env or ()),
@@ -197,19 +258,25 @@ class DoorOptions(msgspec.Struct, frozen=True, kw_only=True):
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help="With --agent remote: the address of this machine on which the agent is served; every request needs the token.",
+            rich_help_panel=REMOTE,
+            help="The address of this machine on which the agent is served; every request needs the token.",
         ),
     ] = None
     http_url: Annotated[
         str | None,
-        typer.Option(help="How the agent reaches it where that is another URL, such as that of a TLS front."),
+        typer.Option(
+            metavar="URL",
+            rich_help_panel=REMOTE,
+            help="How the agent reaches it where that is another URL, such as that of a TLS front.",
+        ),
     ] = None
 
     agent_host: Annotated[
         str | None,
         typer.Option(
             metavar="BOOT_ID|elsewhere",
-            help="With --agent remote: the kernel that the agent runs on (there: cat /proc/sys/kernel/random/boot_id), so that"
+            rich_help_panel=REMOTE,
+            help="The kernel that the agent runs on (there: cat /proc/sys/kernel/random/boot_id), so that"
             " hidden episodes are kept from it; elsewhere: you vouch that it is on no machine of the cluster. Default: it"
             " may be on any, so no hidden episode is played before the agent has ended.",
         ),

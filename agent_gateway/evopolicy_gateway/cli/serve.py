@@ -15,20 +15,21 @@ import orjson
 import structlog
 import typer
 
-from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, run_app, setup_logging
+from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, setup_logging
+from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.http.door import AgentPlace, place_of
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.control import Orders, Progress, Ready, RunClosed, Waits
-from evopolicy_gateway.run.gateway import Close, Gateway, folder_of
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.run.layout import RunFolder, folder_of
 from evopolicy_gateway.submits.desk import Desk
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = App(add_completion=True)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
@@ -60,6 +61,7 @@ def serve(
         bool,
         typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
     ] = False,
+    _: Version = False,
 ) -> None:
     """Serves the workspace of one run on a loopback port, and prints the variables that its agent is started with.
 

@@ -17,7 +17,7 @@ import typer
 from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
-from evopolicy_common.processes.preflight import check_loopback, check_writable
+from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway.cli import options
@@ -63,9 +63,7 @@ def suite(
     parallel: Annotated[
         int | None, typer.Option(min=1, max=256, help="Runs at once, over the file's.")
     ] = None,
-    changed: Annotated[
-        str, typer.Option(help="Runs whose settings the file has changed: refuse, keep, rerun.")
-    ] = "refuse",
+    changed: Annotated[Changed, typer.Option(help="Runs whose settings the file has changed.")] = "refuse",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and stop.")] = False,
     slots: options.Slots = 2,
     state: Annotated[
@@ -85,9 +83,7 @@ def suite(
             raise ConfigError(
                 "--audit goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --audit"
             )
-        isolation = options.isolation_of(hidden_isolation, local=local)
-        if changed not in ("refuse", "keep", "rerun"):
-            raise ConfigError(f"--changed {changed!r}: there are refuse, keep, rerun")
+        options.check_isolation(hidden_isolation, local=local)
         wanted = suite_file.read(file)
         if parallel is not None:
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
@@ -105,7 +101,7 @@ def suite(
                 state=state or root / ".cluster",
                 data=data,
                 audit=audit,
-                hidden_isolation=isolation,
+                hidden_isolation=hidden_isolation,
             )
         where.check_cases(run.settings for run in expanded)
         order = Order(
@@ -113,7 +109,7 @@ def suite(
             runs=tuple(expanded),
             root=root,
             where=where,
-            changed=changed,  # type: ignore[arg-type]
+            changed=changed,
             dry_run=dry_run,
             as_json=as_json,
         )
@@ -129,6 +125,7 @@ async def _suite(order: Order) -> int:
     console = terminal(stderr=order.as_json)
     check_writable(order.root, "--runs")
     check_loopback()
+    check_installed("gateway")
     with alone(order.root / ".lock", order.root):
         index = suite_index.load(order.root, order.suite.name)
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))

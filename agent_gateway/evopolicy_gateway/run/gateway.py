@@ -211,12 +211,3 @@ def _load(
     if file is not None:
         found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
     return credentials.at(found, connect), run
-
-
-def folder_of(path: Path) -> RunFolder:
-    """The run folder at `path`; ConfigError when there is no such folder."""
-    if not path.is_dir():
-        raise ConfigError(
-            f"{path} is not a folder; name a run directory such as runs/evolve/gym_acrobot/first"
-        )
-    return RunFolder(path.absolute())

@@ -210,3 +210,12 @@ def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
 def save(path: Path, value: msgspec.Struct) -> None:
     """Writes a small private file of the gateway's folder."""
     write_atomically(path, msgspec.json.encode(value), mode=0o600)
+
+
+def folder_of(path: Path) -> RunFolder:
+    """The run folder at `path`; ConfigError when there is no such folder."""
+    if not path.is_dir():
+        raise ConfigError(
+            f"{path} is not a folder; name a run directory such as runs/evolve/gym_acrobot/first"
+        )
+    return RunFolder(path.absolute())

@@ -8,7 +8,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_common.processes.preflight import check_loopback, check_text, check_writable
+from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
@@ -53,6 +53,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     def check_held(self) -> None:
         """`check` for who may hold the folder's lock."""
         check_text(self.started_in, "cd")
+        check_installed("gateway")
         check_writable(self.runs, "--runs")
         if self.door is None:
             check_loopback()

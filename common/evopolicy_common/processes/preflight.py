@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 import os
 import socket
 import tempfile
@@ -128,4 +129,33 @@ def no_loopback(error: OSError) -> str:
     return (
         f"cannot listen on {LOOPBACK}, where the agent's service is: {error.strerror or error}; bring IPv4 loopback up with"
         " `ip link set lo up` (in a container: give it a network)"
+    )
+
+
+EXTRAS = {
+    "cryptography": "coordinator",
+    "jinja2": "coordinator",
+    "matplotlib": "coordinator",
+    "starlette": "gateway",
+    "uvicorn": "gateway",
+    "h11": "gateway",
+    "gymnasium": "worker",
+    "mujoco": "worker",
+    "av": "worker",
+}
+"""Which extra of the package brings a module that its base does without."""
+
+
+def check_installed(extra: str) -> None:
+    """ConfigError with what to install where a module of the package's extra is missing."""
+    for module, its in EXTRAS.items():
+        if its == extra and importlib.util.find_spec(module) is None:
+            raise ConfigError(missing(extra, module))
+
+
+def missing(extra: str, module: str) -> str:
+    """The error for a module of an extra that is not installed, with the remedy."""
+    return (
+        f"the {extra} part of evopolicy is not installed here (no module {module!r}):"
+        f" pip install 'evopolicy[{extra}]'"
     )

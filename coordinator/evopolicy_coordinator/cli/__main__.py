@@ -1,6 +1,6 @@
 """`python -m evopolicy_coordinator.cli`: the same as `evopolicy-coordinator`."""
 
-from evopolicy_coordinator.cli.main import main
+from evopolicy_coordinator.cli import program
 
 if __name__ == "__main__":
-    main()
+    program()

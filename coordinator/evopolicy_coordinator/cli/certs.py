@@ -6,13 +6,14 @@ import contextlib
 import datetime as dt
 import socket
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import msgspec
 import typer
 from rich.table import Table
 
 from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_common.wire.credentials import MachineRole, default_state_dir
@@ -20,9 +21,7 @@ from evopolicy_coordinator.pki import certs, machines
 from evopolicy_coordinator.pki.machines import Machine, Machines
 from evopolicy_coordinator.storage.state_folder import cluster_of
 
-app = typer.Typer(
-    help="Certificates for the machines of a cluster.", no_args_is_help=True, rich_markup_mode=None
-)
+app = App(help="Certificates for the machines of a cluster.", no_args_is_help=True)
 
 PORT = 7447
 """Where a coordinator is taken to listen, unless told otherwise."""
@@ -83,7 +82,7 @@ def init(
 
 @app.command(epilog="Example: evopolicy-coordinator certs issue worker gpu-7 --out ./gpu-7")
 def issue(
-    role: Annotated[str, typer.Argument(help="worker, gateway, operator or router.", show_default=False)],
+    role: Annotated[MachineRole, typer.Argument(help="What the machine is let in as.", show_default=False)],
     name: Annotated[str, typer.Argument(help="The machine's name.", show_default=False)],
     state: State = None,
     out: Annotated[Path | None, typer.Option(help="New folder for it [./ROLE-NAME].")] = None,
@@ -110,12 +109,11 @@ def issue(
     """
     with fail_on_our_errors():
         root = state or default_state_dir()
-        kind = _role(role)
         folder = out or Path(f"{role}-{name}")
         made = machines.issue(
             root,
             cluster_of(root, None),
-            kind,
+            role,
             name,
             tuple(connect or ()) or (first_endpoint(root),),
             folder,
@@ -140,9 +138,9 @@ def issue(
             "gateway": "evopolicy-gateway RUN_DIRECTORY",
             "operator": "evopolicy run --env gym/acrobot --agent evolve",
         }.get(role)
-        if start is not None and kind != "gateway":
+        if start is not None and role != "gateway":
             say(f"there: {start} --credentials {folder.name}")
-        if kind == "router":
+        if role == "router":
             say(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
 
 
@@ -205,13 +203,6 @@ def _told(machine: Machine) -> dict[str, object]:
         "expires": machine.expires,
         "revoked": machine.revoked,
     }
-
-
-def _role(text: str) -> MachineRole:
-    for role in get_args(MachineRole):
-        if text == role:
-            return role  # type: ignore[no-any-return]
-    raise ConfigError(f"ROLE {text!r}: there are {', '.join(get_args(MachineRole))}")
 
 
 def first_endpoint(root: Path) -> str:

@@ -17,17 +17,16 @@ from rich import box
 from rich.table import Table
 
 from evopolicy_common import catalogue
+from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.terminal import say, say_json, terminal
 from evopolicy_coordinator import splits
 
-app = typer.Typer(
+app = App(
     name="data",
     help="Make and check the split files of environments (hidden cases: keep them from agents).",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
 )
 
 

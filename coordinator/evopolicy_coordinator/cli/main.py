@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors, run_app, setup_logging
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.cli import fail_on_our_errors, setup_logging
+from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
@@ -23,16 +22,7 @@ from evopolicy_coordinator.server import process, router_config
 from evopolicy_coordinator.server.process import Options
 from evopolicy_coordinator.storage.backup import back_up
 
-
-class Isolation(StrEnum):
-    """`CoreSettings.hidden_isolation`, as an option."""
-
-    RELATED = "related"
-    STRICT = "strict"
-    OFF = "off"
-
-
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = App(add_completion=True)
 app.add_typer(certs_cli.app, name="certs")
 app.command(
     "router-config",
@@ -90,12 +80,12 @@ def serve(
         ),
     ] = 0.0,
     hidden_isolation: Annotated[
-        Isolation,
+        Literal["related", "strict", "off"],
         typer.Option(
             help="On kernels with which agents, and beside which train episodes, no hidden episode is played: those of"
             " `related` runs, which share a hidden case; `strict`: all; `off`: none, and runs are stamped `shared`.",
         ),
-    ] = Isolation.RELATED,
+    ] = "related",
     hidden_wait: Annotated[
         float,
         typer.Option(
@@ -109,7 +99,10 @@ def serve(
         Path | None,
         typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
     ] = None,
-    log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    log_level: Annotated[
+        Literal["debug", "info", "warning", "error"], typer.Option(help="Least level that is logged.")
+    ] = "info",
+    _: Version = False,
 ) -> None:
     """Coordinates a cluster: workers and gateways connect to it, with the credentials that it writes.
 
@@ -118,8 +111,6 @@ def serve(
     if context.invoked_subcommand is not None:
         return
     with fail_on_our_errors():
-        if log_level not in ("debug", "info", "warning", "error"):
-            raise ConfigError(f"--log-level {log_level!r}: say debug, info, warning or error")
         setup_logging(log_level)
         options = Options(
             state=state or default_state_dir(),
@@ -129,7 +120,7 @@ def serve(
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
             core=CoreSettings(
-                audit_share=audit, hidden_isolation=hidden_isolation.value, hidden_wait_s=hidden_wait
+                audit_share=audit, hidden_isolation=hidden_isolation, hidden_wait_s=hidden_wait
             ),
         )
         try:

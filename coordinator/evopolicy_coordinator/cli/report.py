@@ -16,6 +16,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common.cli import code_of
+from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json, say_lines, terminal
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 NOTHING, MIXED = 1, 3
 
-app = typer.Typer(name="report", add_completion=False, rich_markup_mode=None)
+app = App(name="report")
 
 
 @app.command(

@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.commands import App
 from evopolicy_common.messages.operator import (
     StatusReply,
 )
@@ -28,22 +29,16 @@ from evopolicy_common.wire.operator_client import OperatorClient
 
 T = TypeVar("T")
 
-status_app = typer.Typer(
-    name="status", help="What a cluster is doing.", add_completion=False, rich_markup_mode=None
-)
-workers_app = typer.Typer(
+status_app = App(name="status", help="What a cluster is doing.")
+workers_app = App(
     name="workers",
     help="Take workers out of service and back.",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
 )
-runs_app = typer.Typer(
+runs_app = App(
     name="runs",
     help="An operator's word on runs.",
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
 )
 
 
@@ -129,11 +124,6 @@ def resume(
     """Take a worker back that was paused or drained, or quarantined by an audit."""
     _asking(connect, file, lambda operator: operator.set_worker(worker, "active"))
     say(f"{worker} is active")
-
-
-@runs_app.callback()
-def runs() -> None:
-    """An operator's word on runs."""
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")

@@ -12,19 +12,16 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import bytes_text, fail_on_our_errors
+from evopolicy_common.commands import App
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_coordinator.storage import upkeep
 
-gc_app = typer.Typer(
-    name="gc", help="Remove what finished runs left.", add_completion=False, rich_markup_mode=None
-)
-disk_app = typer.Typer(
+gc_app = App(name="gc", help="Remove what finished runs left.")
+disk_app = App(
     name="disk",
     help="What a state folder holds and a sweep will need.",
-    add_completion=False,
-    rich_markup_mode=None,
 )
 
 StateOption = Annotated[

@@ -11,13 +11,14 @@ import contextlib
 import random
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated
 
 import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
+from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster, unless_failed
@@ -29,7 +30,7 @@ from evopolicy_coordinator.verify.source import read_run, sample
 DIFFERS, USAGE, UNCHECKED = 1, 2, 3
 _SHOWN = 20
 
-app = typer.Typer(name="verify", add_completion=False, rich_markup_mode=None)
+app = App(name="verify")
 
 
 class _Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,8 +79,8 @@ def verify(
     ] = None,
     slots: Annotated[int, typer.Option(min=1, max=1024, help="With --local: episodes at once.")] = 2,
     tier: Annotated[
-        str | None,
-        typer.Option(help="Sandbox tier of the workers' slots: bwrap, landlock, none; default: the run's."),
+        Tier | None,
+        typer.Option(help="Sandbox tier of the workers' slots; default: the run's.", show_default=False),
     ] = None,
     policy: Annotated[
         bool,
@@ -95,8 +96,6 @@ def verify(
         fail("--state and --data go with --local")
     if local and (connect or file is not None):
         fail("--local brings up its own cluster: it does not go with --connect or --credentials")
-    if tier is not None and tier not in get_args(Tier):
-        fail(f"--tier {tier!r}: there are {', '.join(get_args(Tier))}")
     options = _Options(
         run=run,
         sample=sample_,
@@ -107,7 +106,7 @@ def verify(
         state=state,
         data=data,
         slots=slots,
-        tier=cast(Tier | None, tier),
+        tier=tier,
         policy=policy,
     )
     console = terminal(stderr=as_json)

@@ -109,10 +109,6 @@ def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda state: certs_cli.issue("king", "k", state=state),
-            "there are worker, gateway, operator, router",
-        ),
         (lambda state: certs_cli.issue("router", "r", state=state), "needs a --host"),
         (lambda state: certs_cli.issue("worker", "a b", state=state), "NAME 'a b'"),
         (lambda state: certs_cli.issue("worker", "w", state=state / "new"), "certs init"),

@@ -8,6 +8,8 @@ from typing import Any
 
 import msgspec
 import pytest
+import typer
+from documents import parse
 from finished_run import SETTINGS, finished
 from hypothesis import given
 from hypothesis import strategies as st
@@ -158,8 +160,9 @@ def test_wrong_option_values_name_the_option() -> None:
         ("profile", "p"),
     ]
     for field, text in (*choices, ("tier", "docker"), ("video", "on")):
-        with pytest.raises(ConfigError, match=f"--{field.replace('_', '-')} '{text}'"):
-            RunOptions(agent="evolve", **{field: text}).settings("toy/line", "t")
+        option = f"--{field.replace('_', '-')}"
+        with pytest.raises(typer.BadParameter, match=f"'{text}' is not one of"):
+            parse(["evopolicy", "run", "--env", "toy/line", "--agent", "evolve", option, text])
 
 
 def test_profile_published_makes_every_published_choice_and_takes_no_other() -> None:

@@ -1,0 +1,147 @@
+"""The frame of every command: help in groups, `--version`, shell completion, usage errors, and what is not installed."""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import re
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, NoReturn, TypeVar
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+import evopolicy_common
+from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
+from evopolicy_common.processes.preflight import EXTRAS, missing
+from evopolicy_common.terminal import end_without_reader, say
+
+# typer brings click with it, under a name of its own in newer versions: only its public exceptions lead there.
+_ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_SETTINGS = {"help_option_names": ["-h", "--help"]}
+_METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "PATH", "directory": "DIR"}
+"""How values are shown in help, by the type's name."""
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        say(f"evopolicy {evopolicy_common.__version__} (Python {platform.python_version()})")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool,
+    typer.Option(
+        "--version",
+        is_eager=True,
+        callback=_show_version,
+        help="Show the version and exit.",
+        show_default=False,
+    ),
+]
+"""Of each program's first level."""
+
+
+class _Help:
+    """Options under the heading of their `rich_help_panel`, in plain text: it folds on narrow terminals, and pipes well."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):  # type: ignore[attr-defined]
+            record = param.get_help_record(ctx)
+            if record is None:
+                continue
+            usual = "Options" if param.param_type_name == "option" else "Arguments"
+            name = getattr(param, "rich_help_panel", None) or usual
+            groups.setdefault(name, []).append((_value_names(record[0]), record[1]))
+        if "Options" in groups:  # last: where there are groups, they tell more
+            others = groups.pop("Options")
+            groups["Other options" if groups.keys() - {"Arguments"} else "Options"] = others
+        for name, records in groups.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+        if isinstance(self, TyperGroup):
+            self.format_commands(ctx, formatter)
+
+
+class Command(_Help, TyperCommand):
+    """A command whose help is grouped."""
+
+
+class Group(_Help, TyperGroup):
+    """A group of commands that, without one, shows its help and ends as wrong usage does."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        shown = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        # Whole sentences, folded: typer would cut them to one line.
+        rows = [(name, each.get_short_help_str(1000)) for name, each in shown if each and not each.hidden]
+        if rows:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args and self.no_args_is_help and not ctx.resilient_parsing:
+            say(ctx.get_help(), err=True)
+            raise typer.Exit(USAGE_ERROR)
+        return super().parse_args(ctx, args)
+
+
+class App(typer.Typer):
+    """A `typer.Typer` of ours: `-h`, plain help in groups, and no traceback of typer's."""
+
+    def __init__(self, **options: Any) -> None:
+        settings = {"help_option_names": ["-h", "--help"]}
+        usual = {
+            "cls": Group,
+            "rich_markup_mode": None,
+            "add_completion": False,
+            "context_settings": settings,
+        }
+        super().__init__(**(usual | options))
+
+    def command(self, name: str | None = None, **options: Any) -> Callable[[Function], Function]:
+        """As typer's; the command's help is grouped and knows `-h`."""
+        usual: dict[str, Any] = {"cls": Command, "context_settings": _SETTINGS}
+        return super().command(name, **(usual | options))
+
+
+def run_app(app: typer.Typer) -> NoReturn:
+    """Runs the command that `sys.argv` names, and exits."""
+    setup_notices()
+    end_without_reader()
+    try:
+        with needed_extras(), fail_on_our_errors():
+            code = typer.main.get_command(app).main(standalone_mode=False)
+    except _ClickError as error:
+        fail(_usage_text(error), USAGE_ERROR)
+    except (typer.Abort, KeyboardInterrupt):
+        fail("interrupted", 130)
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+@contextlib.contextmanager
+def needed_extras() -> Iterator[None]:
+    """Ends the command with the extra to install where a module of one is missing inside the `with`."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        fail(missing(extra, error.name or ""))
+
+
+def _value_names(text: str) -> str:
+    """`--runs <path>` as `--runs PATH`, `--env <list[str]>` as `--env TEXT`; choices stay as they are."""
+    return re.sub(
+        r"<(?:list\[)?(\w+)(?: range)?\]?>", lambda found: _METAVARS.get(found[1].lower(), found[0]), text
+    )
+
+
+def _usage_text(error: Any) -> str:
+    text = " ".join(str(error.format_message()).split()).replace("Value error, ", "") or "wrong usage"
+    context = getattr(error, "ctx", None)
+    return text if context is None else f"{text.rstrip('.')}; see {context.command_path} --help"

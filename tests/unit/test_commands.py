@@ -1,0 +1,173 @@
+"""How every command looks: help, version, completion, usage errors, and what it says without its extra."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from documents import APPS, commands
+
+BIN = Path(sys.executable).parent
+PROGRAMS = sorted(APPS)
+GROUPS = [
+    ["evopolicy"],
+    ["evopolicy", "data"],
+    ["evopolicy", "workers"],
+    ["evopolicy", "runs"],
+    ["evopolicy-coordinator", "certs"],
+]
+MODULES = {
+    "evopolicy": "evopolicy_gateway.cli.main:main",
+    "evopolicy-coordinator": "evopolicy_coordinator.cli:program",
+    "evopolicy-gateway": "evopolicy_gateway.cli:gateway_program",
+    "evopolicy-worker": "evopolicy_worker.cli:main",
+}
+
+WITHOUT = """
+import importlib, sys
+blocked = sys.argv.pop(1).split(",")
+
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in blocked:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+class NoSpec:
+    def __call__(self, name, *rest):
+        return None if name.partition(".")[0] in blocked else find_spec(name, *rest)
+
+
+import importlib.util
+find_spec = importlib.util.find_spec
+importlib.util.find_spec = NoSpec()
+sys.meta_path.insert(0, Blocker())
+module, function = sys.argv.pop(1).split(":")
+getattr(importlib.import_module(module), function)()
+"""
+"""Starts a program in which some modules cannot be imported, as where their extra is not installed."""
+
+
+def started(words: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [BIN / words[0], *words[1:]],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | environment,
+        timeout=120,
+    )
+
+
+def without(modules: str, words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT, modules, MODULES[words[0]], *words[1:]],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env=os.environ | {"XDG_STATE_HOME": str(folder / "state")},
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize("words", GROUPS, ids=" ".join)
+def test_a_group_without_a_command_shows_its_help_and_ends_as_wrong_usage(words: list[str]) -> None:
+    done = started(words)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"Usage: {' '.join(words)} [OPTIONS] COMMAND [ARGS]...\n\n  ")
+    assert "\nCommands:\n" in done.stderr
+    assert "error:" not in done.stderr
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_tells_its_version_and_how_a_line_goes_on(program: str) -> None:
+    assert started([program, "--version"]).stdout.startswith("evopolicy 0.")
+    variable = f"_{program.upper().replace('-', '_')}_COMPLETE"
+    asked = {variable: "complete_bash", "COMP_WORDS": f"{program} --ver", "COMP_CWORD": "1"}
+    assert started([program], **asked).stdout.split() == ["--version"]
+
+
+def test_completion_knows_the_commands_and_choices_of_all_rooms() -> None:
+    asked = {"_EVOPOLICY_COMPLETE": "complete_bash"}
+    assert started(["evopolicy"], **asked, COMP_WORDS="evopolicy wor", COMP_CWORD="1").stdout.split() == [
+        "workers"
+    ]
+    words = started(["evopolicy"], **asked, COMP_WORDS="evopolicy workers pa", COMP_CWORD="2").stdout.split()
+    assert words == ["pause"]
+    words = started(
+        ["evopolicy"], **asked, COMP_WORDS="evopolicy local --tier b", COMP_CWORD="3"
+    ).stdout.split()
+    assert words == ["bwrap"]
+
+
+def test_every_command_knows_h_and_shows_no_python_types() -> None:
+    for name, command in commands():
+        context = command.make_context(name, [], resilient_parsing=True)
+        assert "-h" in context.help_option_names, name
+        told = command.get_help(context)
+        for kind in ("<str>", "<int", "<float", "<path>", "list["):
+            assert kind not in told, (name, kind)
+
+
+def test_choices_are_shown_and_a_wrong_one_is_told_with_those_that_are() -> None:
+    told = started(["evopolicy", "local", "--help"]).stdout
+    for choices in ("<bwrap|landlock|none>", "<bwrap|open-network|none>", "<off|first|all>"):
+        assert choices in told
+    done = started(["evopolicy", "run", "--env", "toy", "--agent", "evolve", "--tier", "x"])
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: Invalid value for '--tier': 'x' is not one of 'bwrap', 'landlock', 'none'; see evopolicy run --help\n"
+    )
+
+
+def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:
+    told = started(["evopolicy", "local", "--help"], COLUMNS="60").stdout
+    headings = [line[:-1] for line in told.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings[0] == "Run"
+    assert headings[-1] == "Other options"
+    assert len(headings) >= 6
+    assert max(map(len, told.splitlines())) <= 60
+
+
+def test_a_mistyped_command_is_answered_with_the_nearest() -> None:
+    assert "Did you mean 'status'?" in started(["evopolicy", "statsu"]).stderr
+
+
+@pytest.mark.parametrize(
+    ("modules", "words", "extra"),
+    [
+        ("starlette,uvicorn,h11", ["evopolicy-gateway", "x"], "gateway"),
+        (
+            "starlette,uvicorn,h11",
+            ["evopolicy", "run", "--env", "gym/acrobot", "--agent", "evolve"],
+            "gateway",
+        ),
+        ("starlette,uvicorn,h11", ["evopolicy", "local", "--env", "toy", "--agent", "evolve"], "gateway"),
+        ("starlette,uvicorn,h11", ["evopolicy", "suite", "smoke.toml", "--local"], "gateway"),
+        ("cryptography", ["evopolicy-coordinator"], "coordinator"),
+        ("cryptography", ["evopolicy-coordinator", "certs", "init"], "coordinator"),
+        ("jinja2,matplotlib", ["evopolicy", "report", "RUN", "--out", "report"], "coordinator"),
+        ("gymnasium,mujoco,av", ["evopolicy-worker", "--env", "gym/acrobot"], "worker"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "_".join(value[:2]),
+)
+def test_a_command_without_its_extra_names_it(
+    modules: str, words: list[str], extra: str, tmp_path: Path
+) -> None:
+    done = without(modules, words, tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ")
+    assert f"pip install 'evopolicy[{extra}]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("words", [["status"], ["verify", "x"], ["data", "check", "x"], ["gc", "--dry-run"]])
+def test_commands_that_serve_nothing_do_without_the_gateways_extra(words: list[str], tmp_path: Path) -> None:
+    done = without("starlette,uvicorn,h11", ["evopolicy", *words], tmp_path)
+    assert "pip install" not in done.stderr
+    assert "Traceback" not in done.stderr
