@@ -29,6 +29,7 @@ from evopolicy_coordinator.core.records import (
     WorkerRow,
     train_group,
 )
+from evopolicy_coordinator.server.words import words
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -391,7 +392,7 @@ class Checkers:
         self._steps += 1
         quiet_s = self._simulation.world.now - max(self._moved_at, self._simulation.world.calm_at)
         if quiet_s > QUIET_S:
-            status = core.status(self._simulation.world.now)
+            status = core.status(self._simulation.world.now, words)
             want(
                 False, "it goes on", f"nothing was committed for {quiet_s:.0f} s", status.runs, status.stalls
             )

@@ -27,11 +27,13 @@ from evopolicy_coordinator.core.effects import (
     ReadEvaluation,
     ReadFinished,
     ReadResults,
+    Refuse,
     Reply,
 )
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import evaluation_group, submit_done, train_group
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.server.words import message
 
 PAGE = 5
 """Episodes in a page, at most."""
@@ -209,7 +211,7 @@ class SimCoordinator:
         self.life += 1
         self.world.after(0.2, self.start)
 
-    def _carry_out(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> None:
+    def _carry_out(self, effect: Reply | Refuse | ReadResults | ReadEvaluation | ReadFinished) -> None:
         who = self._asks.pop(int(effect.request), None)
         if who is None:
             return
@@ -219,10 +221,10 @@ class SimCoordinator:
         self.checkers.answering(request, message)
         self.world.send(endpoint, answer, message)
 
-    def _message(self, effect: Reply | ReadResults | ReadEvaluation | ReadFinished) -> Any:
+    def _message(self, effect: Reply | Refuse | ReadResults | ReadEvaluation | ReadFinished) -> Any:
         match effect:
-            case Reply():
-                return effect.message
+            case Reply() | Refuse():
+                return message(effect)
             case ReadFinished():
                 return self.disk.finished[effect.run].result
             case ReadResults():

@@ -21,6 +21,7 @@ from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_common.messages.operator import SetWorker
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.server.words import words
 
 HORIZON_S = 1500.0
 """Simulated seconds after which what is not finished never will be."""
@@ -240,7 +241,7 @@ class Simulation:
         if not finished:
             missing = {plan.name for plan in self.plans} - self.checkers.finished_runs
             core = self.coordinator.core
-            status = None if core is None else core.status(self.world.now)
+            status = None if core is None else core.status(self.world.now, words)
             raise ViolationError(f"runs that never finish: {sorted(missing)}; {status}")
         self.world.calm_at = self.world.now
         self.world.run(self.world.now + 20.0, lambda: False)

@@ -16,8 +16,10 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.wire.refusals import Refusal
 
 from .events import RequestId
+from .reasons import Reason
 from .records import Row
 
 
@@ -33,6 +35,17 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
     request: RequestId
     message: Message
+    waits_for: Reason | None = None
+    """What the message says in words that somebody waits for; None for nothing."""
+    stimulus_id: str = ""
+
+
+class Refuse(msgspec.Struct, frozen=True, kw_only=True):
+    """Answer the query `request` with `Refused`: the status, and the reason in words."""
+
+    request: RequestId
+    status: Refusal
+    reason: Reason
     stimulus_id: str = ""
 
 
@@ -51,7 +64,7 @@ class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     cursor: int
     upto: int | None
     """None for a run that is finished: then the row's `released`. `Refused("unknown_submit")` when there is no row."""
-    waits_for: str = ""
+    waits_for: Reason | None = None
     held_s: float = 0.0
     stimulus_id: str = ""
 
@@ -66,7 +79,7 @@ class ReadEvaluation(msgspec.Struct, frozen=True, kw_only=True):
     upto: int
     total: int
     finished: bool
-    waits_for: str = ""
+    waits_for: Reason | None = None
     stimulus_id: str = ""
 
 
@@ -116,4 +129,4 @@ ReadEffect = ReadResults | ReadEvaluation | ReadFinished
 AuditEffect = PrepareAudit | CompareAudit
 """Answered by an event, in time."""
 
-Effect = Persist | Reply | ReadEffect | AuditEffect | Log
+Effect = Persist | Reply | Refuse | ReadEffect | AuditEffect | Log

@@ -20,6 +20,7 @@ from .effects import Effect
 from .isolation import stays
 from .leasing import expiry, fleet, queue
 from .model import LaneKey
+from .reasons import Reason
 from .records import Snapshot
 from .runs import (
     audits,
@@ -33,7 +34,7 @@ from .runs import (
 )
 from .settings import CoreSettings
 from .state import State
-from .status import CoreStatus
+from .status import CoreStatus, Words
 from .step import Step
 from .structures.story import StoryLine
 from .workers import handin, membership, scheduler
@@ -96,17 +97,17 @@ class Core:
         """The token of a run's gateway, finished runs too; None for no run."""
         return self.state.capabilities.get(run)
 
-    def over(self, run: str) -> tuple[Refusal, str]:
-        """Why nothing more is taken of a run that is not open, in a word and a sentence."""
+    def over(self, run: str) -> tuple[Refusal, Reason]:
+        """Why nothing more is taken of a run that is not open."""
         return known.over(self.state, run)
 
     def worker_of(self, session: str) -> str | None:
         """The worker whose present session is `session` (its right to read and write blobs); None when it is nobody's."""
         return self.state.sessions.get(session)
 
-    def status(self, now: float) -> CoreStatus:
-        """The core's part of a `StatusReply`."""
-        return status.status(self.state, now)
+    def status(self, now: float, words: Words) -> CoreStatus:
+        """The core's part of a `StatusReply`; `words` puts a reason into words."""
+        return status.status(self.state, now, words)
 
     def story(self, key: str) -> list[StoryLine]:
         """What happened to a job, lease, worker, group or run, oldest first, as far back as is kept."""

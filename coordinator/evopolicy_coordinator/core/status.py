@@ -5,6 +5,7 @@ Looks at everything, so it is for a status request only, never for an event.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from evopolicy_common.messages.operator import RunStatus, WorkerStatus
@@ -13,9 +14,13 @@ from .agents import permits
 from .isolation import bars
 from .leasing import pins
 from .model import AUDIT, Lane, Run, Worker
+from .reasons import Reason
 from .runs import audits, finished
 from .runs.waits import waits_for
 from .state import State
+
+Words = Callable[[Reason | None], str]
+"""Puts a reason into words; nothing for none."""
 
 
 class CoreStatus(NamedTuple):
@@ -35,10 +40,10 @@ class CoreStatus(NamedTuple):
     quarantined: dict[str, str]
 
 
-def status(state: State, now: float) -> CoreStatus:
-    """The core's part of a `StatusReply`."""
+def status(state: State, now: float, words: Words) -> CoreStatus:
+    """The core's part of a `StatusReply`; `words` puts a reason into words."""
     workers = tuple(_worker(state, worker, now) for worker in state.workers.values())
-    runs = tuple(_run(state, run) for run in state.runs.values())
+    runs = tuple(_run(state, run, words) for run in state.runs.values())
     states: dict[str, int] = {}
     for row in [row for run in state.runs.values() for row in run.audits.values()]:
         states[row.state] = states.get(row.state, 0) + 1
@@ -47,7 +52,7 @@ def status(state: State, now: float) -> CoreStatus:
         episodes_per_s=state.rate.per_s(now),
         workers=workers,
         runs=runs,
-        stalls=_stalls(state, now),
+        stalls=_stalls(state, now, words),
         audit_share=state.settings.audit_share,
         audits=states,
         disputes=(*state.disputes, *audits.undecided(state)),
@@ -76,26 +81,27 @@ def _worker(state: State, worker: Worker, now: float) -> WorkerStatus:
     )
 
 
-def _run(state: State, run: Run) -> RunStatus:
+def _run(state: State, run: Run, words: Words) -> RunStatus:
     groups = [group for group in state.groups.values() if group.run == run.id and group.kind != "audit"]
-    waiting = [text for group in groups if (text := waits_for(state, group))]
+    waiting = [reason for group in groups if (reason := waits_for(state, group)) is not None]
+    progress, waits = finished.progress(state, run)
     return RunStatus(
         run=run.id,
         entry=run.row.settings.entry,
         env=run.row.settings.env,
-        phase=finished.progress(state, run).phase,
+        phase=progress.phase,
         budget=run.row.budget,
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
         queued=sum(run.flow.n_ready[:AUDIT]),
         running=run.flow.n_leased,
         done=run.ledger.settled + sum(group.done for group in groups),
-        waits_for=waiting[0] if waiting else finished.progress(state, run).waits_for,
+        waits_for=words(waiting[0] if waiting else waits),
         agent_host=permits.agents(state, run.id),
     )
 
 
-def _stalls(state: State, now: float) -> tuple[str, ...]:
+def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
     """What waits longer than `stall_s`, oldest group first."""
     stalls: list[str] = []
     limit_s = state.settings.stall_s
@@ -105,7 +111,7 @@ def _stalls(state: State, now: float) -> tuple[str, ...]:
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         if waiting:
             oldest = min(waiting, key=lambda job: job.since)
-            what = waits_for(state, group) or _behind(group.flow.lane)
+            what = words(waits_for(state, group)) or _behind(group.flow.lane)
             again = (
                 f", after {oldest.failures} faults, the last: {oldest.last_failure}"
                 if oldest.failures

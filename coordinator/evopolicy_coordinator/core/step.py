@@ -16,13 +16,14 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.messages.worker import JobResult, Message, Refused
+from evopolicy_common.messages.worker import JobResult, Message
 from evopolicy_common.wire.refusals import Refusal
 
 from . import transitions
-from .effects import Effect, Log, Persist, Reply
+from .effects import Effect, Log, Persist, Refuse, Reply
 from .events import RequestId
 from .model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
+from .reasons import Reason
 from .records import AuditRow, Row, SubmitRow
 
 # ---- news ----
@@ -133,13 +134,15 @@ class Step:
         """Let the shell do something once the rows are durable."""
         self._out.append(effect)
 
-    def reply(self, request: RequestId, message: Message) -> None:
-        """Answer a request."""
-        self._out.append(Reply(request=request, message=message, stimulus_id=self.stimulus_id))
+    def reply(self, request: RequestId, message: Message, waits_for: Reason | None = None) -> None:
+        """Answer a request; the shell puts what is waited for into the message's words."""
+        effect = Reply(request=request, message=message, waits_for=waits_for, stimulus_id=self.stimulus_id)
+        self._out.append(effect)
 
-    def refuse(self, request: RequestId, status: Refusal, message: str) -> None:
+    def refuse(self, request: RequestId, status: Refusal, reason: Reason) -> None:
         """Answer a request with the reason why it is not carried out."""
-        self.reply(request, Refused(status=status, message=message))
+        effect = Refuse(request=request, status=status, reason=reason, stimulus_id=self.stimulus_id)
+        self._out.append(effect)
 
     def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
         """Tell operators."""

@@ -32,6 +32,7 @@ from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, Read
 from evopolicy_coordinator.core.events import AuditEvent
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.server.words import words
 from evopolicy_coordinator.storage.store import Reader
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -154,7 +155,7 @@ class Answers:
             cursor=page.cursor,
             episodes=tuple(feedback(found.outcome) for found in page.rows),
             done=records.submit_done(row) if page.cursor >= upto else None,
-            waits_for=effect.waits_for,
+            waits_for=words(effect.waits_for),
             held_s=effect.held_s,
         )
 
@@ -166,7 +167,7 @@ class Answers:
             total=effect.total,
             outcomes=tuple(found.outcome for found in page.rows),
             finished=effect.finished and page.cursor >= effect.upto,
-            waits_for=effect.waits_for,
+            waits_for=words(effect.waits_for),
         )
 
     def _recorded(self, message: RecordedRequest) -> Message:

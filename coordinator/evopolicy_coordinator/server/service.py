@@ -40,7 +40,7 @@ from evopolicy_common.records import bundles
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.transport import IncomingQuery
-from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Reply
+from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
 from evopolicy_coordinator.core.events import (
     AnyEvent,
     AuditEvent,
@@ -57,6 +57,7 @@ from evopolicy_coordinator.server.intake import Intake, Parsed
 from evopolicy_coordinator.server.pending import PendingQueries
 from evopolicy_coordinator.server.turned_away import TurnedAwayWorkers
 from evopolicy_coordinator.server.watchdog import LoopWatchdog
+from evopolicy_coordinator.server.words import message, words
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
 
@@ -322,7 +323,7 @@ class Service:
         elif parsed.room == "gw":
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
-                raise RefusedError(*core.over(parsed.asker))
+                raise RefusedError(*_over(core, parsed.asker))
         run_id = parsed.asker if parsed.room == "gw" else None
         answer = answer_to(query, parsed.asker)
         self._answers.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
@@ -339,7 +340,7 @@ class Service:
         self._answers.get(run, message, answer_to(query, parsed.asker))
 
     def _status(self, core: Core) -> operator.StatusReply:
-        part = core.status(self.now())._asdict()
+        part = core.status(self.now(), words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
         return operator.StatusReply(
             cluster=self._cluster,
@@ -503,12 +504,12 @@ class Service:
             log.exception("cannot carry out", effect=type(effect).__name__)
 
     def _carried_out(self, effect: Effect) -> None:
-        if isinstance(effect, Reply):
+        if isinstance(effect, Reply | Refuse):
             pending = self._pending.take(effect.request)
             if pending is not None:
-                query = pending.query
-                self._turned_away.answered(query.key, query.payload, effect.message, self.now())
-                query.reply(answer_bytes(effect.message), lane_of(pending.asker))
+                query, told = pending.query, message(effect)
+                self._turned_away.answered(query.key, query.payload, told, self.now())
+                query.reply(answer_bytes(told), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._pending.take(effect.request)
             if pending is not None:
@@ -540,7 +541,7 @@ class Service:
 
     def _tell_stalls(self) -> None:
         """Names in the log what waits longer than it should, as `evopolicy status` does."""
-        stalls = () if self._core is None else self._stalls(self._core.status(self.now()).stalls)
+        stalls = () if self._core is None else self._stalls(self._core.status(self.now(), words).stalls)
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_TOLD])
 
@@ -567,3 +568,8 @@ def _check_session(core: Core, name: str, session: str) -> Worker:
             Refusal.UNKNOWN_WORKER, f"worker {name[:64]!r} has no such session; register again"
         )
     return worker
+
+
+def _over(core: Core, run: str) -> tuple[Refusal, str]:
+    status, reason = core.over(run)
+    return status, words(reason)

@@ -20,6 +20,7 @@ from evopolicy_coordinator.core.isolation import bars, kernels, stays
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases
 from evopolicy_coordinator.core.model import Ask, Family, Kernel, Run
+from evopolicy_coordinator.core.reasons import Reason
 from evopolicy_coordinator.core.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
@@ -42,11 +43,11 @@ def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
 # ---- asking ----
 
 
-def ask(state: State, run: Run, row: PermitRow, step: Step) -> str:
-    """Ask for a permit, again or for the first time; gives what it waits for, empty when it is granted."""
+def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
+    """Ask for a permit, again or for the first time; gives what it waits for, None when it is granted."""
     kernel, family = kernels.kernel(state, row.boot_id), run.family
     if run.id in kernel.permits.get(family, ()):
-        return ""
+        return None
     if run.id not in kernel.asks.get(family, ()):
         family.users += 1
         ask = state.asks[run.id, kernel.boot_id] = Ask(row, family, kernel)
@@ -68,9 +69,9 @@ def _preempt(state: State, family: Family, kernel: Kernel, step: Step) -> None:
                 leases.put_off(state, stay.lease, "an agent is to start there", step)
 
 
-def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -> str:
+def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -> Reason | None:
     waits_for = bars.permit_bar(state, family, kernel)
-    if waits_for:
+    if waits_for is not None:
         return waits_for
     ask = _withdraw(state, run, kernel, family)
     assert ask is not None
@@ -80,7 +81,7 @@ def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -
     step.log("info", "permit_granted", run=run, host=row.host, boot_id=row.boot_id)
     for poll in state.polls.take_all(poll_target(run, row.boot_id)):
         step.reply(poll.request, gateway.Permit(granted=True))
-    return ""
+    return None
 
 
 def restore(state: State, row: PermitRow, family: Family) -> None:
@@ -125,12 +126,12 @@ def settle(state: State, step: Step) -> None:
         _grant(state, ask.row.run, ask.kernel, ask.family, step)
 
 
-def drop_asks(state: State, run: str, refusal: Refusal, text: str, step: Step) -> None:
+def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: Step) -> None:
     """Nothing more is granted to a run."""
     for name, boot_id in [key for key in state.asks if key[0] == run]:
         forget_ask(state, name, boot_id, step)
         for poll in state.polls.take_all(poll_target(name, boot_id)):
-            step.refuse(poll.request, refusal, text)
+            step.refuse(poll.request, refusal, reason)
 
 
 # ---- the end ----

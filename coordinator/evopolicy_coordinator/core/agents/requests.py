@@ -8,6 +8,7 @@ from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.isolation import bars, kernels
 from evopolicy_coordinator.core.model import EVERYWHERE, Run
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import PermitRow, RunRow
 from evopolicy_coordinator.core.runs.known import over
 from evopolicy_coordinator.core.state import State
@@ -40,30 +41,30 @@ def requested(state: State, event: events.Asked[gateway.RequestPermit], step: St
         host=message.host if same else "",
     )
     waits_for = permits.ask(state, run, row, step)
-    if not waits_for:
+    if waits_for is None:
         step.reply(event.request, gateway.Permit(granted=True))
         return
     state.timers.arm(("ask", (run.id, kernel)), step.now + max(0.0, message.wait_s) + ASK_AGAIN_S)
     poll = Poll(event.request, "permit", permits.poll_target(run.id, kernel))
     if not state.polls.wait(poll, message.wait_s, step.now):
-        step.reply(event.request, gateway.Permit(granted=False, waits_for=waits_for))
+        step.reply(event.request, gateway.Permit(granted=False), waits_for)
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
     """A gateway has waited for a permit in vain."""
     _, run, boot_id = poll.target.split(" ", 2)
     waits_for = bars.permit_bar(state, state.runs[run].family, kernels.kernel(state, boot_id))
-    step.reply(poll.request, gateway.Permit(granted=False, waits_for=waits_for))
+    step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
-def implied(state: State, run: Run, step: Step) -> str:
-    """The permit of an agent whose gateway asks for none, so it may be anywhere; gives what it waits for, empty when the
+def implied(state: State, run: Run, step: Step) -> Reason | None:
+    """The permit of an agent whose gateway asks for none, so it may be anywhere; gives what it waits for, None when the
     run has one."""
     kernel = permits.place(run, EVERYWHERE)
     if kernel is None or permits.held(state, run.id):
-        return ""
+        return None
     waits_for = permits.ask(state, run, PermitRow(run=run.id, boot_id=kernel), step)
-    if waits_for:
+    if waits_for is not None:
         state.timers.arm(("ask", (run.id, kernel)), step.now + ASK_AGAIN_S)
     return waits_for
 
@@ -72,7 +73,7 @@ def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step
     """An operator vouches that a run's agent is not alive any more."""
     message = event.message
     if message.run not in state.capabilities:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     permits.end(state, message.run, step, "by an operator's word")
     step.reply(event.request, operator.Done())

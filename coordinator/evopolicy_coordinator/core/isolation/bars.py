@@ -21,13 +21,12 @@ from evopolicy_coordinator.core.model import (
     Lease,
     Worker,
 )
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import PermitRow
 from evopolicy_coordinator.core.state import State
 
 from . import kernels
 from .kernels import all_related, related
-
-SCORING = "hidden cases of another run are being scored"
 
 NO_BOOT_ID = (
     "the worker does not tell its kernel's boot id, so an agent may be on the same one; install the coordinator's version of"
@@ -104,19 +103,19 @@ def hidden_bar(state: State, family: Family | None, kernel: Kernel) -> str | Non
     return None
 
 
-def permit_bar(state: State, family: Family, kernel: Kernel) -> str:
-    """What a permit waits for, in words for its gateway; empty when it may be granted."""
+def permit_bar(state: State, family: Family, kernel: Kernel) -> Reason | None:
+    """What a permit waits for; None when it may be granted."""
     if not state.isolates:
-        return ""
+        return None
     there = state.kernels.values() if kernel is state.everywhere else (kernel, state.everywhere)
     if any(related(each.reversals, family) for each in there):
-        return SCORING
+        return because("scoring")
     stays = [stay for each in there for stay in all_related(each.hidden, family)]
     if not stays:
-        return ""
+        return None
     if any(stay.lease is not None for stay in stays):
-        return "hidden cases on this machine to be put off"
-    return "workers of this machine to report that they play no hidden cases"
+        return because("being_put_off")
+    return because("to_report")
 
 
 def adoptable(state: State, job: JobState, worker: Worker) -> bool:
@@ -160,7 +159,7 @@ def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lea
     return sorted(found, key=lambda each: len(each[1]))
 
 
-# ---- in words ----
+# ---- what is told ----
 
 
 def bar_of_worker(state: State, worker: Worker) -> str:
@@ -179,35 +178,28 @@ def bar_of_worker(state: State, worker: Worker) -> str:
     return f"the agent of {rows[0].run} may be alive there" if rows else ""
 
 
-def obstacle(state: State, group: JobGroup) -> str:
-    """What keeps an open group from all workers that could play it, in words; empty when nothing of this does.
+def obstacle(state: State, group: JobGroup) -> Reason | None:
+    """What keeps an open group from all workers that could play it, None when nothing of this does.
 
     Of a train group only that hidden cases do."""
     lane, family = group.flow.lane, group.flow.family
     if lane is None or not state.isolates or not (group.hidden or group.kind == "train"):
-        return ""
+        return None
     there = kernels.serving(state, lane)
     if not there:
-        return ""
+        return None
     if group.kind == "train":
-        return SCORING if all(train_bar(state, family, kernel) for kernel in there) else ""
+        return because("scoring") if all(train_bar(state, family, kernel) for kernel in there) else None
     why = [hidden_bar(state, family, kernel) for kernel in there]
     if not all(why):
-        return ""
+        return None
     for kernel in there:
         permits = permits_there(state, kernel, family)
         if permits is not None:
             row = next(iter(permits.values()))
-            return (
-                f"the agent of {row.run} to end, which may be alive {_at(row)}; if it is not, resume that run, or say"
-                f" `evopolicy runs agent-gone {row.run}`"
-            )
+            return because("agent_alive", run=row.run, place=row.host or row.boot_id)
     if "asked" in why:
-        return "an agent that is about to start there"
+        return because("agent_starting")
     if "train" in why:
-        return "train episodes of runs with the same hidden cases to end"
-    return f"a worker that tells its kernel's boot id: {NO_BOOT_ID}"
-
-
-def _at(row: PermitRow) -> str:
-    return f"on {row.host or row.boot_id}" if row.host or row.boot_id else "on any machine"
+        return because("related_train")
+    return because("unknown_kernel")

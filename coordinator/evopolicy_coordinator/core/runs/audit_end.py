@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from evopolicy_common.messages.audit import AuditFinding, AuditRecord
 from evopolicy_coordinator.core.isolation import bars
 from evopolicy_coordinator.core.model import Run, Worker
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import AuditRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
@@ -110,10 +111,10 @@ def cancel(state: State, run: Run, step: Step) -> None:
             _give_up(state, run, row, CANCELLED, step)
 
 
-def waits_for(run: Run) -> str:
+def waits_for(run: Run) -> Reason | None:
     """What a run that is otherwise done waits for."""
     n = sum(row.state == "open" for row in run.audits.values())
-    return f"{n} audits of its episodes on other workers" if n else ""
+    return because("audits", n=n) if n else None
 
 
 def record(state: State, run: Run) -> AuditRecord | None:

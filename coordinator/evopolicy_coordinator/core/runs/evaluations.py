@@ -14,6 +14,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadEvaluation
 from evopolicy_coordinator.core.leasing import groups, pins
 from evopolicy_coordinator.core.model import Ended, Evaluation, JobGroup
+from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import EvaluationRow, evaluation_group
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import EpisodesDone, FlowPinned, Step
@@ -30,7 +31,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
         step.reply(event.request, operator.EvaluationStarted(evaluation=known))
         return
     if not event.cases or len(event.cases) != len(event.case_ids):
-        step.refuse(event.request, Refusal.BAD_REQUEST, "an evaluation needs at least one case")
+        step.refuse(event.request, Refusal.BAD_REQUEST, because("evaluation_without_cases"))
         return
     row = EvaluationRow(
         evaluation=event.evaluation,
@@ -133,7 +134,9 @@ def polled(state: State, event: events.Asked[operator.EvaluationPoll], step: Ste
     group = state.groups.get(poll.target)
     if group is None:
         step.refuse(
-            event.request, Refusal.UNKNOWN_EVALUATION, f"there is no evaluation {message.evaluation!r}"
+            event.request,
+            Refusal.UNKNOWN_EVALUATION,
+            because("unknown_evaluation", evaluation=message.evaluation),
         )
     elif group.done > message.cursor or not state.polls.wait(poll, message.wait_s, step.now):
         step.add(_page(state, poll, group, step, finished=False))
@@ -152,6 +155,6 @@ def _page(state: State, poll: Poll, group: JobGroup, step: Step, *, finished: bo
         upto=group.done,
         total=group.done if finished else group.n,
         finished=finished,
-        waits_for="" if finished else waits.waits_for(state, group),
+        waits_for=None if finished else waits.waits_for(state, group),
         stimulus_id=step.stimulus_id,
     )

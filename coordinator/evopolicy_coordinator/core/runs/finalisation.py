@@ -19,6 +19,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.leasing import groups, queue
 from evopolicy_coordinator.core.model import HELDOUT, JobGroup, Run
+from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import (
     FinishedRow,
     SubmitRow,
@@ -88,10 +89,10 @@ def close(state: State, event: events.Asked[gateway.CloseRun], step: Step) -> No
     message = event.message
     run = state.runs.get(message.run)
     if run is None and message.run not in state.capabilities:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     permits.end(state, message.run, step, "its run was closed")
-    permits.drop_asks(state, message.run, Refusal.RUN_CLOSED, f"run {message.run!r} is closed", step)
+    permits.drop_asks(state, message.run, Refusal.RUN_CLOSED, because("run_closed", run=message.run), step)
     if run is not None and run.state.phase == "open":
         step.change_run(
             run, phase="closed", closed_at=step.now, close_reason=message.reason, agent=message.agent
@@ -136,7 +137,7 @@ def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) ->
         if evaluations.cancel(state, message.run, step) or message.run in state.capabilities:
             step.reply(event.request, operator.Done())
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     if run.open is not None:
         index, run.open = run.open, None
@@ -148,7 +149,7 @@ def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) ->
     if run.state.phase == "open":
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
         permits.cancelled(state, run.id, step)
-    permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, f"run {run.id!r} was cancelled", step)
+    permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, because("run_cancelled", run=run.id), step)
     _finish(state, run, None, step, cancelled=True, unplayed=True)
     step.reply(event.request, operator.Done())
 

@@ -9,6 +9,7 @@ from evopolicy_common.messages import operator
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import (
     SubmitRow,
     heldout_group,
@@ -149,27 +150,27 @@ def waited(state: State, event: events.Asked[operator.WaitRun], step: Step) -> N
         if message.run in state.capabilities:
             step.add(results.finished_effect(event.request, message.run, step))
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     poll = Poll(event.request, "run", run.id)
     if not state.polls.wait(poll, message.wait_s, step.now):
-        step.reply(event.request, progress(state, run))
+        step.reply(event.request, *progress(state, run))
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
     """An operator has waited in vain for the end of a run."""
-    step.reply(poll.request, progress(state, state.runs[poll.target]))
+    step.reply(poll.request, *progress(state, state.runs[poll.target]))
 
 
-def progress(state: State, run: Run) -> operator.RunProgress:
-    """Where an unfinished run stands, for its operator."""
+def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | None]:
+    """Where an unfinished run stands, for its operator, and what it waits for."""
     if run.state.phase == "open" or run.open is not None:
         group = None if run.open is None else state.groups[train_group(run.id, run.open)]
         done = run.ledger.settled + (0 if group is None else group.done)
-        waits_for = "" if group is None else waits.waits_for(state, group)
+        waits_for = None if group is None else waits.waits_for(state, group)
         if run.state.description is None:  # its gateway cannot serve yet
             waits_for = waits.waits_for_workers(state, run.flow)
-        return operator.RunProgress(phase="open", done=done, total=run.row.budget, waits_for=waits_for)
+        return operator.RunProgress(phase="open", done=done, total=run.row.budget), waits_for
     ok = [row for row in ok_submits(run) if row.ineligible is None]
     n = len(run.row.validation)
     groups = [state.groups.get(validation_group(run.id, row.submit_index)) for row in ok]
@@ -177,7 +178,7 @@ def progress(state: State, run: Run) -> operator.RunProgress:
     playing = [group for group in groups if group is not None]
     if playing:
         waits_for = waits.waits_for(state, playing[0])
-        return operator.RunProgress(phase="validation", done=done, total=n * len(ok), waits_for=waits_for)
+        return operator.RunProgress(phase="validation", done=done, total=n * len(ok)), waits_for
     best = select(run)
     group = None if best is None else state.groups.get(heldout_group(run.id, best.submit_index))
     phase: Literal["heldout", "random"] = "heldout"
@@ -185,7 +186,5 @@ def progress(state: State, run: Run) -> operator.RunProgress:
         phase, group = "random", state.groups.get(random_group(run.id))
     total = len(run.row.heldout)
     if group is None:
-        return operator.RunProgress(phase=phase, done=total, total=total, waits_for=audit_end.waits_for(run))
-    return operator.RunProgress(
-        phase=phase, done=group.done, total=total, waits_for=waits.waits_for(state, group)
-    )
+        return operator.RunProgress(phase=phase, done=total, total=total), audit_end.waits_for(run)
+    return operator.RunProgress(phase=phase, done=group.done, total=total), waits.waits_for(state, group)

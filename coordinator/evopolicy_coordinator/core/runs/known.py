@@ -5,6 +5,7 @@ from __future__ import annotations
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core.events import RequestId
 from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
@@ -17,13 +18,13 @@ def live(state: State, request: RequestId, name: str, step: Step) -> Run | None:
     return run
 
 
-def over(state: State, name: str) -> tuple[Refusal, str]:
-    """Why nothing more is taken of a run that is not open, in a word and a sentence."""
+def over(state: State, name: str) -> tuple[Refusal, Reason]:
+    """Why nothing more is taken of a run that is not open."""
     last = state.finished.get(name)
     if last is not None and last.cancelled:
-        return Refusal.RUN_CANCELLED, f"run {name!r} was cancelled by the operator"
+        return Refusal.RUN_CANCELLED, because("cancelled_by_operator", run=name)
     if last is not None:
-        return Refusal.RUN_FINISHED, f"run {name!r} is finished"
+        return Refusal.RUN_FINISHED, because("run_finished", run=name)
     if name in state.runs:
-        return Refusal.RUN_CLOSED, f"run {name!r} is closed and takes no more submits"
-    return Refusal.UNKNOWN_RUN, f"there is no run {name[:64]!r}"
+        return Refusal.RUN_CLOSED, because("run_takes_no_more", run=name)
+    return Refusal.UNKNOWN_RUN, because("unknown_run", run=name[:64])

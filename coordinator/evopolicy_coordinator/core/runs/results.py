@@ -8,6 +8,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
 from evopolicy_coordinator.core.events import RequestId
 from evopolicy_coordinator.core.model import JobGroup
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import train_group
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
@@ -24,14 +25,14 @@ def results(state: State, event: events.Asked[gateway.ResultsRequest], step: Ste
     if run is None:
         if message.run in state.capabilities:
             step.add(
-                _page(event.request, message.run, message.submit_index, message.cursor, None, "", 0.0, step)
+                _page(event.request, message.run, message.submit_index, message.cursor, None, None, 0.0, step)
             )
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no run {message.run!r}")
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     if not 0 <= message.submit_index < len(run.submits):
-        text = f"run {run.id!r} has {len(run.submits)} submits, none of index {message.submit_index}"
-        step.refuse(event.request, Refusal.UNKNOWN_SUBMIT, text)
+        reason = because("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
+        step.refuse(event.request, Refusal.UNKNOWN_SUBMIT, reason)
         return
     target = train_group(run.id, message.submit_index)
     poll = Poll(event.request, "results", target, message.cursor)
@@ -58,7 +59,7 @@ def answer(state: State, poll: Poll, step: Step) -> None:
     run = state.runs[poll.target.split("/")[0]]
     index = int(poll.target.split("/")[1][1:])
     row = run.submits[index]
-    waits_for = "" if row.status is not None else waits.waits_for(state, state.groups[poll.target])
+    waits_for = None if row.status is not None else waits.waits_for(state, state.groups[poll.target])
     upto = row.released if row.status is not None else _released(state, poll.target)
     held = held_s(state, run, step.now)
     step.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, held, step))
@@ -70,7 +71,7 @@ def _page(
     index: int,
     cursor: int,
     upto: int | None,
-    waits_for: str,
+    waits_for: Reason | None,
     held: float,
     step: Step,
 ) -> ReadResults:

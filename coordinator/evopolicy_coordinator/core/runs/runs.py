@@ -14,6 +14,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import RunRow, RunStateRow, train_group
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import FlowPinned, JobRetried, ResultsDiffered, Step
@@ -32,7 +33,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
         return
     fault = _fault(event)
     if fault is None and event.run in state.capabilities:
-        fault = f"there is a run {event.run!r} already"
+        fault = because("run_exists", run=event.run)
     if fault is not None:
         step.refuse(event.request, Refusal.BAD_SETTINGS, fault)
         return
@@ -87,17 +88,17 @@ def forget(state: State, run: Run) -> None:
     pins.drop_flow(state, run.flow)
 
 
-def _fault(event: events.RunCreated) -> str | None:
+def _fault(event: events.RunCreated) -> Reason | None:
     least, most = event.min_episodes_per_submit, event.max_episodes_per_submit
     if event.budget < 1:
-        return f"a budget of {event.budget} episodes; at least 1 is needed"
+        return because("budget_below_one", budget=event.budget)
     if not 1 <= least <= most:
-        return f"a submit of {least} to {most} episodes; wanted is 1 ≤ minimum ≤ maximum"
+        return because("submit_bounds", least=least, most=most)
     if least > event.budget:
-        return f"a submit takes at least {least} episodes, the budget is {event.budget}"
+        return because("minimum_over_budget", least=least, budget=event.budget)
     for name, cases in (("train", event.train), ("validation", event.validation), ("heldout", event.heldout)):
         if not cases:
-            return f"the {name} split has no cases"
+            return because("no_cases", split=name)
     return None
 
 
@@ -114,11 +115,12 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
     description = run.flow.description
     row, settings = run.row, run.row.settings
     if description is None:
-        text = f"the run waits for {waits.waits_for_workers(state, run.flow)}"
-        step.refuse(event.request, Refusal.NO_WORKER, text)
+        missing = waits.waits_for_workers(state, run.flow)
+        step.refuse(event.request, Refusal.NO_WORKER, because("no_worker_yet", waits_for=missing))
         return
     if not event.message.asks_permit and without_permit(state, event.request, run, step):
         return
+    told, waits_for = run_state(state, run, step.now)
     step.reply(
         event.request,
         gateway.RunOpened(
@@ -136,19 +138,18 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
             denied_imports=row.denied_imports,
             simulation=settings.simulation,
             max_steps=row.max_steps,
-            state=run_state(state, run, step.now),
+            state=told,
         ),
+        waits_for,
     )
 
 
 def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
     """Refuse, for now, what an agent asks that may be on any machine, until it may."""
-    waits_for = requests.implied(state, run, step) if run.state.phase == "open" else ""
-    if waits_for:
-        step.refuse(
-            request, Refusal.UNAVAILABLE, f"the run's agent may not start yet; it waits for {waits_for}"
-        )
-    return bool(waits_for)
+    waits_for = requests.implied(state, run, step) if run.state.phase == "open" else None
+    if waits_for is not None:
+        step.refuse(request, Refusal.UNAVAILABLE, because("may_not_start", waits_for=waits_for))
+    return waits_for is not None
 
 
 def state_requested(state: State, event: events.Asked[gateway.StateRequest], step: Step) -> None:
@@ -159,7 +160,8 @@ def state_requested(state: State, event: events.Asked[gateway.StateRequest], ste
         return
     run = live(state, event.request, event.message.run, step)
     if run is not None:
-        step.reply(event.request, gateway.StateReply(state=run_state(state, run, step.now)))
+        told, waits_for = run_state(state, run, step.now)
+        step.reply(event.request, gateway.StateReply(state=told), waits_for)
 
 
 def last_state(row: RunStateRow) -> gateway.RunState:
@@ -178,25 +180,23 @@ def held_s(state: State, run: Run, now: float) -> float:
     return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held(now))
 
 
-def run_state(state: State, run: Run, now: float) -> gateway.RunState:
-    """What the gateway of an unfinished run is told of it."""
-    in_flight = None
+def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Reason | None]:
+    """What the gateway of an unfinished run is told of it, and what its open submit waits for."""
+    in_flight, waits_for = None, None
     if run.open is not None:
         group = state.groups[train_group(run.id, run.open)]
+        waits_for = waits.waits_for(state, group)
         in_flight = gateway.SubmitInFlight(
-            submit_index=run.open,
-            n_episodes=group.n,
-            n_done=group.done,
-            waits_for=waits.waits_for(state, group),
-            held_s=group.held(now),
+            submit_index=run.open, n_episodes=group.n, n_done=group.done, held_s=group.held(now)
         )
-    return gateway.RunState(
+    told = gateway.RunState(
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
         is_finalized=run.state.phase != "open",
         in_flight=in_flight,
         held_s=held_s(state, run, now),
     )
+    return told, waits_for
 
 
 # ---- what those below have to tell ----

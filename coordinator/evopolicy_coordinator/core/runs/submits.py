@@ -18,6 +18,7 @@ from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.model import JobGroup, Run
+from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import SubmitRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import EpisodesDone, Step, SubmitEnded
@@ -42,7 +43,7 @@ def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> Non
         step.refuse(event.request, *over(state, run.id))
         return
     if run.open is not None:
-        step.refuse(event.request, Refusal.BUSY, f"submit {run.open} is still running; one runs at a time")
+        step.refuse(event.request, Refusal.BUSY, because("busy", submit=run.open))
         return
     refused = refusal(
         message.env_instances,
@@ -55,7 +56,7 @@ def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> Non
         step.refuse(event.request, *refused)
         return
     if message.bundle is None and message.bundle_error is None:
-        step.refuse(event.request, Refusal.BAD_REQUEST, "a submit names a bundle, or says why there is none")
+        step.refuse(event.request, Refusal.BAD_REQUEST, because("no_bundle"))
         return
     if without_permit(state, event.request, run, step):
         return
@@ -66,8 +67,8 @@ def _again(event: events.Asked[gateway.Submit], row: SubmitRow, step: Step) -> N
     """The answer to a key that is known: the same as the first time, if the request is."""
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
-        text = f"key {message.key!r} was used for submit {row.submit_index} with another request"
-        step.refuse(event.request, Refusal.KEY_CONFLICT, text)
+        reason = because("key_used", key=message.key, submit=row.submit_index)
+        step.refuse(event.request, Refusal.KEY_CONFLICT, reason)
         return
     step.reply(event.request, _accepted(row))
 

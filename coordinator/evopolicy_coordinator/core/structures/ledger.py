@@ -9,6 +9,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.reasons import Reason, because
 
 from .story import InvariantError
 
@@ -68,17 +69,16 @@ class Ledger:
 
 def refusal(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
-) -> tuple[Refusal, str] | None:
-    """Why these train cases cannot be played, in a word and a sentence, or None. Checked in the order that the protocol names."""
+) -> tuple[Refusal, Reason] | None:
+    """Why these train cases cannot be played, or None. Checked in the order that the protocol names."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:
-            message = f"env_instances names {case_id}; train cases are 0 to {n_cases - 1}"
-            return Refusal.INVALID_ENV_INSTANCE, message
+            return Refusal.INVALID_ENV_INSTANCE, because("unknown_case", case=case_id, last=n_cases - 1)
     if n < minimum:
-        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; a submit takes at least {minimum}"
+        return Refusal.BUDGET_INVALID, because("too_few", n=n, least=minimum)
     if n > maximum:
-        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; a submit takes at most {maximum}"
+        return Refusal.BUDGET_INVALID, because("too_many", n=n, most=maximum)
     if n > available:
-        return Refusal.BUDGET_INVALID, f"{n} episodes asked for; {available} of the budget remain"
+        return Refusal.BUDGET_INVALID, because("over_budget", n=n, left=available)
     return None

@@ -20,6 +20,7 @@ from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.isolation import bars, kernels, stays
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.model import Worker
+from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import WorkerRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Answered, HandedIn, Step
@@ -35,8 +36,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     old = state.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Else one machine could play under another's name, and have it blamed.
-        text = f"a worker of another machine is called {message.worker!r}; choose another --name"
-        step.refuse(event.request, Refusal.NAME_TAKEN, text)
+        step.refuse(event.request, Refusal.NAME_TAKEN, because("name_taken", worker=message.worker))
         return
     if old is not None:
         fleet.drop_poll(state, old, step)
@@ -66,9 +66,8 @@ def _refused_as_forger(state: State, name: str, machine: str, request: events.Re
     forger = name if name in state.quarantined else state.quarantined_machines.get(machine)
     if forger is None:
         return False
-    same = "" if forger == name else f" (as {forger!r} of the same machine)"
-    text = f"worker {name!r} gets no more work here: {state.quarantined[forger]}{same}"
-    step.refuse(request, Refusal.QUARANTINED, text)
+    reason = because("forger", worker=name, why=state.quarantined[forger], forger=forger)
+    step.refuse(request, Refusal.QUARANTINED, reason)
     return True
 
 
@@ -83,8 +82,7 @@ def worker_of(
     was_lost = known is not None and known.state == "lost"
     worker = fleet.of_session(state, message.worker, message.session, step.now)
     if worker is None:
-        text = f"session of worker {message.worker!r} is not known here; register again"
-        step.refuse(event.request, Refusal.UNKNOWN_WORKER, text)
+        step.refuse(event.request, Refusal.UNKNOWN_WORKER, because("unknown_session", worker=message.worker))
     else:
         state.timers.arm_once(("worker", worker.name), step.now + state.settings.lease_ttl_s)
         if was_lost:
@@ -137,8 +135,8 @@ def worker_state(state: State, event: events.Asked[operator.SetWorker], step: St
     """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
     message = event.message
     if message.state != "active" and message.worker in state.quarantined:
-        text = f"{message.worker} is quarantined: {state.quarantined[message.worker]}"
-        step.refuse(event.request, Refusal.QUARANTINED, text)
+        reason = because("quarantined", worker=message.worker, why=state.quarantined[message.worker])
+        step.refuse(event.request, Refusal.QUARANTINED, reason)
         return
     step.persist(WorkerRow(worker=message.worker, state=message.state))
     worker = state.workers.get(message.worker)
@@ -165,10 +163,10 @@ def repinned(state: State, event: events.Asked[operator.RepinRun], step: Step) -
         if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
     }
     if run is None:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, f"there is no unfinished run {message.run!r}")
+        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("no_unfinished_run", run=message.run))
     elif message.fingerprint_class not in offered:
-        text = f"no worker of class {message.fingerprint_class!r} can play it; there are {', '.join(offered) or 'none'}"
-        step.refuse(event.request, Refusal.UNKNOWN_CLASS, text)
+        reason = because("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
+        step.refuse(event.request, Refusal.UNKNOWN_CLASS, reason)
     else:
         text = f"{run.state.fingerprint_class} → {message.fingerprint_class}: {message.reason}"
         profile = offered[message.fingerprint_class]

@@ -28,6 +28,7 @@ from evopolicy_coordinator.core.effects import (
     ReadEvaluation,
     ReadFinished,
     ReadResults,
+    Refuse,
     Reply,
 )
 from evopolicy_coordinator.core.machine import Core
@@ -48,6 +49,8 @@ from evopolicy_coordinator.core.records import (
     head_of,
 )
 from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.status import CoreStatus
+from evopolicy_coordinator.server.words import message, words
 
 ENV = "toy/line"
 BUNDLE = "a" * 64
@@ -174,9 +177,9 @@ class Rig:
                         self.rows[key_of(row)] = row
                 case Log():
                     self.logs.append(effect)
-                case Reply():
+                case Reply() | Refuse():
                     assert effect.request not in self.replies, "one answer each"
-                    self.replies[effect.request] = effect.message
+                    self.replies[effect.request] = message(effect)
                 case PrepareAudit() | CompareAudit():
                     self.audits.append(effect)
                 case ReadResults() | ReadEvaluation() | ReadFinished():
@@ -348,6 +351,10 @@ class Rig:
         raise AssertionError("there is no end to the work")
 
     # ---- looking ----
+
+    def status(self) -> CoreStatus:
+        """What an operator sees."""
+        return self.core.status(self.now, words)
 
     def row(self, kind: type[T], *key: Any) -> T:
         row = self.rows[(kind, *key)]

@@ -19,6 +19,7 @@ from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_coordinator.core.effects import ReadEvaluation
 from evopolicy_coordinator.core.leasing.seeds import policy_seed
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
+from evopolicy_coordinator.server.words import words
 
 
 def value_of(job: Job) -> float:
@@ -284,7 +285,7 @@ def test_an_evaluation_plays_cases_outside_any_run() -> None:
     rig = Rig()
     assert ask(rig) == EvaluationStarted(evaluation="ev-e")
     assert ask(rig) == EvaluationStarted(evaluation="ev-e")
-    assert "a worker that offers" in page(rig, 0).waits_for
+    assert "a worker that offers" in words(page(rig, 0).waits_for)
     session = rig.register()
     rig.load()
     session = rig.register()

@@ -30,7 +30,7 @@ def test_a_forger_among_three_is_named_and_gets_no_more_leases() -> None:
     assert isinstance(answer, wire.Refused)
     assert answer.status == "quarantined"
     assert "forged" in answer.message
-    assert "w2" in fleet.rig.core.status(fleet.rig.now).quarantined
+    assert "w2" in fleet.rig.status().quarantined
     assert [log.fields["worker"] for log in fleet.rig.logs if log.event == "forger_named"] == ["w2"]
 
 
@@ -56,7 +56,7 @@ def test_two_workers_that_disagree_are_both_in_dispute_and_nobody_is_named() -> 
     fleet = Fleet(w1=0.0, w2=5.0)
     fleet.train(0, 1, 2, 3)
     fleet.work_off()
-    assert any("a third is to decide" in text for text in fleet.rig.core.status(fleet.rig.now).disputes)
+    assert any("a third is to decide" in text for text in fleet.rig.status().disputes)
     fleet.rig.close()
     fleet.work_off()
     fleet.rig.pass_time(WAIT_S)

@@ -284,7 +284,7 @@ def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
             break
         (lease,) = got
     assert rig.core.state.workers["w1"].benched_until > rig.now
-    (run,) = rig.core.status(rig.now).runs
+    (run,) = rig.status().runs
     assert run.waits_for == "workers whose jobs kept failing to be tried again"
     for _ in range(4):
         rig.pass_time(2.0)
@@ -408,9 +408,9 @@ def test_a_lost_worker_is_forgotten_in_the_end() -> None:
     rig = Rig()
     rig.register()
     rig.pass_time(rig.settings.lease_ttl_s + 1.0)
-    assert [worker.state for worker in rig.core.status(rig.now).workers] == ["lost"]
+    assert [worker.state for worker in rig.status().workers] == ["lost"]
     rig.pass_time(FORGET_S)
-    assert rig.core.status(rig.now).workers == ()
+    assert rig.status().workers == ()
 
 
 def test_no_poll_waits_longer_than_the_longest_wait() -> None:

@@ -49,7 +49,7 @@ def test_a_permit_is_durable_and_asked_for_again_at_no_cost() -> None:
     row = rig.row(PermitRow, "r1", HERE)
     assert (row.host, row.machine_id, row.ended_at) == ("lab", "m", None)
     rig.load()
-    assert rig.core.status(rig.now).runs[0].agent_host == "lab"
+    assert rig.status().runs[0].agent_host == "lab"
 
 
 @pytest.mark.parametrize("restart", [False, True])
@@ -63,7 +63,7 @@ def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(restart: bo
         session = rig.register(slots=8)
         rig.pass_time(rig.settings.adoption_s)
     assert splits(rig.poll(session, 8)) == {"random"}
-    assert "alive" in rig.core.status(rig.now).workers[0].hidden_bar
+    assert "alive" in rig.status().workers[0].hidden_bar
     other = rig.register("w2", slots=8)
     assert splits(rig.poll(other, 8)) == {"validation"}
 
@@ -91,7 +91,7 @@ def test_an_agent_whose_kernel_is_not_known_keeps_hidden_cases_from_all() -> Non
     scored(rig, session)
     rig.create("r1", agent="")
     assert splits(rig.poll(session, 8)) == {"random"}
-    assert [run.agent_host for run in rig.core.status(rig.now).runs] == ["", "everywhere"]
+    assert [run.agent_host for run in rig.status().runs] == ["", "everywhere"]
 
 
 def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why() -> None:
@@ -101,7 +101,7 @@ def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why
     assert splits(rig.poll(session, 8)) == {"random"}
     told = next(reply for reply in rig.replies.values() if isinstance(reply, wire.Registered))
     assert "boot id" in told.hidden_bar
-    assert told.hidden_bar == rig.core.status(rig.now).workers[0].hidden_bar
+    assert told.hidden_bar == rig.status().workers[0].hidden_bar
 
 
 def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_let_go() -> None:
@@ -281,9 +281,9 @@ def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
         rig.pass_time(5.0)
         rig.beat(session)
     assert rig.poll(session, 8) == []
-    (waits_for,) = [run.waits_for for run in rig.core.status(rig.now).runs if run.run == "r0"]
+    (waits_for,) = [run.waits_for for run in rig.status().runs if run.run == "r0"]
     assert "evopolicy runs agent-gone r1" in waits_for
-    assert any("agent-gone r1" in line for line in rig.core.status(rig.now).stalls)
+    assert any("agent-gone r1" in line for line in rig.status().stalls)
     assert gone(rig) == operator.Done()
     assert splits(rig.poll(session, 8)) == {"validation"}
     assert gone(rig, "nobody").status == Refusal.UNKNOWN_RUN
@@ -320,9 +320,9 @@ def test_a_takeover_by_another_host_keeps_the_first_permit() -> None:
     rig.create("r1", agent=None)
     rig.permit("r1", HERE, host="first")
     rig.permit("r1", "elsewhere", host="second")
-    assert rig.core.status(rig.now).runs[0].agent_host == "first, second"
+    assert rig.status().runs[0].agent_host == "first, second"
     gone(rig)
-    assert rig.core.status(rig.now).runs[0].agent_host == ""
+    assert rig.status().runs[0].agent_host == ""
 
 
 @pytest.mark.parametrize("by", ["open", "submit"])
@@ -341,7 +341,7 @@ def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> N
     assert speak().status == Refusal.UNAVAILABLE
     rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
     assert not hasattr(speak(), "status")
-    assert rig.core.status(rig.now).runs[1].agent_host == "everywhere"
+    assert rig.status().runs[1].agent_host == "everywhere"
 
 
 def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:

@@ -255,9 +255,9 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     assert rig.poll(other) == []
     rig.pass_time(20.0)
     rig.beat(other)
-    (run,) = rig.core.status(rig.now).runs
+    (run,) = rig.status().runs
     assert "same versions" in run.waits_for
-    worker = next(each for each in rig.core.status(rig.now).workers if each.worker == "w2")
+    worker = next(each for each in rig.status().workers if each.worker == "w2")
     assert "r1" in worker.refused
     named = worker.fingerprint
     wrong = rig.tell(asked(operator.RepinRun, request="a", run="r1", fingerprint_class="nope", reason="x"))
@@ -290,7 +290,7 @@ def test_a_worker_with_the_papers_versions_is_a_class_of_its_own_and_named_so() 
     rig.submit(0)
     other = rig.register("w2", packages=usual | paper)
     assert rig.poll(other) == []
-    workers = {each.worker: each for each in rig.core.status(rig.now).workers}
+    workers = {each.worker: each for each in rig.status().workers}
     assert workers["w1"].fingerprint != workers["w2"].fingerprint
     for name, version in paper.items():
         assert workers["w2"].versions[name] == version
@@ -316,7 +316,7 @@ def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
     rig.pass_time(5.0)
     assert rig.beat(session).drain is ends
     assert rig.poll(session) == []
-    assert [each.state for each in rig.core.status(rig.now).workers] == [state]
+    assert [each.state for each in rig.status().workers] == [state]
     rig.tell(asked(operator.SetWorker, request="back", worker="w1", state="active"))
     assert len(rig.poll(session)) == 1
 
@@ -331,7 +331,7 @@ def test_a_run_opened_while_its_only_worker_was_away_is_played_when_it_is_back(
         rig.tell(asked(operator.SetWorker, request="out", worker="w1", state="paused"))
     else:
         rig.pass_time(60.0)
-    assert [each.state for each in rig.core.status(rig.now).workers] == [how]
+    assert [each.state for each in rig.status().workers] == [how]
     rig.create()
     rig.submit(0)
     if how == "paused":
@@ -357,7 +357,7 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     rig.create()
     rig.submit(0)
     rig.pass_time(40.0)
-    (stall,) = rig.core.status(rig.now).stalls
+    (stall,) = rig.status().stalls
     assert "r1/s0/train" in stall
     assert "a worker that offers toy/line" in stall
     assert rig.core.story("r1/s0/train")
@@ -370,7 +370,7 @@ def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> Non
     rig.submit(0)
     rig.hand_in(session, result(rig.poll(session)[0], "failed", error="no space left on device"))
     rig.pass_time(1.0)
-    (stall,) = rig.core.status(rig.now).stalls
+    (stall,) = rig.status().stalls
     assert "wait for another try after a fault of ours" in stall
     assert stall.endswith("after 1 faults, the last: failed on w1: no space left on device")
 

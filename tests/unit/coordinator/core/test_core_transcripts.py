@@ -17,7 +17,7 @@ from core_rig import Rig
 import evopolicy_coordinator.core
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core import machine, step
-from evopolicy_coordinator.core.effects import Effect, Log, Persist, Reply
+from evopolicy_coordinator.core.effects import Effect, Log, Persist, Refuse, Reply
 
 FOLDER = Path(evopolicy_coordinator.core.__file__).parent / "transcripts"
 
@@ -123,6 +123,11 @@ class Transcript(Rig):
                 return ["persist", *(f"    {shown(row)}" for row in effect.rows)]
             case Reply():
                 return [f"reply to {self._askers[effect.request]}: {shown(effect.message)}"]
+            case Refuse():
+                about = ", ".join(f"{name}={value}" for name, value in effect.reason.about.items())
+                return [
+                    f"refuse {self._askers[effect.request]}: {effect.status}, {effect.reason.code}({about})"
+                ]
             case Log():
                 fields = " ".join(f"{name}={value}" for name, value in effect.fields.items())
                 return [f"log {effect.event} {fields}"]

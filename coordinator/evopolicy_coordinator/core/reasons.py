@@ -1,0 +1,67 @@
+"""Why something is refused, and what waits for what: codes with what they are about. The words are the shell's (`server.words`)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+Code = Literal[
+    # Refused: runs and evaluations.
+    "unknown_run",
+    "no_unfinished_run",
+    "unknown_evaluation",
+    "run_cancelled",
+    "cancelled_by_operator",
+    "run_finished",
+    "run_closed",
+    "run_takes_no_more",
+    "run_exists",
+    "budget_below_one",
+    "submit_bounds",
+    "minimum_over_budget",
+    "no_cases",
+    "evaluation_without_cases",
+    # Refused: submits.
+    "busy",
+    "key_used",
+    "no_bundle",
+    "unknown_submit",
+    "unknown_case",
+    "too_few",
+    "too_many",
+    "over_budget",
+    "no_worker_yet",
+    "may_not_start",
+    # Refused: workers.
+    "name_taken",
+    "unknown_session",
+    "forger",
+    "quarantined",
+    "unknown_class",
+    # What a group, a permit or a run waits for.
+    "workers",
+    "scoring",
+    "being_put_off",
+    "to_report",
+    "agent_alive",
+    "agent_starting",
+    "related_train",
+    "unknown_kernel",
+    "hand_back",
+    "adoption",
+    "own_fault",
+    "bench",
+    "free_slot",
+    "audits",
+]
+
+
+class Reason(NamedTuple):
+    """A code, and what it is about by name; a reason may be about another."""
+
+    code: Code
+    about: dict[str, Any]
+
+
+def because(code: Code, **about: Any) -> Reason:
+    """The reason `code`, about these."""
+    return Reason(code, about)
