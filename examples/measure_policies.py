@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from evopolicy_common.catalogue import suites
+from evopolicy_common.catalogue import entry, suites
 from evopolicy_common.messages.environment import Case
 from evopolicy_coordinator.analysis.scoring.paper import heldout_returns
 from evopolicy_worker.environments.base import Environment
@@ -57,7 +57,7 @@ def policy_class(folder: Path) -> Iterator[Any]:
                 del sys.modules[name]
 
 
-def play(environment: Environment, policy: Any, seed: int) -> tuple[float, int, int, float]:
+def play(environment: Environment, policy: Any, seed: int, max_steps: int) -> tuple[float, int, int, float]:
     """One episode: its return, its steps, how many actions were invalid, and the seconds spent in the policy."""
     obs = environment.reset(Case(seed=seed))
     policy.reset(0)
@@ -69,7 +69,7 @@ def play(environment: Environment, policy: Any, seed: int) -> tuple[float, int, 
         action, repaired = environment.action_codec.repair(raw)
         obs, reward, terminated, truncated, _ = environment.step(action)
         total, steps, invalid = total + reward, steps + 1, invalid + repaired
-        if terminated or truncated:
+        if terminated or truncated or steps == max_steps:
             return total, steps, invalid, thinking
 
 
@@ -77,19 +77,25 @@ def measure(env_id: str, seeds: range, *, show_returns: bool) -> str:
     """Play one environment's policy over `seeds`; its row of the table."""
     environment = make(env_id)
     description = environment.description
+    max_steps = entry(env_id).published_steps or description.max_episode_steps
     env_meta = {
         "env": env_id,
         "submit_index": 0,
         "n_episodes_this_submit": len(seeds),
         "remaining_budget_after": 0,
-        "max_episode_steps": description.max_episode_steps,
+        "max_episode_steps": max_steps,
         "obs_space": description.obs_space,
         "action_space": description.action_space,
         "obs_storage": description.obs_storage,
     }
     with policy_class(POLICIES / slug(env_id)) as new_policy:
         episodes = [
-            play(environment, new_policy(description.obs_space, description.action_space, env_meta), seed)
+            play(
+                environment,
+                new_policy(description.obs_space, description.action_space, env_meta),
+                seed,
+                max_steps,
+            )
             for seed in seeds
         ]
     environment.close()

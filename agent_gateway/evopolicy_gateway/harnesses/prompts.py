@@ -6,7 +6,7 @@ FIRST = (
     "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed."
     " Its rules are binding, above all the rule of the budget where it has one: no local environments, no other simulators,"
     " no copied dynamics or rewards; what you learn of the environment comes from submits."
-    " Work until the episode budget is spent or you cannot improve the policy any further."
+    " Work until the episode budget is spent or, where AGENTS.md lets you stop earlier, you cannot improve the policy any further."
 )
 
 

@@ -51,6 +51,7 @@ def info_document(
         "allowed_imports": list(run.allowed_imports),
         "denied_imports": list(run.denied_imports),
         "policy_scope": run.policy_scope,
+        "finish": run.finish,
         "observations": run.observations,
         "sandbox_tier": run.sandbox_tier,
         "video": run.video,

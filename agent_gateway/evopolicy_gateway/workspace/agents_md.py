@@ -79,7 +79,7 @@ the run has a budget of **$budget episodes**. $evidence
 2. Edit `system/policy.py` (and other files in `system/`).
 3. Submit it on train cases. Read the feedback. Repeat while budget remains.
 
-When the budget is spent or you stop, every submit with status `ok` plays hidden validation cases. The best of them is your
+$finish, every submit with status `ok` plays hidden validation cases. The best of them is your
 result, and its mean return on further hidden cases is your score: a policy must do well on cases it has not seen.
 
 $rule## Where things are
@@ -208,6 +208,10 @@ _EVIDENCE = {
     "forbidden": "What you know of it comes from submitted episodes\nand from nothing else.",
     "allowed": "This run lets you experiment with\nsimulations of your own as well; only submits count.",
 }
+_FINISH = {
+    "early": "When the budget is spent or you stop",
+    "budget": "Spend the whole budget: a run that ends with episodes left is an error and has no score. When it is spent",
+}
 _RULE = {
     "forbidden": """\
 ## The rule of the budget
@@ -257,6 +261,7 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         scope=scope,
         evidence=_EVIDENCE[run.simulation],
         rule=_RULE[run.simulation],
+        finish=_FINISH[run.finish],
         observations=_OBSERVATIONS[run.observations],
         imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "no package",
         threads=run.limits.processes,

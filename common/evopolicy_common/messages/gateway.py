@@ -128,6 +128,7 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     denied_imports: Many[Text]
     state: RunState
     simulation: SimulationRule = "forbidden"
+    finish: FinishRule = "early"
     max_steps: Int = 0
     """Steps after which an episode is cut, and which agents are told as the limit; 0: the environment's own."""
 

@@ -59,7 +59,10 @@ class Policy:
 
 
 def read_speed(obs):
-    """Speed in units/s, from the length of the panel's white bar."""
+    """Speed in units/s, from the length of the panel's white bar.
+
+    Right beside the score text: Gymnasium before 1.4 writes that over the bar, and the speed is unreadable.
+    """
     return max(0.0, obs[84:94, 12, :].min(axis=1).sum() / 253.0 * 20.0 - 3.0)
 
 

@@ -33,6 +33,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "denied_imports": "[str]",
         "state": "RunState",
         "simulation": "'allowed' | 'forbidden'",
+        "finish": "'budget' | 'early'",
         "max_steps": "int",
     },
     "EnvironmentDescription": {

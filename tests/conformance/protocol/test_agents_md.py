@@ -88,6 +88,13 @@ def test_rules_forbid_every_rollout_outside_a_submit_unless_the_run_allows_it() 
     assert "simulations of your own" in free
 
 
+def test_rules_say_whether_the_whole_budget_must_be_spent() -> None:
+    assert "the budget is spent or you stop" in agents_md(opened(), NO_URLS)
+    rules = agents_md(opened(finish="budget"), NO_URLS)
+    assert "Spend the whole budget" in rules
+    assert "or you stop" not in rules
+
+
 @given(data=st.data(), n_ids=st.integers(1, 70), budget=st.integers(1, 300))
 def test_every_example_request_is_accepted_in_a_run_of_any_size(
     data: st.DataObject, n_ids: int, budget: int

@@ -198,7 +198,8 @@ def _notices(study: Study) -> list[dict[str, Any]]:
     if public:
         out.append(
             {
-                "title": f"{public} of {len(study.audit)} runs used splits made from a public seed.",
+                "title": f"{public} of {len(study.audit)} runs played public splits, of case files or a public seed: agents and "
+                "models may know the hidden cases.",
                 "lines": [],
             }
         )

@@ -264,6 +264,7 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             "env": title_of(found.env),
             "run": _short(found.run),
             "selected": None if selected is None else f"s{selected:03d}",
+            "splits": "secret" if found.secret_splits else "public",
         }
         rows.append(row)
 
@@ -294,6 +295,11 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             Column(key="complexity_growth", title="Growth (×)", kind="number", digits=2),
             integer("turns", "Turns"),
             integer("retries", "Retries"),
+            Column(
+                key="splits",
+                title="Splits",
+                note="`public`: of case files or a public seed that anybody may know.",
+            ),
             Column(
                 key="simulation", title="Simulation", note="Whether the run's rules let the agent simulate."
             ),

@@ -137,6 +137,7 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
             allowed_imports=row.allowed_imports,
             denied_imports=row.denied_imports,
             simulation=settings.simulation,
+            finish=settings.finish,
             max_steps=row.max_steps,
             state=told,
         ),
