@@ -21,7 +21,8 @@ from evopolicy_gateway.agent_supervisor.keeper import secrets_in
 from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
+from evopolicy_gateway.harnesses.base import Stage
+from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
 
 FAKES = Path(__file__).parent / "fake_clis"
 PATIENCE_S = 60.0
@@ -76,9 +77,9 @@ class Played:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.ending: Ending | None = None
+        self.ending: AgentEnded | None = None
         self.turns: list[tuple[int, str]] = []
-        self.doings: list[Doing] = []
+        self.doings: list[AgentDoing] = []
 
     @property
     def text(self) -> str:
@@ -143,7 +144,7 @@ def play(
             clock=AgentClock(3600.0),
         )
 
-        async def main() -> Ending:
+        async def main() -> AgentEnded:
             async with asyncio.timeout(PATIENCE_S):
                 playing = asyncio.create_task(make(config.harness, folder, config).play(stage))
                 if over_when is not None:

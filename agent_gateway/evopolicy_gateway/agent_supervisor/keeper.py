@@ -25,7 +25,7 @@ from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
 from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.base import Doing, Ending, Stage
+from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.jail.jail import Jail
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.control import (
@@ -86,20 +86,14 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
             task.cancel()
         control.emit(AgentTime(used_s=clock.used_s()))
         agent_log.close()
-    if isinstance(ending, Ending):
-        return AgentEnded(
-            reason=reason or ending.reason,
-            detail=ending.detail if reason is None else "",
-            turns=ending.turns,
-            retries=ending.retries,
-            facts=ending.facts,
-        )
+    if isinstance(ending, AgentEnded):
+        return ending if reason is None else msgspec.structs.replace(ending, reason=reason, detail="")
     if isinstance(ending, EvopolicyError) or reason is not None:
         return AgentEnded(reason=reason or "agent_failed", detail=str(ending))
     raise ending
 
 
-async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> Ending:
+async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
     if order.jail is not None:
         jail = Jail(
@@ -126,16 +120,9 @@ def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> di
     return {**environment, **named}
 
 
-def _tell(doing: Doing) -> None:
-    control.emit(
-        AgentDoing(
-            action=doing.action[:_TEXT_SHOWN],
-            tokens=doing.tokens,
-            note=doing.note[:_TEXT_SHOWN],
-            paused_s=doing.paused_s,
-            provider=doing.provider,
-        )
-    )
+def _tell(doing: AgentDoing) -> None:
+    shown = {"action": doing.action[:_TEXT_SHOWN], "note": doing.note[:_TEXT_SHOWN]}
+    control.emit(msgspec.structs.replace(doing, **shown))
 
 
 async def _tell_time(clock: AgentClock) -> None:

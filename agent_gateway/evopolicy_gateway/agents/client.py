@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 import urllib.error
 import urllib.request
@@ -15,7 +16,7 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.client import HTTPException
-from typing import Any
+from typing import Any, NoReturn
 from urllib.parse import urlsplit, urlunsplit
 
 _OVER = ("run_closed", "cancelled")
@@ -157,3 +158,13 @@ def _extended(url: str, *, path: str = "", query: str = "") -> str:
     parts = urlsplit(url)
     extended = parts.path + (f"/{path}" if path else "")
     return urlunsplit((parts.scheme, parts.netloc, extended, query or parts.query, ""))
+
+
+def exit_after(agent: str, play: Callable[[Client], int]) -> NoReturn:
+    """Ends the program by what `play` gives: 0 for any submit that was taken, 1 for none, or no gateway."""
+    try:
+        taken = play(Client.from_environment())
+    except ProtocolError as error:
+        print(f"{agent}: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    raise SystemExit(0 if taken else 1)

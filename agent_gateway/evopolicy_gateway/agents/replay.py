@@ -13,7 +13,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
 
 METADATA = frozenset({"_meta.json", "metrics.json"})
 
@@ -101,12 +101,7 @@ def _policy(folder: Path) -> Path | None:
 
 def main() -> None:
     """Plays in the current directory."""
-    try:
-        taken = play(Client.from_environment(), Path(sys.argv[1]), Path.cwd())
-    except ProtocolError as error:
-        print(f"replay: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    raise SystemExit(0 if taken else 1)
+    exit_after("replay", lambda client: play(client, Path(sys.argv[1]), Path.cwd()))
 
 
 if __name__ == "__main__":

@@ -5,10 +5,9 @@ Run as `python -m evopolicy_gateway.agents.uniform` in the workspace, with the `
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+from evopolicy_gateway.agents.client import Client, Refusal, exit_after
 
 POLICY = '''"""Uniform random actions on any action space; elements without a bound are normal."""
 
@@ -91,12 +90,7 @@ def play(client: Client, workspace: Path) -> bool:
 
 def main() -> None:
     """Plays in the current directory."""
-    try:
-        taken = play(Client.from_environment(), Path.cwd())
-    except ProtocolError as error:
-        print(f"random: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    raise SystemExit(0 if taken else 1)
+    exit_after("random", lambda client: play(client, Path.cwd()))
 
 
 if __name__ == "__main__":

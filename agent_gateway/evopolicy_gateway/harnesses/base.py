@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -23,6 +23,7 @@ from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
 from evopolicy_gateway.jail.jail import Jail
+from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
 
 _INFO_TIMEOUT_S = 30.0
 
@@ -31,32 +32,7 @@ class AgentError(EvopolicyError):
     """The agent cannot be started, or its harness cannot make sense of it; for the operator."""
 
 
-class Ending(msgspec.Struct, frozen=True, kw_only=True):
-    """How an agent ended by itself."""
-
-    reason: Literal["agent_stopped", "agent_failed", "silent"]
-    detail: str = ""
-    turns: int = 0
-    """Prompts that it answered."""
-    retries: int = 0
-    facts: dict[str, Any] = {}
-    """What else `run.json` tells: `cli_version`, `model_string`, `settings`, `tokens`."""
-
-
-class Doing(msgspec.Struct, frozen=True, kw_only=True):
-    """What an agent is at, for people who watch and for a sweep that accounts for it."""
-
-    action: str = ""
-    tokens: dict[str, Any] | None = None
-    """Of the run so far, as in `run.json`."""
-    note: str = ""
-    """What the operator should know."""
-    paused_s: float = 0.0
-    """It waits that long for its provider."""
-    provider: str = ""
-
-
-def _nobody_watches(_: Doing) -> None:
+def _nobody_watches(_: AgentDoing) -> None:
     pass
 
 
@@ -76,7 +52,7 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """Ids of the processes that `start` has started, whose exit status it takes."""
     session_file: Path | None = None
     """Where a session is kept, so that it goes on after its keeper was killed."""
-    on_doing: Callable[[Doing], None] = _nobody_watches
+    on_doing: Callable[[AgentDoing], None] = _nobody_watches
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
     activity: Activity | None = None
     """None: nobody asks whether it is silent."""
@@ -140,7 +116,7 @@ class Harness(ABC):
         """ConfigError where the agent cannot be started on this machine; to be asked before a run is opened."""
 
     @abstractmethod
-    async def play(self, stage: Stage) -> Ending:
+    async def play(self, stage: Stage) -> AgentEnded:
         """Plays until the agent stops by itself. Cancelled when the run is over for another reason."""
 
 

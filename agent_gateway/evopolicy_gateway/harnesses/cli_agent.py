@@ -23,12 +23,13 @@ import structlog
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import prompts, session
-from evopolicy_gateway.harnesses.base import AgentError, Doing, Ending, Harness, Stage
+from evopolicy_gateway.harnesses.base import AgentError, Harness, Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.session import SessionState
 from evopolicy_gateway.harnesses.trouble import Trouble, backoff_s
 from evopolicy_gateway.harnesses.turn import play_turn
 from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
 
 _PROBE_PATIENCE_S = 60.0
 _MAX_PAUSE_S = 3600.0
@@ -60,7 +61,7 @@ class CliAgent(Harness):
         if (missing := self._missing(environment)) is not None:
             raise ConfigError(missing)
 
-    async def play(self, stage: Stage) -> Ending:
+    async def play(self, stage: Stage) -> AgentEnded:
         self._config.check(stage.environment)
         stage = stage.with_environment(self._dialect.environment() | self._config.environment)
         await self._probe(stage)
@@ -71,7 +72,7 @@ class CliAgent(Harness):
             if stage.over.is_set():
                 return self._ending()
             ending = await (self._done(stage, reader) if reader.done else self._failed(stage, reader))
-            if isinstance(ending, Ending):
+            if isinstance(ending, AgentEnded):
                 return ending
             if stage.over.is_set():
                 return self._ending()
@@ -93,7 +94,7 @@ class CliAgent(Harness):
             nonlocal told
             if now.usage.total > told.total:
                 told = now.usage
-                stage.on_doing(Doing(tokens=(spent + told).recorded(self._config.prices)))
+                stage.on_doing(AgentDoing(tokens=(spent + told).recorded(self._config.prices)))
             return self._capped(spent + now.usage)
 
         program = [*self._program, *arguments]
@@ -106,7 +107,7 @@ class CliAgent(Harness):
         self._keep(stage)
         return reader
 
-    async def _done(self, stage: Stage, reader: TurnReader) -> Ending | str:
+    async def _done(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
         """The next prompt after a turn that was done, or the end."""
         state = self._state
         state.turns += 1
@@ -129,7 +130,7 @@ class CliAgent(Harness):
             return prompts.FIRST
         return prompts.interrupted(None) if left is None else prompts.go_on(left)
 
-    async def _failed(self, stage: Stage, reader: TurnReader) -> Ending | str:
+    async def _failed(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
         """The prompt of the retry after a failed turn, once it is time for it, or the end."""
         state, config = self._state, self._config
         trouble = reader.trouble or Trouble(kind="passing", message="the program ended without a word")
@@ -154,7 +155,7 @@ class CliAgent(Harness):
                 backoff_s(self._failures, config.backoff_s, random.random()),
                 min(trouble.wait_s or 0.0, _MAX_PAUSE_S),
             )
-            stage.on_doing(Doing(action=f"retry {self._failures} in {wait_s:.0f} s: {message}"))
+            stage.on_doing(AgentDoing(action=f"retry {self._failures} in {wait_s:.0f} s: {message}"))
             await stage.sleep(wait_s)
         state.retries += 1
         self._keep(stage)
@@ -169,12 +170,12 @@ class CliAgent(Harness):
         # Only a turn that is done wins the retries back: until then, one try a pause.
         self._failures = max(self._failures, config.retries)
         stage.log.note({"type": "paused", "seconds": round(wait_s, 1), "message": message})
-        paused = Doing(action=f"paused: {message}", paused_s=wait_s, provider=config.provider_name)
+        paused = AgentDoing(action=f"paused: {message}", paused_s=wait_s, provider=config.provider_name)
         stage.on_doing(paused)
         with stage.clock.paused():
             await stage.sleep(wait_s)
         state.paused_s += wait_s
-        stage.on_doing(Doing(action="tries again", provider=config.provider_name))
+        stage.on_doing(AgentDoing(action="tries again", provider=config.provider_name))
 
     async def _prompt_after_failure(self, stage: Stage) -> str:
         """The first prompt of a session, or what one that was interrupted is told."""
@@ -184,7 +185,7 @@ class CliAgent(Harness):
 
     def _keep(self, stage: Stage) -> None:
         session.save(stage.session_file, self._state)
-        stage.on_doing(Doing(tokens=self._state.usage.recorded(self._config.prices)))
+        stage.on_doing(AgentDoing(tokens=self._state.usage.recorded(self._config.prices)))
 
     def _capped(self, used: Usage) -> str | None:
         config = self._config
@@ -226,7 +227,7 @@ class CliAgent(Harness):
             found = self._version or "of an unknown version"
             note = f"{name} {found} is used; held against was {dialect.tested_version}"
             log.warning("another version than the tested one", version=found, tested=dialect.tested_version)
-            stage.on_doing(Doing(note=note))
+            stage.on_doing(AgentDoing(note=note))
 
     async def _ask(self, stage: Stage, arguments: tuple[str, ...]) -> str:
         words = [*self._program, *arguments]
@@ -257,7 +258,7 @@ class CliAgent(Harness):
 
     def _ending(
         self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
-    ) -> Ending:
+    ) -> AgentEnded:
         state, config = self._state, self._config
         known = self.known()
         settings: dict[str, Any] = known["settings"] | {
@@ -270,7 +271,7 @@ class CliAgent(Harness):
         facts: dict[str, Any] = known | {"cli_version": self._version, "settings": settings}
         if state.usage.total:
             facts["tokens"] = state.usage.recorded(config.prices)
-        return Ending(reason=reason, detail=detail, turns=state.turns, retries=state.retries, facts=facts)
+        return AgentEnded(reason=reason, detail=detail, turns=state.turns, retries=state.retries, facts=facts)
 
 
 async def left_of(stage: Stage) -> int | None:

@@ -15,7 +15,8 @@ import orjson
 
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses import prompts
-from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
+from evopolicy_gateway.harnesses.base import Harness, Stage
+from evopolicy_gateway.operator.control import AgentEnded
 
 _PIPE_PATIENCE_S = 1.0
 _STOP_PATIENCE_S = 10.0
@@ -35,7 +36,7 @@ class CommandHarness(Harness):
         self.command = program
         self._settings = settings or {}
 
-    async def play(self, stage: Stage) -> Ending:
+    async def play(self, stage: Stage) -> AgentEnded:
         process = await stage.start(self._program, talks=True)
         talk = _Talk(process, stage)
         talking = asyncio.create_task(talk.go_on())
@@ -47,7 +48,9 @@ class CommandHarness(Harness):
             if talking.done() and not talk.stopped:
                 await asyncio.wait([ended, silent], return_when=asyncio.FIRST_COMPLETED)
             if silent.done() and not (ended.done() or talk.stopped):
-                return Ending(reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known())
+                return AgentEnded(
+                    reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known()
+                )
             # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
             await asyncio.wait([talking], timeout=_PIPE_PATIENCE_S)
             await asyncio.wait([ended], timeout=_STOP_PATIENCE_S if talk.stopped else None)
@@ -61,12 +64,12 @@ class CommandHarness(Harness):
     def known(self) -> dict[str, Any]:
         return {"settings": self._settings | {"program": self._program}}
 
-    def _ending(self, exit_code: int, turns: int) -> Ending:
+    def _ending(self, exit_code: int, turns: int) -> AgentEnded:
         facts = self.known()
         if exit_code == 0:
-            return Ending(reason="agent_stopped", turns=turns, facts=facts)
+            return AgentEnded(reason="agent_stopped", turns=turns, facts=facts)
         how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"
-        return Ending(
+        return AgentEnded(
             reason="agent_failed", detail=f"{self._program[0]} ended with {how}", turns=turns, facts=facts
         )
 

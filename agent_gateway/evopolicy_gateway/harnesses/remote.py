@@ -5,7 +5,8 @@ It ends when the budget is spent, when its time is over, or when the operator sa
 
 from __future__ import annotations
 
-from evopolicy_gateway.harnesses.base import Ending, Harness, Stage
+from evopolicy_gateway.harnesses.base import Harness, Stage
+from evopolicy_gateway.operator.control import AgentEnded
 from evopolicy_gateway.run.layout import RunFolder
 
 _LOOK_S = 0.5
@@ -17,8 +18,8 @@ class RemoteHarness(Harness):
     name = "remote"
     resumable = True
 
-    async def play(self, stage: Stage) -> Ending:
+    async def play(self, stage: Stage) -> AgentEnded:
         finish = RunFolder(stage.workspace.parent).finish
         while not finish.exists() and not stage.over.is_set():
             await stage.sleep(_LOOK_S)
-        return Ending(reason="agent_stopped", facts={"settings": {"started_by": "the operator"}})
+        return AgentEnded(reason="agent_stopped", facts={"settings": {"started_by": "the operator"}})

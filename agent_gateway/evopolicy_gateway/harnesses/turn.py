@@ -12,9 +12,10 @@ from collections.abc import Callable
 import orjson
 
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
-from evopolicy_gateway.harnesses.base import Doing, Stage
+from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader
 from evopolicy_gateway.harnesses.trouble import Trouble, trouble_of
+from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.run import processes
 
 DONE_PATIENCE_S = 30.0
@@ -89,7 +90,7 @@ async def _read(
         before = reader.action
         reader.read(event)
         if reader.action != before:
-            stage.on_doing(Doing(action=stage.log.redact.text(reader.action)))
+            stage.on_doing(AgentDoing(action=stage.log.redact.text(reader.action)))
         if (why_capped := capped(reader)) is not None:
             reader.done = False
             reader.trouble = Trouble(kind="cap", message=why_capped)

@@ -109,9 +109,10 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, or `told` when the parent ended it."""
     detail: str = ""
     turns: int = 0
+    """Prompts that it answered."""
     retries: int = 0
     facts: dict[str, Any] = {}
-    """What else `run.json` tells of it."""
+    """What else `run.json` tells: `cli_version`, `model_string`, `settings`, `tokens`."""
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):

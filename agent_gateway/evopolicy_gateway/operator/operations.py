@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import structlog
@@ -23,12 +23,15 @@ from evopolicy_common.messages.operator import (
     RunSettings,
     WaitRun,
 )
+from evopolicy_common.messages.worker import Message
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import PATIENCE_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_gateway.operator.alone import until_free
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+
+T = TypeVar("T")
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -41,17 +44,10 @@ class Operations(OperatorClient):
     async def create(self, settings: RunSettings, key: str) -> RunCreated:
         """Opens a run; the same key gives the same run."""
         message = CreateRun(token=self._token, key=key, settings=settings)
-        told = ""
-        while True:
-            try:
-                return await self._requests.until_answered(
-                    "create", message, RunCreated, patience_s=PATIENCE_S
-                )
-            except RefusedError as error:
-                if error.status != Refusal.UNAVAILABLE:
-                    raise _settings_error(error) from error
-                told = _told(error, told)
-            await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
+        try:
+            return await self._once_available("create", message, RunCreated, patience_s=PATIENCE_S)
+        except RefusedError as error:
+            raise _settings_error(error) from error
 
     async def wait(self, run: str) -> AsyncIterator[RunProgress]:
         """How far the run is, every few seconds; the last one holds the finished run."""
@@ -83,14 +79,22 @@ class Operations(OperatorClient):
         message = Claim(
             token=self._token, suite=suite, name=name, holder=holder, ttl_s=ttl_s, run=run, result=result
         )
+        return await self._once_available("claim", message, ClaimState)
+
+    async def _once_available(
+        self, verb: str, message: Message, wanted: type[T], patience_s: float | None = None
+    ) -> T:
+        """The answer, asked for again as long as the coordinator takes nothing new; says once why it does not."""
         told = ""
         while True:
             try:
-                return await self._requests.until_answered("claim", message, ClaimState)
+                return await self._requests.until_answered(verb, message, wanted, patience_s=patience_s)
             except RefusedError as error:
                 if error.status != Refusal.UNAVAILABLE:
                     raise
-                told = _told(error, told)
+                if error.message != told:
+                    log.warning(error.message)
+                told = error.message
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
     async def drop(self, folder: RunFolder) -> None:
@@ -124,13 +128,6 @@ def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Crede
     operator = credentials.find("operator", connect, file)
     beside = file if file is None or file.is_dir() else file.parent / "gateway.json"
     return operator, credentials.find("gateway", connect, beside)
-
-
-def _told(error: RefusedError, told: str) -> str:
-    """Says once why a request is asked again and again."""
-    if error.message != told:
-        log.warning(error.message)
-    return error.message
 
 
 def _settings_error(error: RefusedError) -> Exception:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import structlog
 
-from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError, TransportError
+from evopolicy_common.errors import ConfigError, RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import (
     CloseRun,
@@ -32,7 +32,6 @@ from evopolicy_common.messages.gateway import (
     SubmitAccepted,
 )
 from evopolicy_common.messages.worker import Message
-from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.refusals import NOT_NOW
 from evopolicy_common.wire.requests import Requester
@@ -137,11 +136,7 @@ class Session:
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """The bytes that `ref` names, checked."""
-        if ref.inline is None:
-            return await self._requests.download(self._run, self._token, ref.digest)
-        if digest_of(ref.inline) != ref.digest:
-            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
-        return ref.inline
+        return await self._requests.fetch(self._run, self._token, ref)
 
     async def close(self, reason: str, agent: dict[str, Any]) -> None:
         """No more submits: to be called when the agent and all its children are gone."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from evopolicy_common.errors import EvopolicyError, ProtocolError
+from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
@@ -27,7 +27,6 @@ from evopolicy_common.messages.operator import (
     StatusReply,
     StatusRequest,
 )
-from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire.requests import operator_requests
 from evopolicy_common.wire.transport import Link
 
@@ -139,11 +138,7 @@ class OperatorClient:
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """The bytes that `ref` names, checked."""
-        if ref.inline is None:
-            return await self.download(ref.digest)
-        if digest_of(ref.inline) != ref.digest:
-            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
-        return ref.inline
+        return await self._requests.fetch(_SENDER, self._token, ref)
 
     async def _done(self, verb: str, message: AgentGone | CancelRun | RepinRun | SetWorker) -> None:
         await self._requests.until_answered(verb, message, Done, patience_s=PATIENCE_S)

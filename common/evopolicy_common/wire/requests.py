@@ -17,6 +17,7 @@ import msgspec
 import structlog
 
 from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
+from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.processes.notices import AFTER_S, told_if_slow
@@ -121,6 +122,14 @@ class Requester(Generic[Reply]):
         if len(data) != chunk.size or digest_of(bytes(data)) != digest:
             raise ProtocolError(f"blob {digest} arrived damaged ({len(data)} of {chunk.size} bytes)")
         return bytes(data)
+
+    async def fetch(self, sender: str, token: str, ref: BlobRef) -> bytes:
+        """The bytes that `ref` names, checked."""
+        if ref.inline is None:
+            return await self.download(sender, token, ref.digest)
+        if digest_of(ref.inline) != ref.digest:
+            raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
+        return ref.inline
 
 
 def operator_requests(link: Link) -> Requester[OperatorReply]:

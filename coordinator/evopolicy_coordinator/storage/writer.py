@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from evopolicy_coordinator.core.effects import Effect, Persist
@@ -25,20 +26,13 @@ from evopolicy_coordinator.storage.store import Store
 T = TypeVar("T")
 
 
+@dataclass(slots=True)
 class _Work(Generic[T]):
     """One thing to do with the store, and whom to tell."""
 
-    __slots__ = ("do", "failed", "succeeded")
-
-    def __init__(
-        self,
-        do: Callable[[Store], T],
-        succeeded: Callable[[T], None],
-        failed: Callable[[BaseException], None],
-    ) -> None:
-        self.do = do
-        self.succeeded = succeeded
-        self.failed = failed
+    do: Callable[[Store], T]
+    succeeded: Callable[[T], None]
+    failed: Callable[[BaseException], None]
 
     def run(self, store: Store) -> Callable[[], None]:
         """Does it; returns what is to be called on the event loop."""

@@ -14,15 +14,16 @@ from typing import Any
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import environment_of
 from evopolicy_gateway.agent_supervisor.clock import Activity
-from evopolicy_gateway.harnesses.base import Ending, Stage
+from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.command import CommandHarness
+from evopolicy_gateway.operator.control import AgentEnded
 
 PATIENCE_S = 30.0
 
 
 def play(
     tmp_path: Path, code: str, silence_s: float | None = None
-) -> tuple[Ending, list[dict[str, Any]], list[tuple[int, str]]]:
+) -> tuple[AgentEnded, list[dict[str, Any]], list[tuple[int, str]]]:
     """How a Python program with that code ended, its log, and what it said."""
     turns: list[tuple[int, str]] = []
     log_file = tmp_path.with_name(f"{tmp_path.name}-log") / "agent.jsonl"
@@ -36,7 +37,7 @@ def play(
         on_turn=lambda turn, text: turns.append((turn, text)),
     )
 
-    async def main() -> Ending:
+    async def main() -> AgentEnded:
         async with asyncio.timeout(PATIENCE_S):
             ending = await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
             for pid in stage.started if ending.reason == "silent" else ():  # a keeper would end it
@@ -52,7 +53,7 @@ def play(
     return ending, [json.loads(line) for line in lines], turns
 
 
-def play_with_a_child_that_holds_the_pipes(tmp_path: Path) -> Ending:
+def play_with_a_child_that_holds_the_pipes(tmp_path: Path) -> AgentEnded:
     """How a program ended that left a child behind which has its standard output open."""
     code = """
 import subprocess, sys

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -60,25 +61,21 @@ RC: dict[str, Any] = {
 }
 
 
+@dataclass(slots=True, kw_only=True)
 class Plot:
     """A drawn figure with what belongs beside it."""
 
-    __slots__ = ("alt", "caption", "data", "figure", "group", "name", "title")
-
-    def __init__(
-        self, *, name: str, title: str, caption: str, alt: str, data: Any, figure: Figure, group: str
-    ) -> None:
-        self.name = name
-        """File name without suffix."""
-        self.title = title
-        self.caption = caption
-        self.alt = alt
-        """What it shows, for who cannot see it."""
-        self.data = data
-        """JSON-able: the numbers drawn."""
-        self.figure = figure
-        self.group = group
-        """Section of the report."""
+    name: str
+    """File name without suffix."""
+    title: str
+    caption: str
+    alt: str
+    """What it shows, for who cannot see it."""
+    data: Any
+    """JSON-able: the numbers drawn."""
+    figure: Figure
+    group: str
+    """Section of the report."""
 
 
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:

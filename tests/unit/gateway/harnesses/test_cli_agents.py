@@ -9,13 +9,14 @@ from cli_stage import PATH_TOKEN, Played, play, settings, thinks_without_end
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import session
-from evopolicy_gateway.harnesses.base import AgentError, Ending
+from evopolicy_gateway.harnesses.base import AgentError
 from evopolicy_gateway.harnesses.usage import Prices
+from evopolicy_gateway.operator.control import AgentEnded
 
 both = pytest.mark.parametrize("harness", ["codex", "claude-code"])
 
 
-def ended(played: Played) -> Ending:
+def ended(played: Played) -> AgentEnded:
     assert played.ending is not None
     return played.ending
 
