@@ -132,7 +132,7 @@ def document() -> str:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
         undefended = {"tier": "with tier `none`", "sealed": "unsealed"}
         off = "-" if probe.off is None else undefended["sealed" if "sealed" in probe.off else "tier"]
-        rows.append((first, "no door opens; the episode goes on", off))
+        rows.append((first, "no access; the episode goes on", off))
     for breaker in BREAKERS:
         verdict = f"`{breaker.verdict}`" if breaker.verdict else "harmless; the episode goes on"
         ways = ["unsealed"] * breaker.unsealed + ["with a higher limit"] * (breaker.off is not None)
