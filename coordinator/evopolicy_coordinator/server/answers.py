@@ -30,6 +30,7 @@ from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.events import AuditEvent
+from evopolicy_coordinator.core.records import RunRow
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.server.words import words
@@ -84,16 +85,15 @@ class Answers:
         """Sends stored outcomes of a finished run."""
         self._pages.submit(self._answer, lambda: self._recorded(message), answer)
 
-    def finished_secret(self, run: str) -> bytes | None:
-        """What a finished run's policy seeds are derived from; None for any other run. Reads the database.
+    def finished_run(self, run: str) -> RunRow | None:
+        """A finished run as it was created; None for any other run. Reads the database.
 
         RefusedError when the row cannot be read.
         """
         try:
-            row = self._reader.run(run) if self._reader.finished(run) is not None else None
+            return self._reader.run(run) if run and self._reader.finished(run) is not None else None
         except DamagedStoreError as error:
             raise damaged(error) from error
-        return None if row is None else row.secret
 
     def close(self) -> None:
         for pool in (self._pages, self._audits, *self._lanes):

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.environment import Split, StepLimit
+from evopolicy_common.messages.environment import Case, Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
@@ -28,6 +28,7 @@ from evopolicy_common.wire.credentials import Role
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
+from evopolicy_coordinator.core.records import RunRow
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
@@ -301,13 +302,18 @@ class Intake:
             max_steps=_max_steps(wanted.env, wanted.step_limit),
         )
 
-    def _evaluation_requested(self, m: operator.Evaluate, request: int, stimulus: str) -> AnyEvent:
+    def evaluation_requested(
+        self, m: operator.Evaluate, request: int, stimulus: str, of: RunRow | None = None
+    ) -> AnyEvent:
+        """`of`: the finished run that it plays again: its policy seeds, and its hidden cases where they were its own."""
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
         check_limits(m.limits)
         try:
             suite = catalogue.suite_of(m.env)
-            cases = self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
+            cases = _own_cases(of, m.split) or self._source.splits(
+                suite.name, m.env, self._counts(suite, None, None)
+            ).cases(m.split)
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
@@ -332,7 +338,7 @@ class Intake:
             evaluation=f"e-{secrets.token_hex(8)}",
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
-            secret=secrets.token_bytes(32),
+            secret=secrets.token_bytes(32) if of is None else of.secret,
             max_steps=_max_steps(m.env, m.step_limit),
         )
 
@@ -356,8 +362,13 @@ class Intake:
                 f" --data has {n_train:,}; give it data/main-128 of the published software, or leave out the profile",
             )
 
-    def split_hashes(self, m: operator.DescribeEnvironment) -> dict[str, str]:
-        """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits."""
+    def split_hashes(self, m: operator.DescribeEnvironment, of: RunRow | None = None) -> dict[str, str]:
+        """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits.
+
+        `of`: the finished run that is asked about: its own where it had hidden cases of its own.
+        """
+        if of is not None and of.settings.hidden_cases == "per_run":
+            return of.split_hashes
         try:
             suite = catalogue.suite_of(m.env)
             return self._source.splits(
@@ -451,9 +462,16 @@ _CHECKS: dict[type[Message], Callable[[Intake, Any], Message]] = {
 _EVENTS: dict[type[Message], Callable[[Intake, Any, int, str], AnyEvent]] = {
     worker.Register: Intake._registered,
     operator.CreateRun: Intake._run_created,
-    operator.Evaluate: Intake._evaluation_requested,
+    operator.Evaluate: Intake.evaluation_requested,
 }
 """Requests that the shell adds something to: ids, secrets, cases."""
+
+
+def _own_cases(run: RunRow | None, split: Split) -> tuple[Case, ...]:
+    """The hidden cases that a run had for itself; none where all runs have the same."""
+    if run is None or run.settings.hidden_cases != "per_run":
+        return ()
+    return {"train": (), "validation": run.validation, "heldout": run.heldout}[split]
 
 
 def _or(value: int | None, otherwise: int) -> int:

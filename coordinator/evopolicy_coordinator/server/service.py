@@ -44,7 +44,6 @@ from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEff
 from evopolicy_coordinator.core.events import (
     AnyEvent,
     AuditEvent,
-    EvaluationRequested,
     LivenessLost,
 )
 from evopolicy_coordinator.core.machine import Core
@@ -268,13 +267,11 @@ class Service:
             self._flush()
 
     def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
-        event = self._intake.event(parsed, request, stimulus)
-        as_in = event.message.as_in if isinstance(event, EvaluationRequested) else None
-        if as_in is not None and as_in.run:
-            # The policy seeds of the run itself; the secret they come from does not leave.
-            secret = self._answers.finished_secret(as_in.run)
-            return event if secret is None else msgspec.structs.replace(event, secret=secret)
-        return event
+        message = parsed.message
+        if isinstance(message, operator.Evaluate) and message.as_in is not None:
+            row = self._answers.finished_run(message.as_in.run)
+            return self._intake.evaluation_requested(message, request, stimulus, row)
+        return self._intake.event(parsed, request, stimulus)
 
     async def _serve_description(
         self,
@@ -284,8 +281,8 @@ class Service:
     ) -> None:
         """What is here for playing a run's episodes again."""
         try:
-            hashes = await asyncio.to_thread(self._intake.split_hashes, message)
-            secret = await asyncio.to_thread(self._answers.finished_secret, message.run)
+            row = await asyncio.to_thread(self._answers.finished_run, message.run)
+            hashes = await asyncio.to_thread(self._intake.split_hashes, message, row)
         except RefusedError as error:
             self._refuse(query, error)
         except Exception:
@@ -293,7 +290,7 @@ class Service:
             query.drop()
         else:
             known = operator.EnvironmentState(
-                split_hashes=hashes, knows_run=secret is not None, fingerprints=fingerprints
+                split_hashes=hashes, knows_run=row is not None, fingerprints=fingerprints
             )
             query.reply(answer_bytes(known))
 

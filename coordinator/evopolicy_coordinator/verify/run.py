@@ -103,7 +103,12 @@ class Verifier:
     async def check_cases(self) -> bool:
         """Whether the coordinator still knows the run. ConfigError when its cases are not the run's."""
         state = await self._describe()
-        versions = self._run.record.versions
+        record, versions = self._run.record, self._run.record.versions
+        if record.experiment_dimensions.hidden_cases == "per_run" and not state.knows_run:
+            raise ConfigError(
+                f"run {record.run} had hidden cases of its own, and this cluster's coordinator does not have that run: they are in"
+                " the state folder of the coordinator that made it; use that one, with --state, or a backup of it"
+            )
         for split in _SPLITS:
             ours = versions.cases_hash(split).removeprefix("sha256:")
             theirs = state.split_hashes.get(split, "")

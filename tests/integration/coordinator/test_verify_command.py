@@ -45,14 +45,16 @@ class Played:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.state = root / "st"
-        agent = root / "agent.py"
-        agent.write_text(AGENT)
+        (root / "agent.py").write_text(AGENT)
+        self.play(*(word for env in ENVIRONMENTS for word in ("--env", env)))
+
+    def play(self, *options: str) -> None:
         command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--jail", "none", "--budget", "3"]
-        command += ["--agent", f"command:{sys.executable} {agent}", "--validation", "1", "--heldout", "2"]
-        command += ["--state", str(self.state)]
-        for env in ENVIRONMENTS:
-            command += ["--env", env]
-        done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=150, check=False)
+        command += ["--agent", f"command:{sys.executable} {self.root / 'agent.py'}", "--validation", "1"]
+        command += ["--heldout", "2", "--state", str(self.state), *options]
+        done = subprocess.run(
+            command, cwd=self.root, capture_output=True, text=True, timeout=150, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
 
     def run(self, env: str) -> Path:
@@ -91,6 +93,19 @@ def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: 
     assert not report["policy_differences"]
     assert not report["not_checked"]
     assert not report["fingerprint_differences"]
+
+
+@pytest.mark.timeout(600)
+def test_a_run_with_hidden_cases_of_its_own_is_verified_where_they_are_known(played: Played) -> None:
+    played.play("--env", "toy/line", "--hidden-cases", "per-run", "--exp-id", "own")
+    (run,) = [path.parent for path in played.root.glob("runs/*/toy_line/own*/run.json")]
+    done = played.verify(run)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert (report["identical"], report["episodes"], report["not_checked"]) == (True, 8, [])
+    done = played.verify(run, state=False)
+    assert done.returncode != 0
+    assert "hidden cases of its own" in done.stdout + done.stderr
 
 
 def test_a_sample_draws_as_many_episodes_as_asked_and_the_same_ones_for_the_same_seed(played: Played) -> None:
