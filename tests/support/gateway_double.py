@@ -1,9 +1,11 @@
-"""The coordinator's half of the gateway protocol over a real Zenoh session, with a script in place of workers."""
+"""The coordinator of one gateway: its real service and core in this process, over a real Zenoh session, and a worker whose
+results are scripted. What a gateway is told (statuses, budgets, refusals, pages) is the core's."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,20 @@ from typing import Any
 import httpx
 import msgspec
 import numpy as np
+from service_world import IDENTITY, Asked, World
 
+from evopolicy_common.messages import operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.episode import (
+    BlobRef,
+    EpisodeOutcome,
+    EpisodeSpec,
+    PolicyFailure,
+    ResourceLimits,
+)
 from evopolicy_common.messages.gateway import (
     CloseRun,
-    EpisodeFeedback,
     OpenRun,
-    Permit,
     RequestPermit,
     ResultsPage,
     ResultsRequest,
@@ -26,26 +34,28 @@ from evopolicy_common.messages.gateway import (
     RunOpened,
     RunState,
     StateReply,
-    StateRequest,
     Submit,
     SubmitAccepted,
-    SubmitDone,
-    SubmitInFlight,
 )
-from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.worker import BlobPut, Message, Refused
+from evopolicy_common.records import bundles
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.bundles import BundleFile
 from evopolicy_common.records.trajectory import Recorder
 from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 from evopolicy_gateway.submits.desk import Desk
 from evopolicy_gateway.workspace.agents_md import Urls
 
-CLUSTER = "test"
-RUN = "run-1"
-CAPABILITY = "capability-of-run-1"
+CLUSTER = IDENTITY.cluster
+WORKER = "w-1"
+HIDDEN_FROM = 1_000_000
+"""Seeds of hidden cases. A train case's seed is its id."""
+SUBMIT_WALL_S = 3600.0
 
 LINE = EnvironmentDescription(
     env="toy/line",
@@ -94,161 +104,314 @@ def packed_episode(case: int, n_steps: int = 3) -> bytes:
     return recorder.finish()
 
 
-def episode(index: int, case: int, failure: PolicyFailure | None = None) -> EpisodeFeedback:
-    """What came of `case` at that place of the request."""
+def outcome(spec: EpisodeSpec, failure: PolicyFailure | None = None) -> EpisodeOutcome:
+    """What came of an episode; its recording goes with it where its case is odd, else it is uploaded before."""
+    case = spec.case.seed
     packed = packed_episode(case)
-    return EpisodeFeedback(
-        index=index,
+    return EpisodeOutcome(
+        index=spec.index,
         episode_return=-3.0 - case,
         length=3,
+        terminated=False,
+        truncated=True,
         failure=failure,
         reward_components={"reward_distance": -3.0},
         trajectory=BlobRef(digest=digest_of(packed), size=len(packed), inline=packed if case % 2 else None),
-        video=None,
         stdout=b"hello\n",
-        stderr=b"",
     )
 
 
+class _Gate(asyncio.Event):
+    """An event that tells when it is cleared."""
+
+    def __init__(self, on_clear: Callable[[], None]) -> None:
+        super().__init__()
+        self._on_clear = on_clear
+        self.set()
+
+    def clear(self) -> None:
+        super().clear()
+        self._on_clear()
+
+
+class _Overheard:
+    """A gateway's query on its way to the service, whose answer is heard."""
+
+    def __init__(self, double: Double, query: transport.IncomingQuery, message: Message) -> None:
+        self._double, self._query, self._message = double, query, message
+        self.key, self.payload, self.arrived = query.key, query.payload, query.arrived
+
+    def reply(self, payload: bytes, lane: int = 0) -> None:
+        self._query.reply(self._double.heard(self._message, payload), lane)
+
+    def drop(self) -> None:
+        self._query.drop()
+
+
 class Double:
-    """Answers one run's gateway. Change its attributes to script what happens."""
+    """Answers one run's gateway. Change its attributes to script what its worker does and what fails."""
 
     def __init__(self, run: RunOpened) -> None:
         self.run = run
-        self.remaining = run.episode_budget
-        self.submits: list[Submit] = []
-        self.blobs: dict[str, bytes] = {}
-        self.closed: CloseRun | None = None
+        self.run_id = self.capability = ""
+        """The run's id and its gateway's token, once it is answering."""
         self.asked: list[Message] = []
+        self.submits: list[Submit] = []
+        """Those that were accepted."""
+        self.closed: CloseRun | None = None
         self.up = True
         """False: no question is answered."""
-        self.go = asyncio.Event()
-        """Until it is set, submits run on."""
-        self.go.set()
+        self.go = _Gate(self._take_back)
+        """While it is clear, the worker takes no episodes."""
         self.order: Callable[[int], list[int]] = lambda n: list(range(n))[::-1]
-        """In which order a submit's episodes come in."""
-        self.verdict: Callable[[Submit], tuple[str, PolicyFailure | None, int]] = lambda submit: (
-            "ok",
-            None,
-            len(submit.env_instances),
-        )
-        """Status, cause and episodes kept."""
+        """In which order a submit's episodes are handed in. Those left out are never: the submit's wall time passes."""
         self.failures: dict[int, PolicyFailure] = {}
         """By request index."""
-        self.refuse_submit: Refused | None = None
-        self.permits: list[Permit | Refused] = []
-        """Answers to requests for a permit, the last one again and again; none: it is granted."""
-        self.held_s = 0.0
+        self.lost: set[int] = set()
+        """Cases whose recordings the coordinator's disk has lost, as after a restore from an older backup."""
+        self.held_s: float | None = None
+        """Told in place of how long hidden episodes have held the run up, which would take that long."""
+        self.intercept: Callable[[Message], Message | None] = lambda message: None
+        """Answers in the service's place, as another version's coordinator would."""
+        self.world: World
+        """The service and its store; `world.full = True` is a full disk."""
+        self.scoring = asyncio.Event()
+        """While it is set, hidden episodes that the worker plays do not end."""
+        self._boot_id = "kernel-of-the-worker"
+        self._session = ""
+        self._held: dict[str, worker.Lease] = {}
+        self._tasks: list[asyncio.Task[None]] = []
+
+    # What a gateway asks.
 
     def on_queries(self, queries: list[transport.IncomingQuery]) -> None:
+        served = []
         for query in queries:
             if not self.up:
                 query.drop()
                 continue
             message = codec.decode(codec.gateway_requests, query.payload)
             self.asked.append(message)
-            if isinstance(message, ResultsRequest) and not self.go.is_set():
-                asyncio.get_running_loop().create_task(self._later(query, message))
+            answer = self.intercept(message)
+            if answer is not None:
+                query.reply(codec.encode(answer))
             else:
-                query.reply(codec.encode(self._answer(message)))
+                served.append(_Overheard(self, query, message))
+        self.world.service.on_queries(served)  # type: ignore[arg-type]
 
-    async def _later(self, query: transport.IncomingQuery, message: ResultsRequest) -> None:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(0.2):
-                await self.go.wait()
-        query.reply(codec.encode(self._answer(message)))
+    def heard(self, message: Message, payload: bytes) -> bytes:
+        """Notes the service's answer, and returns what the gateway gets."""
+        answer = codec.decode(codec.gateway_replies, payload)
+        if isinstance(message, Submit) and isinstance(answer, SubmitAccepted):
+            if message.key not in {old.key for old in self.submits}:
+                self.submits.append(message)
+        elif isinstance(message, CloseRun) and isinstance(answer, RunClosed):
+            self.closed = message
+        if self.held_s is not None:
+            if isinstance(answer, ResultsPage):
+                return codec.encode(msgspec.structs.replace(answer, held_s=self.held_s))
+            if isinstance(answer, RunOpened | StateReply):
+                state = msgspec.structs.replace(answer.state, held_s=self.held_s)
+                return codec.encode(msgspec.structs.replace(answer, state=state))
+        return payload
 
-    def _answer(self, message: Message) -> Message:
-        if message.token != CAPABILITY:  # type: ignore[attr-defined]
-            return Refused(status=Refusal.BAD_TOKEN, message="wrong token")
-        if isinstance(message, OpenRun):
-            return msgspec.structs.replace(self.run, state=self._state())
-        if isinstance(message, RequestPermit):
-            if not self.permits:
-                return Permit(granted=True)
-            return self.permits.pop(0) if len(self.permits) > 1 else self.permits[0]
-        if isinstance(message, StateRequest):
-            return StateReply(state=self._state())
-        if isinstance(message, BlobPut):
-            have = self.blobs.get(message.digest, b"")
-            if message.offset == len(have) < message.size:
-                self.blobs[message.digest] = have = have + message.data
-            return BlobAck(have=len(have))
-        if isinstance(message, BlobGet):
-            data = next(
-                packed for case in range(99) if digest_of(packed := packed_episode(case)) == message.digest
-            )
-            return BlobChunk(size=len(data), data=data[message.offset : message.offset + 50])
-        if isinstance(message, Submit):
-            return self._submit(message)
-        if isinstance(message, ResultsRequest):
-            return self._page(message)
-        assert isinstance(message, CloseRun)
-        self.closed = message
-        return RunClosed()
+    # The coordinator.
 
-    def _submit(self, message: Submit) -> Message:
-        known = [index for index, old in enumerate(self.submits) if old.key == message.key]
-        if not known:
-            if self.refuse_submit is not None:
-                return self.refuse_submit
-            self.submits.append(message)
-            self.remaining -= len(message.env_instances)
-        index = known[0] if known else len(self.submits) - 1
-        return SubmitAccepted(
-            submit_index=index, first_global_episode=self._first(index), remaining_budget=self._left(index)
+    async def start(self, root: Path) -> None:
+        """The service with this run, and its worker."""
+        root.mkdir(exist_ok=True)
+        run = self.run
+        self.world = World(
+            root,
+            CoreSettings(),
+            data=_write_cases(root / "data", run.n_env_instances),
+            allowed_imports=run.allowed_imports,
+            denied_imports=run.denied_imports,
         )
+        await self.world.service.start()
+        await self._register()
+        created = await self._create("run")
+        self.run_id, self.capability = created.run, created.capability
+        self._tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._beat())]
 
-    def _page(self, message: ResultsRequest) -> ResultsPage:
-        submit = self.submits[message.submit_index]
-        if not self.go.is_set():
-            return ResultsPage(
-                cursor=message.cursor, episodes=(), done=None, waits_for="a worker", held_s=self.held_s
-            )
-        status, cause, n_kept = self.verdict(submit)
-        n = len(submit.env_instances)
-        arrivals = self.order(n) if status in ("ok", "rollout_timeout", "quarantined") else []
-        page = arrivals[message.cursor : message.cursor + 2]
-        cursor = message.cursor + len(page)
-        done = None
-        if cursor == len(arrivals):
-            done = SubmitDone(
-                status=status,  # type: ignore[arg-type]
-                n_episodes=n,
-                env_instances=submit.env_instances,
-                first_global_episode=self._first(message.submit_index),
-                remaining_budget=self._left(message.submit_index),
-                started_at=1_700_000_000.0,
-                completed_at=1_700_000_002.5,
-                failure=cause,
-                n_kept=n_kept,
-            )
-        episodes = tuple(episode(i, submit.env_instances[i], self.failures.get(i)) for i in page)
-        return ResultsPage(cursor=cursor, episodes=episodes, done=done, held_s=self.held_s)
+    async def stop(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        ended = await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.world.service.stop()
+        self.world.store.close()
+        for end in ended:
+            if isinstance(end, Exception):
+                raise end
 
-    def _state(self) -> RunState:
-        running = None
-        if self.submits and not self.go.is_set():
-            running = SubmitInFlight(
-                submit_index=len(self.submits) - 1,
-                n_episodes=len(self.submits[-1].env_instances),
-                n_done=0,
-                waits_for="a worker",
-                held_s=self.held_s,
-            )
-        return RunState(
-            remaining_budget=self.remaining,
-            n_submits=len(self.submits),
-            is_finalized=self.closed is not None,
-            in_flight=running,
-            held_s=self.held_s,
+    async def _create(self, key: str) -> operator.RunCreated:
+        run = self.run
+        settings = RunSettings(
+            env=run.env.env,
+            entry="e",
+            model="m",
+            exp_id=key,
+            budget=run.episode_budget,
+            min_episodes_per_submit=run.min_episodes_per_submit,
+            max_episodes_per_submit=run.max_episodes_per_submit,
+            n_validation=1,
+            n_heldout=1,
+            policy_scope=run.policy_scope,
+            observations=run.observations,
+            sandbox_tier=run.sandbox_tier,
+            limits=msgspec.structs.replace(run.limits, submit_wall_s=SUBMIT_WALL_S),
         )
+        message = operator.CreateRun(token="operate", key=key, settings=settings)
+        created = await self._ask(keys.operator_key(CLUSTER, "create"), message)
+        assert isinstance(created, operator.RunCreated), created
+        return created
 
-    def _first(self, index: int) -> int:
-        return sum(len(submit.env_instances) for submit in self.submits[:index])
+    async def score_another_run(self, boot_id: str) -> None:
+        """A hidden episode of another run on the same cases is played on that kernel, until `scoring` is cleared."""
+        self._boot_id = boot_id
+        await self._register()
+        created = await self._create("other")
+        token = created.capability
+        speaker: dict[str, Any] = {"run": created.run, "token": token}
 
-    def _left(self, index: int) -> int:
-        return self.run.episode_budget - self._first(index + 1)
+        async def ask(verb: str, message: Message) -> Any:
+            return await self._ask(keys.gateway_key(CLUSTER, created.run, verb), message)
+
+        await ask("open", OpenRun(**speaker, asks_permit=True))
+        await ask("permit", RequestPermit(**speaker, boot_id="kernel-of-another-agent"))
+        bundle = bundles.pack([BundleFile("policy.py", False, b"class Policy: pass")])
+        size = len(bundle.packed)
+        put = BlobPut(
+            sender=created.run, token=token, digest=bundle.digest, size=size, offset=0, data=bundle.packed
+        )
+        await ask("blob", put)
+        await ask("submit", Submit(**speaker, key="k", env_instances=(0,), bundle=bundle.digest))
+        asked = ResultsRequest(**speaker, submit_index=0, cursor=1, wait_s=1.0)
+        while (await ask("results", asked)).done is None:
+            pass
+        self.scoring.set()
+        await ask("close", CloseRun(**speaker, reason="agent_stopped"))
+        while not self._held:
+            await asyncio.sleep(0.01)
+
+    async def cancel(self) -> None:
+        """The operator cancels the run."""
+        message = operator.CancelRun(token="operate", run=self.run_id)
+        answer = await self._ask(keys.operator_key(CLUSTER, "cancel"), message)
+        assert not isinstance(answer, Refused), answer
+
+    async def _ask(self, key: str, message: Message) -> Any:
+        """Asks until there is an answer: while the core is loaded anew there is none."""
+        while True:
+            asked = Asked(key, message)
+            self.world.service.on_queries([asked])  # type: ignore[list-item]
+            answer = await asked.message()
+            if answer is not None:
+                return answer
+            await asyncio.sleep(0.02)
+
+    # The worker.
+
+    async def _register(self) -> None:
+        message = worker.Register(
+            worker=WORKER,
+            token="join",
+            protocol=codec.WIRE_VERSION,
+            slots=256,
+            tiers=("bwrap", "none"),
+            environments=(self.run.env,),
+            fingerprint=worker.Fingerprint(code_version="1", python="3", packages={}, cpu="any"),
+            boot_id=self._boot_id,
+        )
+        self._session = (await self._ask(keys.worker_key(CLUSTER, "register"), message)).session
+        await self._tell("beat", worker.Heartbeat(worker=WORKER, session=self._session, held=()))
+
+    async def _tell(self, verb: str, message: Message) -> Any:
+        answer = await self._ask(keys.worker_key(CLUSTER, verb), message)
+        if isinstance(answer, Refused):  # of a core that was loaded anew
+            await self._register()
+        return answer
+
+    def _take_back(self) -> None:
+        """Ends the poll that waits, so that it brings no lease."""
+        if self._session:
+            message = worker.LeaseRequest(worker=WORKER, session=self._session, n=0, wait_s=0.0)
+            self.world.service.on_queries([Asked(keys.worker_key(CLUSTER, "lease"), message)])  # type: ignore[list-item]
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(2.0)
+            held = tuple(
+                worker.HeldLease(
+                    lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, running=True
+                )
+                for lease in self._held.values()
+            )
+            await self._tell("beat", worker.Heartbeat(worker=WORKER, session=self._session, held=held))
+
+    async def _work(self) -> None:
+        while True:
+            await self.go.wait()
+            request = worker.LeaseRequest(worker=WORKER, session=self._session, n=256, wait_s=5.0)
+            answer = await self._tell("lease", request)
+            if isinstance(answer, worker.Leases):
+                self._held |= {lease.lease_id: lease for lease in answer.leases}
+            found = {spec.index: lease for lease in self._held.values() for spec in lease.job.episodes}
+            if not found:
+                continue
+            if any(spec.case.seed >= HIDDEN_FROM for lease in found.values() for spec in lease.job.episodes):
+                while self.scoring.is_set():
+                    await asyncio.sleep(0.01)
+                await self._hand_in(list(found.values()))
+            elif not self.submits or len(found) == len(self.submits[-1].env_instances):
+                await self._play(found)
+
+    async def _play(self, found: dict[int, worker.Lease]) -> None:
+        """Hands a submit's episodes in, one after another."""
+        order = self.order(len(found))
+        for index in order:
+            await self._hand_in([found[index]])
+        if len(order) < len(found):
+            self.world.service._unix_offset += SUBMIT_WALL_S + 1.0
+            self.world.service._on_timer()
+            self._held.clear()
+
+    async def _hand_in(self, leases: list[worker.Lease]) -> None:
+        for lease in leases:
+            episodes = tuple(outcome(spec, self.failures.get(spec.index)) for spec in lease.job.episodes)
+            for each in episodes:
+                if each.trajectory is not None and each.trajectory.inline is None:
+                    await self._upload(packed_episode(_case_of(lease, each.index)))
+            result = worker.JobResult(
+                lease_id=lease.lease_id,
+                job_id=lease.job.job_id,
+                attempt=lease.attempt,
+                kind="done",
+                episodes=episodes,
+            )
+            await self._tell("done", worker.HandIn(worker=WORKER, session=self._session, results=(result,)))
+            self._held.pop(lease.lease_id, None)
+            for case in self.lost & {_case_of(lease, each.index) for each in episodes}:
+                self.world.blobs.delete(digest_of(packed_episode(case)))
+
+    async def _upload(self, data: bytes) -> None:
+        message = BlobPut(
+            sender=WORKER, token=self._session, digest=digest_of(data), size=len(data), offset=0, data=data
+        )
+        await self._tell("blob", message)
+
+
+def _case_of(lease: worker.Lease, index: int) -> int:
+    return next(spec.case.seed for spec in lease.job.episodes if spec.index == index)
+
+
+def _write_cases(folder: Path, n_train: int) -> Path:
+    for stem, seeds in (("train", range(n_train)), ("valid", [HIDDEN_FROM]), ("heldout", [HIDDEN_FROM + 1])):
+        path = folder / "toy_line" / f"{stem}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cases = [{"seed": seed} for seed in seeds]
+        path.write_text(json.dumps({"env": "toy/line", "split": stem, "cases": cases}))
+    return folder
 
 
 @contextlib.asynccontextmanager
@@ -257,24 +420,28 @@ async def answering(folder: Path, double: Double) -> AsyncIterator[Credentials]:
     (folder / "passwords").write_text("gateway:secret\n")
     endpoint = f"unixsock-stream/{folder}/sock"
     config = transport.server_config(CLUSTER, [endpoint], folder / "passwords", {"gateway": "gateway"})
-    async with transport.serve(config, double.on_queries) as server:
-        server.declare([keys.gateway_expr(CLUSTER)])
-        yield Credentials(
-            cluster=CLUSTER,
-            role="gateway",
-            endpoints=(endpoint,),
-            user="gateway",
-            password="secret",
-            token=CAPABILITY,
-        )
+    await double.start(folder / "coordinator")
+    try:
+        async with transport.serve(config, double.on_queries) as server:
+            server.declare([keys.gateway_expr(CLUSTER)])
+            yield Credentials(
+                cluster=CLUSTER,
+                role="gateway",
+                endpoints=(endpoint,),
+                user="gateway",
+                password="secret",
+                token=double.capability,
+            )
+    finally:
+        await double.stop()
 
 
-def prepare(root: Path, found: Credentials) -> RunFolder:
+def prepare(root: Path, found: Credentials, double: Double) -> RunFolder:
     """A run folder as `evopolicy run` leaves it for a gateway."""
     folder = RunFolder(root)
     folder.state.mkdir(parents=True, mode=0o700, exist_ok=True)
     credentials.write(found, folder.credentials)
-    save(folder.opened, OpenedRun(run=RUN))
+    save(folder.opened, OpenedRun(run=double.run_id))
     return folder
 
 
@@ -326,6 +493,6 @@ async def served(tmp_path: Path, double: Double | None = None) -> AsyncIterator[
     double = double or Double(opened())
     async with (
         answering(tmp_path, double) as found,
-        gateway_on(prepare(tmp_path / "run", found), double) as service,
+        gateway_on(prepare(tmp_path / "run", found, double), double) as service,
     ):
         yield service

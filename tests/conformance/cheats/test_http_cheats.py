@@ -17,7 +17,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, opened, prepare
+from gateway_double import Double, Served, answering, gateway_on, opened, prepare
 
 from evopolicy_gateway.http.door import Door
 from evopolicy_gateway.run.layout import save
@@ -38,7 +38,7 @@ class Wire:
     def __init__(self, served: Served, tmp_path: Path) -> None:
         self.served = served
         self._address = urlsplit(served.urls.submit)
-        self._secrets = [CAPABILITY.encode(), str(tmp_path).encode()]
+        self._secrets = [served.double.capability.encode(), str(tmp_path).encode()]
         self.path = self._address.path.removesuffix("/submit")
         """Secret, before each of the three names."""
         self.host = f"{self._address.hostname}:{self._address.port}"
@@ -87,7 +87,7 @@ def status(answer: bytes) -> int:
 async def serving(tmp_path: Path, door: Door | None = None) -> AsyncIterator[Wire]:
     double = Double(opened())
     async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found)
+        folder = prepare(tmp_path / "run", found, double)
         if door is not None:
             save(folder.door, door)
         async with gateway_on(folder, double) as service:
@@ -267,7 +267,7 @@ def test_a_fault_of_ours_is_told_without_a_word_of_it(
 ) -> None:
     async def script(w: Wire) -> None:
         async def fail() -> None:
-            raise RuntimeError(f"{tmp_path} {CAPABILITY}")
+            raise RuntimeError(f"{tmp_path} {w.served.double.capability}")
 
         with monkeypatch.context() as patched:
             patched.setattr(w.served.desk, "refresh", fail)

@@ -100,11 +100,9 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
             status, document = post(submit, body)
             assert (status, document["status"]) == (400, wanted)
             assert document["error"]["message"]
-        double.verdict = lambda request: (
-            "init_error",
-            PolicyFailure(category="init_error", step_index=None, message="no", traceback="tb"),
-            0,
-        )
+        double.failures = {
+            0: PolicyFailure(category="init_error", step_index=None, message="no", traceback="tb")
+        }
         status, document = post(submit, {"env_instances": [0]})
         assert (status, document["status"]) == (200, "init_error")
         check_submit(workspace / document["feedback"], document)

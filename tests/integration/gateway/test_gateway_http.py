@@ -11,9 +11,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import CAPABILITY, Double, Served, opened, served
+from gateway_double import Double, Served, opened, served
 
 from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_common.messages.worker import BlobPut
 from evopolicy_common.records.summary import decode_summary
 from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES
 
@@ -52,7 +53,7 @@ def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(t
         assert summary.mean_return == -5.0
         assert summary.std_return == pytest.approx(2**0.5)
         assert summary.remaining_budget == 9
-        assert summary.wall_time_seconds == 2.5
+        assert summary.wall_time_seconds > 0.0
         assert files_below(folder) == sorted(
             ["summary.json"]
             + [
@@ -95,7 +96,7 @@ def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
             "status": "running",
             "n_episodes": 2,
             "n_done": 0,
-            "waits_for": "a worker",
+            "waits_for": "a free slot",
             "held_s": 0.0,
         }
 
@@ -214,7 +215,7 @@ def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) 
 
     double = play(tmp_path, script)
     assert double.submits == []
-    assert double.blobs == {}
+    assert not any(isinstance(message, BlobPut) for message in double.asked)
 
 
 def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_path: Path) -> None:
@@ -258,7 +259,7 @@ def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
         assert len({answer.content for answer in answers}) == 1
         assert (await s.http.put(s.urls.submit, content=b"x")).status_code == 405
         for answer in answers:
-            assert CAPABILITY not in answer.text
+            assert s.double.capability not in answer.text
             assert "server" not in answer.headers
 
     play(tmp_path, script)
@@ -287,7 +288,7 @@ def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) -> None:
 
     async def main() -> None:
         double = Double(opened())
-        double.verdict = lambda submit: ("import_error", cause, 0)
+        double.failures = {0: cause, 1: cause}
         double_made.append(double)
         async with served(tmp_path, double) as s:
             answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1]})).json()
@@ -338,7 +339,6 @@ def test_an_episode_that_failed_has_its_error_file_and_is_listed(tmp_path: Path)
 def test_a_submit_timeout_keeps_exactly_the_episodes_before_the_first_unfinished(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.verdict = lambda submit: ("rollout_timeout", None, 2)
         double.order = lambda n: [0, 3, 1]
         async with served(tmp_path, double) as s:
             answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1, 2, 3]})).json()

@@ -6,12 +6,11 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import pytest
-from gateway_double import RUN, Double, answering, gateway_on, opened, prepare, served
+from gateway_double import Double, answering, gateway_on, opened, prepare, served
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.gateway import CloseRun, OpenRun, Permit, RequestPermit
+from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
 from evopolicy_common.messages.operator import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
@@ -22,7 +21,6 @@ from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
 
 KERNEL = "0f2e9a7c-11d0-4b35-8d2f-5a3c9e7b1d60"
-WAITING = Permit(granted=False, waits_for="hidden episodes to end on this machine")
 
 
 def asked(double: Double, kind: type[Message]) -> list[Message]:
@@ -58,15 +56,15 @@ def remote(folder: RunFolder, agent_host: str) -> None:
 def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.permits = [WAITING]
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            await double.score_another_run(host.boot_id())
+            folder = prepare(tmp_path / "run", found, double)
             gateway, said = quiet(folder)
             task = asyncio.create_task(gateway.run())
-            await until(lambda: len(asked(double, RequestPermit)) > 1)
-            assert set(said) == {WAITING.waits_for}
+            await until(lambda: said)
+            assert set(said) == {"hidden cases on this machine to be put off"}
             assert not folder.workspace.exists()
-            double.permits = []
+            double.scoring.clear()
             await until(lambda: len(said) > 1 and said[-2] == "")
             assert gateway.permit_s > 0.0
             gateway.tell(None)
@@ -76,7 +74,11 @@ def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path
         assert opening.asks_permit
         first = asked(double, RequestPermit)[0]
         assert isinstance(first, RequestPermit)
-        assert (first.run, first.boot_id, first.machine_id) == (RUN, host.boot_id(), host.machine_id())
+        assert (first.run, first.boot_id, first.machine_id) == (
+            double.run_id,
+            host.boot_id(),
+            host.machine_id(),
+        )
 
     asyncio.run(main())
 
@@ -85,7 +87,7 @@ def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             for _ in range(2):
                 async with gateway_on(folder, double):
                     pass
@@ -98,11 +100,14 @@ def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
 def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.permits = [Refused(status=Refusal.RUN_CANCELLED, message="the run was cancelled")]
         async with answering(tmp_path, double) as found:
-            gateway, said = quiet(prepare(tmp_path / "run", found))
-            assert await gateway.run()
-        assert said == [""]
+            await double.score_another_run(host.boot_id())
+            gateway, said = quiet(prepare(tmp_path / "run", found, double))
+            task = asyncio.create_task(gateway.run())
+            await until(lambda: said)
+            await double.cancel()
+            assert await task
+        assert said[-1] == ""
 
     asyncio.run(main())
 
@@ -110,9 +115,9 @@ def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
 def test_gateway_of_an_agent_that_has_ended_closes_the_run_without_a_permit(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.permits = [WAITING]
         async with answering(tmp_path, double) as found:
-            gateway, _ = quiet(prepare(tmp_path / "run", found))
+            await double.score_another_run(host.boot_id())
+            gateway, _ = quiet(prepare(tmp_path / "run", found, double))
             gateway.tell(Close(reason="agent_stopped"))
             assert await gateway.run()
         assert double.closed is not None
@@ -123,9 +128,10 @@ def test_gateway_of_an_agent_that_has_ended_closes_the_run_without_a_permit(tmp_
 def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
-        double.permits = [Refused(status=Refusal.BAD_MESSAGE, message="not a message")]
+        older = Refused(status=Refusal.BAD_MESSAGE, message="not a message")
+        double.intercept = lambda message: older if isinstance(message, RequestPermit) else None
         async with answering(tmp_path, double) as found:
-            gateway, said = quiet(prepare(tmp_path / "run", found))
+            gateway, said = quiet(prepare(tmp_path / "run", found, double))
             with pytest.raises(ConfigError, match=r"older version.*update it"):
                 await gateway.run()
         assert said == [""]
@@ -148,7 +154,7 @@ def test_run_of_a_remote_agent_is_closed_when_its_operator_says_that_it_has_ende
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             remote(folder, KERNEL)
             async with gateway_on(folder, double) as service:
                 service.gateway.tell(Close(reason="budget_spent"))
@@ -169,7 +175,7 @@ def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Pa
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             remote(folder, ELSEWHERE)
             async with gateway_on(folder, double) as service:
                 assert await service.close()
@@ -182,7 +188,7 @@ def test_gateway_that_is_stopped_while_it_waits_for_an_agents_end_leaves_the_run
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             remote(folder, "")
             async with gateway_on(folder, double) as service:
                 service.gateway.tell(Close(reason="wall_limit"))
@@ -198,7 +204,7 @@ def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) ->
     async def main() -> None:
         double = Double(opened(episode_budget=1))
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             async with gateway_on(folder, double, alone=True, place=AgentPlace(boot_id=KERNEL)) as service:
                 await service.http.post(service.urls.submit, json={"env_instances": [1]})
                 await until(lambda: len(service.waits) > 1)
@@ -215,7 +221,7 @@ def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) ->
 
 def test_submit_that_hidden_episodes_hold_up_tells_so_and_counts_against_no_limit(tmp_path: Path) -> None:
     async def main() -> None:
-        double = Double(opened(state=msgspec.structs.replace(opened().state, held_s=5.0)))
+        double = Double(opened())
         double.held_s = 5.0
         double.go.clear()
         async with served(tmp_path, double) as service:
@@ -224,7 +230,7 @@ def test_submit_that_hidden_episodes_hold_up_tells_so_and_counts_against_no_limi
             double.held_s = 7.5
             await until(lambda: service.desk.held_s == 7.5)
             running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
-            assert running["waits_for"] == "a worker"
+            assert running["waits_for"] == "a free slot"
             assert running["held_s"] >= 2.5
             double.go.set()
             await service.desk.idle()

@@ -12,8 +12,6 @@ import gateway_double
 import pytest
 from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
 
-from evopolicy_common.messages.worker import BlobGet, Message, Refused
-from evopolicy_common.records.blobs import digest_of
 from evopolicy_gateway.run.layout import RunFolder
 from evopolicy_gateway.submits import episode_files, formatting
 from evopolicy_gateway.submits.journal import Died, Journal, SetAside
@@ -58,18 +56,11 @@ def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
     asyncio.run(main())
 
 
-class Forgetful(Double):
-    """Has lost a recording, as after a restore from an older backup."""
-
-    def _answer(self, message: Message) -> Message:
-        if isinstance(message, BlobGet) and message.digest == digest_of(packed_episode(2)):
-            return Refused(status="unknown_blob", message="no such blob here")
-        return super()._answer(message)
-
-
 def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None:
     async def main() -> None:
-        async with served(tmp_path, Forgetful(opened())) as s:
+        double = Double(opened())
+        double.lost = {2}
+        async with served(tmp_path, double) as s:
             assert (await s.http.post(s.urls.submit, json=BODY)).json()["status"] == "ok"
             assert [line["message"] for line in told(s.folder.feedback, "ep_001")] == [
                 "this episode's trajectory or video is not stored any more; the episode's return counts"
@@ -116,7 +107,7 @@ def test_an_episode_that_kills_two_gateways_is_put_aside_and_blames_no_other(tmp
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             async with gateway_on(folder, double) as s:
                 double.go.clear()
                 await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2, 3, 4]})
@@ -161,7 +152,7 @@ def test_a_submit_that_ends_two_gateways_is_put_aside(
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found)
+            folder = prepare(tmp_path / "run", found, double)
             with pytest.raises(KeyError):
                 await ended_by_a_submit(folder, double)
             async with gateway_on(folder, double) as s:

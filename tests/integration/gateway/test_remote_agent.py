@@ -18,7 +18,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import CAPABILITY, Double, Served, answering, gateway_on, opened, prepare
+from gateway_double import Double, Served, answering, gateway_on, opened, prepare
 from waiting import wait_until
 
 from evopolicy_common.errors import ConfigError
@@ -37,7 +37,7 @@ async def open_door(tmp_path: Path, door: Door | None = None) -> AsyncIterator[S
     """A gateway that serves a remote agent."""
     double = Double(opened())
     async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found)
+        folder = prepare(tmp_path / "run", found, double)
         save(folder.door, door or Door(host=HOST, port=0))
         async with gateway_on(folder, double) as service:
             yield service
@@ -83,7 +83,7 @@ def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> 
         assert {answer.status_code for answer in answers} == {401}
         assert len({(answer.content, tuple(answer.headers.items())) for answer in answers}) == 1
         assert answers[0].headers["WWW-Authenticate"] == "Bearer"
-        assert not any(secret in answers[0].text for secret in (token, CAPABILITY, str(tmp_path)))
+        assert not any(secret in answers[0].text for secret in (token, s.double.capability, str(tmp_path)))
         assert s.double.submits == []
         assert s.desk.n_rejected == 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,16 +64,31 @@ class Asked:
 
 
 class World:
-    """A service on a store in a folder, asked directly."""
+    """A service on a store in a folder, asked directly. With `data` its cases come from files."""
 
-    def __init__(self, root: Path, settings: CoreSettings) -> None:
+    def __init__(
+        self,
+        root: Path,
+        settings: CoreSettings,
+        *,
+        data: Path | None = None,
+        allowed_imports: Sequence[str] = (),
+        denied_imports: Sequence[str] = (),
+    ) -> None:
         self.root = root
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
         self.uploads = Uploads()
         self.answers = Answers(root / "db", self.blobs, self.uploads)
-        source = SplitSource(data=None, secret=b"s" * 32)
-        intake = Intake(IDENTITY, self.blobs, source, self.uploads, allowed_imports=(), denied_imports=())
+        source = SplitSource(data=data, secret=b"s" * 32)
+        intake = Intake(
+            IDENTITY,
+            self.blobs,
+            source,
+            self.uploads,
+            allowed_imports=allowed_imports,
+            denied_imports=denied_imports,
+        )
         self.service = Service("c", self.store, self.answers, intake, settings)
         self.writes = 0
         self.full = False
