@@ -28,7 +28,7 @@ from evopolicy_coordinator.analysis.tables.run_tables import (
 )
 from evopolicy_coordinator.analysis.tables.table import Column, Table, best_marks
 
-_DEMAND = Column(key="demand", title="Demand")
+_DEMAND = Column("demand", "Demand")
 
 
 def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
@@ -74,20 +74,18 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         for row in suite.board.standings
     ]
     columns = [ENTRY, HARNESS]
-    columns += [Column(key=family, title=family_title(family), kind="number") for family in families]
-    columns.append(Column(key="score", title=suite_title(suite.name), kind="number"))
+    columns += [Column(family, family_title(family), "number") for family in families]
+    columns.append(Column("score", suite_title(suite.name), "number"))
     if any(row.score_interval is not None for row in suite.board.standings):
-        columns.append(Column(key="score_interval", title="95 % interval"))
-        columns.append(Column(key="rank_interval", title="Rank interval"))
+        columns.append(Column("score_interval", "95 % interval"))
+        columns.append(Column("rank_interval", "Rank interval"))
     if budgets:
-        columns.append(Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."))
+        columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
     columns += [
-        Column(key="wins", title="Wins", kind="integer", note="Environments on which it ranks first."),
-        Column(
-            key="top2", title="Top-2", kind="integer", note="Environments on which it ranks first or second."
-        ),
-        Column(key="environments", title="Environments"),
-        Column(key="runs", title="Runs", kind="integer"),
+        Column("wins", "Wins", "integer", note="Environments on which it ranks first."),
+        Column("top2", "Top-2", "integer", note="Environments on which it ranks first or second."),
+        Column("environments", "Environments"),
+        Column("runs", "Runs", "integer"),
     ]
     budget = " Budget: train episodes of a run." if budgets else ""
     caption = (
@@ -127,7 +125,7 @@ def _heldout(suite: Suite) -> Table:
                 if cell.mean is not None and cell.rank <= 2 and len(suite.board.standings) > 1:
                     marks[i, env] = cell.rank
         rows.append(row)
-    columns = [Column(key=env, title=title_of(env), kind="number") for env in suite.board.environments]
+    columns = [Column(env, title_of(env), "number") for env in suite.board.environments]
     return Table(
         name=f"heldout_{suite.name}",
         title=f"{suite_title(suite.name)} held-out returns",
@@ -165,13 +163,13 @@ def _cells(suite: Suite) -> Table:
         "at least two, rank and rank score.",
         columns=(
             ENV,
-            Column(key="family", title="Family"),
+            Column("family", "Family"),
             ENTRY,
-            Column(key="mean", title="Held-out mean", kind="number"),
-            Column(key="interval", title="95 % interval"),
-            Column(key="runs", title="Runs", kind="integer"),
-            Column(key="rank", title="Rank", kind="integer"),
-            Column(key="score", title="Rank score", kind="number"),
+            Column("mean", "Held-out mean", "number"),
+            Column("interval", "95 % interval"),
+            Column("runs", "Runs", "integer"),
+            Column("rank", "Rank", "integer"),
+            Column("score", "Rank score", "number"),
         ),
         rows=tuple(rows),
     )
@@ -201,7 +199,7 @@ def _normalised(suite: Suite) -> Table:
         columns=(
             ENV,
             _DEMAND,
-            *(Column(key=agent, title=agent, kind="number", digits=2) for agent in agents),
+            *(Column(agent, agent, "number", digits=2) for agent in agents),
         ),
         rows=tuple(rows),
         marks=bold,
@@ -233,14 +231,12 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
             ENV,
             ENTRY,
             RUN,
-            Column(key="submits", title="Scored submits", kind="integer"),
-            Column(key="best", title="Best validation mean", kind="number"),
-            Column(
-                key="improvements", title="Improvements", kind="integer", note="Rises after the first score."
-            ),
-            Column(key="area", title="Area", kind="number", digits=2),
-            Column(key="to_50", title="To 50 % (episodes)", kind="integer"),
-            Column(key="to_80", title="To 80 % (episodes)", kind="integer"),
+            Column("submits", "Scored submits", "integer"),
+            Column("best", "Best validation mean", "number"),
+            Column("improvements", "Improvements", "integer", note="Rises after the first score."),
+            Column("area", "Area", "number", digits=2),
+            Column("to_50", "To 50 % (episodes)", "integer"),
+            Column("to_80", "To 80 % (episodes)", "integer"),
         ),
         rows=tuple(rows),
         links={i: link for i, found in enumerate(study.evolutions) if (link := link_of(found.run))},
@@ -269,7 +265,7 @@ def _edit_types(study: Study) -> Table:
     ]
 
     def count(key: str, title: str, note: str) -> Column:
-        return Column(key=key, title=title, kind="integer", note=note)
+        return Column(key, title, "integer", note=note)
 
     return Table(
         name="edit_types",
@@ -283,9 +279,9 @@ def _edit_types(study: Study) -> Table:
             HARNESS,
             _DEMAND,
             count("n_synthesis", "Synthesis n", "New topology."),
-            Column(key="hit_synthesis", title="Synthesis hit", kind="percent"),
+            Column("hit_synthesis", "Synthesis hit", "percent"),
             count("n_parametric", "Parametric n", "Same topology, other bytes."),
-            Column(key="hit_parametric", title="Parametric hit", kind="percent"),
+            Column("hit_parametric", "Parametric hit", "percent"),
             count("n_rollback", "Rollback", "Back to an earlier topology."),
             count("n_retest", "Retest", "Byte-identical."),
             count("n_data", "Data only", "Files outside the source bundle changed, such as weights."),
@@ -319,8 +315,8 @@ def _structure(study: Study) -> Table:
             _DEMAND,
             ENTRY,
             HARNESS,
-            *(Column(key=k, title=t, kind="number", digits=1) for k, t in zip(keys, titles, strict=True)),
-            Column(key="runs", title="Runs", kind="integer"),
+            *(Column(k, t, "number", digits=1) for k, t in zip(keys, titles, strict=True)),
+            Column("runs", "Runs", "integer"),
         ),
         rows=tuple(rows),
     )
@@ -346,10 +342,10 @@ def _edit_sizes(study: Study) -> Table:
         "only: files outside the source bundle changed, such as weights.",
         columns=(
             ENTRY,
-            Column(key="lines", title="Changed lines"),
-            Column(key="n", title="Transitions", kind="integer"),
-            Column(key="p_visible", title="Visible mean improved", kind="percent"),
-            Column(key="p_validation", title="Validation best improved", kind="percent"),
+            Column("lines", "Changed lines"),
+            Column("n", "Transitions", "integer"),
+            Column("p_visible", "Visible mean improved", "percent"),
+            Column("p_validation", "Validation best improved", "percent"),
         ),
         rows=tuple(rows),
     )
@@ -370,7 +366,7 @@ def _tokens(study: Study) -> Table:
     ]
 
     def millions(key: str, title: str, note: str) -> Column:
-        return Column(key=key, title=title, kind="number", digits=2, below=True, note=note)
+        return Column(key, title, "number", digits=2, below=True, note=note)
 
     return Table(
         name="tokens",
@@ -383,8 +379,8 @@ def _tokens(study: Study) -> Table:
             millions("input", "In (M)", "Non-cached input."),
             millions("cache", "Cache (M)", "Cache read plus cache creation."),
             millions("output", "Out (M)", "Output, reasoning included."),
-            Column(key="cost", title="Cost (US$)", kind="number", digits=2),
-            Column(key="runs", title="Runs that tell", kind="integer"),
+            Column("cost", "Cost (US$)", "number", digits=2),
+            Column("runs", "Runs that tell", "integer"),
         ),
         rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
     )

@@ -19,10 +19,10 @@ from evopolicy_coordinator.analysis.scoring.scores import (
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables.table import Column, Table
 
-ENTRY = Column(key="entry", title="Agent")
-HARNESS = Column(key="harness", title="Harness")
-ENV = Column(key="env", title="Environment")
-RUN = Column(key="run", title="Run")
+ENTRY = Column("entry", "Agent")
+HARNESS = Column("harness", "Harness")
+ENV = Column("env", "Environment")
+RUN = Column("run", "Run")
 
 _COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
 """What a harness notes among its settings of how a run went: no setting."""
@@ -78,8 +78,8 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
             ENV,
             ENTRY,
             RUN,
-            Column(key="submits", title="Submits", kind="integer"),
-            Column(key="score", title="Held-out mean", kind="number"),
+            Column("submits", "Submits", "integer"),
+            Column("score", "Held-out mean", "number"),
         ),
         rows=rows,
         links={i: link for i, run in enumerate(study.runs) if (link := link_of(run.name))},
@@ -113,16 +113,16 @@ def _agents(study: Study) -> Table:
         columns=(
             ENTRY,
             HARNESS,
-            Column(key="cli_version", title="Version", note="Of the harness's program."),
-            Column(key="model", title="Model string"),
-            Column(key="settings", title="Settings"),
-            Column(key="jail", title="Jail"),
+            Column("cli_version", "Version", note="Of the harness's program."),
+            Column("model", "Model string"),
+            Column("settings", "Settings"),
+            Column("jail", "Jail"),
             Column(
-                key="hidden_isolation",
-                title="Hidden isolation",
+                "hidden_isolation",
+                "Hidden isolation",
                 note="exclusive: hidden episodes and agents never shared a kernel.",
             ),
-            Column(key="runs", title="Runs", kind="integer"),
+            Column("runs", "Runs", "integer"),
         ),
         rows=tuple(rows),
     )
@@ -178,17 +178,17 @@ def _environments(study: Study) -> Table:
         caption="What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
         columns=(
             ENV,
-            Column(key="family", title="Family"),
-            Column(key="id", title="Suite id"),
-            Column(key="spaces", title="Obs./action"),
-            Column(key="demand", title="Demand"),
-            Column(key="steps", title="Longest episode (steps)", kind="integer"),
-            Column(key="budget", title="Budget", kind="integer", note="Train episodes of a run."),
-            Column(key="submit", title="Episodes a submit", note="Fewest to most."),
-            Column(key="validation", title="Validation cases", kind="integer"),
-            Column(key="heldout", title="Held-out cases", kind="integer"),
-            Column(key="scope", title="Policy scope", note="How long one policy object lives."),
-            Column(key="version", title="Version"),
+            Column("family", "Family"),
+            Column("id", "Suite id"),
+            Column("spaces", "Obs./action"),
+            Column("demand", "Demand"),
+            Column("steps", "Longest episode (steps)", "integer"),
+            Column("budget", "Budget", "integer", note="Train episodes of a run."),
+            Column("submit", "Episodes a submit", note="Fewest to most."),
+            Column("validation", "Validation cases", "integer"),
+            Column("heldout", "Held-out cases", "integer"),
+            Column("scope", "Policy scope", note="How long one policy object lives."),
+            Column("version", "Version"),
         ),
         rows=tuple(rows),
     )
@@ -238,18 +238,18 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
             ENV,
             ENTRY,
             RUN,
-            Column(key="submit", title="Submit"),
-            Column(key="before", title="Budget before", kind="integer"),
-            Column(key="after", title="Budget after", kind="integer"),
-            Column(key="read", title="Evidence read"),
-            Column(key="said", title="The agent's own words"),
-            Column(key="status", title="Status"),
-            Column(key="edit", title="Edit"),
-            Column(key="changed_lines", title="Changed lines", kind="integer"),
-            Column(key="visible", title="Visible mean", kind="number"),
-            Column(key="validation", title="Validation mean", kind="number"),
-            Column(key="best", title="New validation best"),
-            Column(key="selected", title="Selected"),
+            Column("submit", "Submit"),
+            Column("before", "Budget before", "integer"),
+            Column("after", "Budget after", "integer"),
+            Column("read", "Evidence read"),
+            Column("said", "The agent's own words"),
+            Column("status", "Status"),
+            Column("edit", "Edit"),
+            Column("changed_lines", "Changed lines", "integer"),
+            Column("visible", "Visible mean", "number"),
+            Column("validation", "Validation mean", "number"),
+            Column("best", "New validation best"),
+            Column("selected", "Selected"),
         ),
         rows=tuple(rows),
     )
@@ -268,11 +268,8 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
         }
         rows.append(row)
 
-    def integer(key: str, title: str) -> Column:
-        return Column(key=key, title=title, kind="integer")
-
     def seconds(key: str, title: str) -> Column:
-        return Column(key=key, title=f"{title} (s)", kind="number", digits=0)
+        return Column(key, f"{title} (s)", "number", digits=0)
 
     return Table(
         name="audit",
@@ -284,29 +281,25 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             ENV,
             ENTRY,
             RUN,
-            integer("accepted", "Accepted"),
-            integer("rejected", "Rejected"),
-            Column(key="invalid_rate", title="Invalid rate", kind="percent"),
-            integer("budget_used", "Budget used"),
-            Column(key="episodes_per_submit", title="Episodes / submit", kind="number", digits=1),
-            integer("failed_episodes", "Failed episodes"),
-            integer("score_drops", "Score drops"),
-            Column(key="selected", title="Selected"),
-            Column(key="complexity_growth", title="Growth (×)", kind="number", digits=2),
-            integer("turns", "Turns"),
-            integer("retries", "Retries"),
+            Column("accepted", "Accepted", "integer"),
+            Column("rejected", "Rejected", "integer"),
+            Column("invalid_rate", "Invalid rate", "percent"),
+            Column("budget_used", "Budget used", "integer"),
+            Column("episodes_per_submit", "Episodes / submit", "number", digits=1),
+            Column("failed_episodes", "Failed episodes", "integer"),
+            Column("score_drops", "Score drops", "integer"),
+            Column("selected", "Selected"),
+            Column("complexity_growth", "Growth (×)", "number", digits=2),
+            Column("turns", "Turns", "integer"),
+            Column("retries", "Retries", "integer"),
             Column(
-                key="splits",
-                title="Splits",
-                note="`public`: of case files or a public seed that anybody may know.",
+                "splits", "Splits", note="`public`: of case files or a public seed that anybody may know."
             ),
+            Column("simulation", "Simulation", note="Whether the run's rules let the agent simulate."),
             Column(
-                key="simulation", title="Simulation", note="Whether the run's rules let the agent simulate."
-            ),
-            Column(
-                key="simulator_flags",
-                title="Simulator flags",
-                kind="integer",
+                "simulator_flags",
+                "Simulator flags",
+                "integer",
                 note="Places in its code that look like a simulator: a signal to read, never a verdict.",
             ),
             seconds("wall_s", "Wall"),
@@ -333,12 +326,12 @@ def _simulators(study: Study, link_of: LinkOf) -> Table:
             ENV,
             ENTRY,
             RUN,
-            Column(key="file", title="File"),
-            Column(key="lines", title="Lines"),
-            Column(key="submits", title="Submits"),
-            Column(key="kind", title="Kind"),
-            Column(key="reasons", title="Why"),
-            Column(key="quote", title="Code"),
+            Column("file", "File"),
+            Column("lines", "Lines"),
+            Column("submits", "Submits"),
+            Column("kind", "Kind"),
+            Column("reasons", "Why"),
+            Column("quote", "Code"),
         ),
         rows=tuple(
             {
@@ -408,9 +401,9 @@ def _not_told(study: Study) -> Table:
         title="Not told",
         caption="What run directories of the published software do not tell, by the table that lacks it. Nothing is put in its place.",
         columns=(
-            Column(key="table", title="Table"),
-            Column(key="what", title="Not told"),
-            Column(key="runs", title="Runs", kind="integer"),
+            Column("table", "Table"),
+            Column("what", "Not told"),
+            Column("runs", "Runs", "integer"),
         ),
         rows=tuple({"table": table, "what": what, "runs": n} for table, what, n in counts if n),
     )
@@ -421,6 +414,6 @@ def _left_out(study: Study) -> Table:
         name="left_out",
         title="Left out",
         caption="Folders that are no complete run, and why. They are in no table and no figure.",
-        columns=(Column(key="path", title="Folder"), Column(key="reason", title="Reason")),
+        columns=(Column("path", "Folder"), Column("reason", "Reason")),
         rows=tuple({"path": path_text(item.path), "reason": item.reason} for item in study.left_out),
     )

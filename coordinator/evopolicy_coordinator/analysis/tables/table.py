@@ -21,7 +21,7 @@ DASH = "–"
 """Shown where there is no value; CSV leaves the field empty."""
 
 
-class Column(msgspec.Struct, frozen=True, kw_only=True):
+class Column(msgspec.Struct, frozen=True):
     """One column: its field, its heading and how its values are shown."""
 
     key: str

@@ -33,21 +33,8 @@ from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step
 
 from . import templates
 
-LOOK_AGAIN_S = 5.0
-"""A run that waits for its audits sees so often whether anyone can still play them."""
-
-FINDINGS_MAX = 100
-"""Findings that a run's record keeps."""
-
-ONE_WORKER = "one worker only"
-ONE_MACHINE = "one machine only"
-OTHERS_DIFFER = "the other workers have other versions or processors"
-UNKNOWN_KERNEL = "the other workers' kernels are not known"
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"
-TOO_LATE = "nobody played it again in time"
-CANCELLED = "the run was cancelled"
-FORGING_AUDITOR = "only a forger had played it again"
 
 
 def drawn(secret: bytes, group: str, index: int, share: float) -> bool:

@@ -23,10 +23,10 @@ WORDS = "what the agent said of its submit, in some more words than go into a li
 
 
 def table(n_text: int, n_numbers: int, n_rows: int, text: str = WORDS) -> Table:
-    texts = tuple(Column(key=f"t{i}", title=f"Text {i}") for i in range(n_text))
-    numbers = tuple(Column(key=f"x{i}", title=f"Number {i}", kind="number") for i in range(n_numbers))
+    texts = tuple(Column(f"t{i}", f"Text {i}") for i in range(n_text))
+    numbers = tuple(Column(f"x{i}", f"Number {i}", "number") for i in range(n_numbers))
     row = {**{c.key: text for c in texts}, **{c.key: 1.5 for c in numbers}}
-    columns = (Column(key="who", title="Agent"), *texts, *numbers)
+    columns = (Column("who", "Agent"), *texts, *numbers)
     rows = tuple({"who": f"agent {i}", **row} for i in range(n_rows))
     return Table(name="w", title="W", caption="", columns=columns, rows=rows)
 

@@ -56,7 +56,7 @@ def test_csv_holds_no_formula_and_nothing_that_steers_a_terminal(text: str, writ
         name="t",
         title="T",
         caption="",
-        columns=(Column(key="who", title="Who"), Column(key="x", title="X", kind="number")),
+        columns=(Column("who", "Who"), Column("x", "X", "number")),
         rows=({"who": text, "x": -1.5},),
     )
     assert list(csv.reader(io.StringIO(to_csv(table)))) == [["who", "x"], [written, "-1.5"]]
@@ -73,14 +73,12 @@ def test_csv_holds_no_formula_and_nothing_that_steers_a_terminal(text: str, writ
     ],
 )
 def test_markdown_shows_text_and_no_html_links_or_images(text: str, written: str) -> None:
-    table = Table(
-        name="t", title="T", caption="", columns=(Column(key="who", title="Who"),), rows=({"who": text},)
-    )
+    table = Table(name="t", title="T", caption="", columns=(Column("who", "Who"),), rows=({"who": text},))
     assert to_markdown(table).splitlines()[-1] == f"| {written} |"
 
 
 def test_number_too_small_to_show_is_told_from_nought() -> None:
-    column = Column(key="x", title="X", kind="number", digits=2, below=True)
+    column = Column("x", "X", "number", digits=2, below=True)
     assert [shown(value, column) for value in (0.0, 0.0001, 0.0099, 0.01, 0.014)] == [
         "0.00",
         "<0.01",
@@ -88,7 +86,7 @@ def test_number_too_small_to_show_is_told_from_nought() -> None:
         "0.01",
         "0.01",
     ]
-    assert shown(0.0001, Column(key="x", title="X", kind="number", digits=2)) == "0.00"
+    assert shown(0.0001, Column("x", "X", "number", digits=2)) == "0.00"
 
 
 def test_equal_best_values_share_the_mark_and_leave_no_second() -> None:
