@@ -14,8 +14,8 @@ from typing import Any
 
 from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence
+from evopolicy_coordinator.core.families import Families
 from evopolicy_coordinator.core.isolation import bars, stays
-from evopolicy_coordinator.core.isolation.families import Families
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
 from evopolicy_coordinator.core.model import JobGroup, Profile
 from evopolicy_coordinator.core.runs import audits, finalisation, finished, results, submits

@@ -121,6 +121,35 @@ def test_no_module_of_the_product_is_in_an_import_circle() -> None:
     assert circles({name: imported(name, path, known) for name, path in known.items()}) == []
 
 
+CORE = "evopolicy_coordinator.core"
+CORE_LAYERS = (
+    ("events", "effects", "reasons", "records", "settings"),
+    ("structures",),
+    ("transitions",),
+    ("model", "families", "state", "step"),
+    ("isolation",),
+    ("leasing",),
+    ("agents",),
+    ("workers",),
+    ("runs",),
+    ("loading", "invariants", "status", "machine"),
+)
+"""From the ground up, as in ARCHITECTURE.md."""
+
+
+def test_the_cores_modules_build_on_those_below_them_only() -> None:
+    floor = {part: number for number, parts in enumerate(CORE_LAYERS) for part in parts}
+    known = modules()
+    for name, path in known.items():
+        if not name.startswith(f"{CORE}."):
+            continue
+        part = name.removeprefix(f"{CORE}.").split(".")[0]
+        for other in imported(name, path, known):
+            if other.startswith(f"{CORE}."):
+                below = other.removeprefix(f"{CORE}.").split(".")[0]
+                assert floor[below] <= floor[part], f"{name} imports {other}"
+
+
 OWN_STDOUT = {
     "evopolicy_gateway/agents": "programs of their own, whose stdout is an agent's log",
     "evopolicy_gateway/jail/doorway.py": "inside the jail, with the standard library alone",

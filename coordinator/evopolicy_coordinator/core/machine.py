@@ -15,7 +15,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.wire.refusals import Refusal
 
 from . import events, invariants, loading, status, step
-from .agents import permits, precedence, requests
+from .agents import known, permits, precedence, requests
 from .effects import Effect
 from .isolation import stays
 from .leasing import expiry, fleet, queue
@@ -27,7 +27,6 @@ from .runs import (
     evaluations,
     finalisation,
     finished,
-    known,
     results,
     runs,
     submits,

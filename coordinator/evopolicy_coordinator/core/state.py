@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from evopolicy_common.messages.gateway import RunState
 
-from .isolation.families import Families
+from .families import Families
 from .model import (
     EVERYWHERE,
     RANKS,

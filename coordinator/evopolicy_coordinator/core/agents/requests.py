@@ -6,11 +6,11 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.operator import ELSEWHERE, HiddenIsolation
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents.known import over
 from evopolicy_coordinator.core.isolation import bars, kernels
 from evopolicy_coordinator.core.model import EVERYWHERE, Run
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import PermitRow, RunRow
-from evopolicy_coordinator.core.runs.known import over
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 from evopolicy_coordinator.core.structures.polls import Poll
@@ -57,7 +57,15 @@ def answer(state: State, poll: Poll, step: Step) -> None:
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
-def implied(state: State, run: Run, step: Step) -> Reason | None:
+def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
+    """Refuse, for now, what an agent asks that may be on any machine, until it may."""
+    waits_for = _implied(state, run, step) if run.state.phase == "open" else None
+    if waits_for is not None:
+        step.refuse(request, Refusal.UNAVAILABLE, because("may_not_start", waits_for=waits_for))
+    return waits_for is not None
+
+
+def _implied(state: State, run: Run, step: Step) -> Reason | None:
     """The permit of an agent whose gateway asks for none, so it may be anywhere; gives what it waits for, None when the
     run has one."""
     kernel = permits.place(run, EVERYWHERE)

@@ -1,16 +1,19 @@
 """Groups of jobs: a submit's train episodes, a checkpoint's hidden ones, an evaluation's, an audit's replay.
 
-Rules that this module owns: what of a group is not done is queued when it opens; nothing of it is played once it is closed.
+Rules that this module owns:
+- A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.
+- What of a group is not done is queued when it opens; nothing of it is played once it is closed.
+- Of a finished episode only its mark is kept, and only while the group is open.
 """
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.model import JobGroup, JobState
+from evopolicy_coordinator.core.model import JobGroup, JobState, Mark
+from evopolicy_coordinator.core.records import OutcomeHead
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 from . import fleet, leases, queue
-from .jobs import open_jobs
 
 
 def open_group(state: State, group: JobGroup, step: Step) -> None:
@@ -20,7 +23,7 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
     if loading is not None:
         heads = loading.heads.pop(group.id, [])
         loading.reloaded.append(group)
-    for job in open_jobs(group, heads, state.first_attempt, step.now):
+    for job in _cut(group, heads, state.first_attempt, step.now):
         state.jobs[job.job_id] = job
         if loading is not None:
             begun = loading.begun.get((group.id, job.first))
@@ -31,6 +34,29 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
         else:
             queue.put(state, job, step)
     state.story.tell(step.now, step.stimulus_id, group.id, f"opened, {group.done} of {group.n} done")
+
+
+def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
+    """Fill in `group.marks` from the stored heads and `group.jobs` with what is left to play, in order.
+
+    A job of several episodes is stored whole or not at all.
+    """
+    for head in sorted(heads, key=lambda head: head.seq):
+        group.marks[head.index] = Mark(head.episode_return, head.length, head.failure, head.trajectory)
+    per_job = group.template.per_job
+    for first in range(0, group.n, per_job):
+        if first in group.marks:
+            continue
+        group.jobs[first] = JobState(
+            job_id=f"{group.id}/{first}",
+            group=group,
+            first=first,
+            n=min(per_job, group.n - first),
+            attempts=attempts,
+            priority=group.priority,
+            since=now,
+        )
+    return list(group.jobs.values())
 
 
 def close_group(state: State, group: JobGroup, step: Step, why: str) -> None:

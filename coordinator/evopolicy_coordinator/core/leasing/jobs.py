@@ -1,43 +1,16 @@
-"""A job as its worker gets it, and the jobs that a group is cut into.
+"""A job as its worker gets it.
 
-Rules that this module owns:
-- A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.
-- A job's content follows from its group and its position, so it need not be stored, and every attempt of it is the same job,
-  but for what the policy returned in an earlier one (`BegunRow`).
-- Of a finished episode only its mark is kept, and only while the group is open.
+Rule that this module owns: a job's content follows from its group and its position, so it need not be stored, and every
+attempt of it is the same job, but for what the policy returned in an earlier one (`BegunRow`).
 """
 
 from __future__ import annotations
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeSpec, Job
-from evopolicy_coordinator.core.model import JobGroup, JobState, Mark, Template
-from evopolicy_coordinator.core.records import OutcomeHead
+from evopolicy_coordinator.core.model import JobState, Template
 
 from .seeds import policy_seed, reference_seed
-
-
-def open_jobs(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
-    """Fill in `group.marks` from the stored heads and `group.jobs` with what is left to play, in order.
-
-    A job of several episodes is stored whole or not at all.
-    """
-    for head in sorted(heads, key=lambda head: head.seq):
-        group.marks[head.index] = Mark(head.episode_return, head.length, head.failure, head.trajectory)
-    per_job = group.template.per_job
-    for first in range(0, group.n, per_job):
-        if first in group.marks:
-            continue
-        group.jobs[first] = JobState(
-            job_id=f"{group.id}/{first}",
-            group=group,
-            first=first,
-            n=min(per_job, group.n - first),
-            attempts=attempts,
-            priority=group.priority,
-            since=now,
-        )
-    return list(group.jobs.values())
 
 
 def _seed(template: Template, index: int) -> bytes:

@@ -12,6 +12,7 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
+from evopolicy_coordinator.core.agents.known import live
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.model import Run
 from evopolicy_coordinator.core.reasons import Reason, because
@@ -21,7 +22,6 @@ from evopolicy_coordinator.core.step import FlowPinned, JobRetried, ResultsDiffe
 from evopolicy_coordinator.core.structures.ledger import Ledger
 
 from . import waits
-from .known import live
 
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:
@@ -118,7 +118,7 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
         missing = waits.waits_for_workers(state, run.flow)
         step.refuse(event.request, Refusal.NO_WORKER, because("no_worker_yet", waits_for=missing))
         return
-    if not event.message.asks_permit and without_permit(state, event.request, run, step):
+    if not event.message.asks_permit and requests.without_permit(state, event.request, run, step):
         return
     told, waits_for = run_state(state, run, step.now)
     step.reply(
@@ -143,14 +143,6 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
         ),
         waits_for,
     )
-
-
-def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
-    """Refuse, for now, what an agent asks that may be on any machine, until it may."""
-    waits_for = requests.implied(state, run, step) if run.state.phase == "open" else None
-    if waits_for is not None:
-        step.refuse(request, Refusal.UNAVAILABLE, because("may_not_start", waits_for=waits_for))
-    return waits_for is not None
 
 
 def state_requested(state: State, event: events.Asked[gateway.StateRequest], step: Step) -> None:

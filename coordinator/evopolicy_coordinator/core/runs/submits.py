@@ -16,6 +16,8 @@ from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents import requests
+from evopolicy_coordinator.core.agents.known import live, over
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.model import JobGroup, Run
 from evopolicy_coordinator.core.reasons import because
@@ -25,8 +27,6 @@ from evopolicy_coordinator.core.step import EpisodesDone, Step, SubmitEnded
 from evopolicy_coordinator.core.structures.ledger import refusal
 
 from . import results, templates
-from .known import live, over
-from .runs import without_permit
 
 
 def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> None:
@@ -58,7 +58,7 @@ def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> Non
     if message.bundle is None and message.bundle_error is None:
         step.refuse(event.request, Refusal.BAD_REQUEST, because("no_bundle"))
         return
-    if without_permit(state, event.request, run, step):
+    if requests.without_permit(state, event.request, run, step):
         return
     _accept(state, run, event, step)
 

@@ -9,7 +9,8 @@ import json
 from collections.abc import Iterable
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_coordinator.core.model import CaseKey, Family
+
+from .model import CaseKey, Family
 
 
 class Families:
