@@ -129,6 +129,13 @@ def fail_on_our_errors() -> Iterator[None]:
         if text is None:
             raise
         fail(text, FAILURE)
+    except UnicodeEncodeError as error:
+        if not any(str(error.object) in word for word in sys.argv):
+            raise
+        fail(
+            f"{harmless(str(error.object))!r} is not UTF-8, which names and messages are: choose another",
+            USAGE_ERROR,
+        )
     except KeyboardInterrupt:
         fail("interrupted", 130)
 

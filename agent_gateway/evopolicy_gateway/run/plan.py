@@ -53,6 +53,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     def check_held(self) -> None:
         """`check` for who may hold the folder's lock."""
         check_text(self.started_in, "cd")
+        msgspec.json.encode((self.settings, self.agent))  # UnicodeEncodeError for an option that is not UTF-8
         check_installed("gateway")
         check_writable(self.runs, "--runs")
         if self.door is None:

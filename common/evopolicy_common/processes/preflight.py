@@ -27,6 +27,12 @@ _REMEDIES = {
     errno.EMFILE: "too many files are open (ulimit -n)",
     errno.ENFILE: "too many files are open on this machine",
     errno.ENOTDIR: "a part of the path is no folder",
+    errno.EISDIR: "this is a folder, and a file is wanted",
+    errno.ENAMETOOLONG: "a name in the path is too long",
+    errno.ELOOP: "its links lead in a circle",
+    errno.EIO: "the disk fails",
+    errno.ESTALE: "the network file system has lost it: mount it again",
+    errno.EFBIG: "a limit on the size of files (ulimit -f)",
     errno.EADDRNOTAVAIL: "this machine does not have that address",
     errno.EADDRINUSE: "something else listens there",
 }

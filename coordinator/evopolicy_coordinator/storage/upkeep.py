@@ -96,8 +96,8 @@ def collect(
     `now`: Unix time. ConfigError when `state` is no state folder, StorageError when the database refuses.
     """
     now = time.time() if now is None else now
-    blobs = BlobStore(state / "blobs")
     with _database(state) as db:
+        blobs = BlobStore(state / "blobs")
         old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
         old_evaluations = [
             row.evaluation
@@ -137,9 +137,9 @@ def collect(
 
 def use(state: Path) -> list[EnvironmentUse]:
     """What the stored runs take, by environment, largest first; runs whose episodes were collected are left out."""
-    blobs = BlobStore(state / "blobs")
     found: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
+        blobs = BlobStore(state / "blobs")
         for run in rows(db, RunRow):
             train = db.execute(
                 "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE '%/train'",

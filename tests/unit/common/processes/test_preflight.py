@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,18 @@ def test_a_damaged_store_is_no_reason_to_start_a_program_again() -> None:
     with pytest.raises(SystemExit) as ended, fail_on_our_errors():
         raise DamagedStoreError("table runs, row (run) = ('r',): this row cannot be read")
     assert ended.value.code == 2
+
+
+def test_an_argument_that_is_not_utf_8_is_told_and_any_other_such_text_is_a_bug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["evopolicy", "status", "--connect", "tcp/odd-\udcff:1"])
+    with pytest.raises(SystemExit) as ended, fail_on_our_errors():
+        "odd-\udcff".encode()
+    assert ended.value.code == 2
+    assert "'odd-\N{REPLACEMENT CHARACTER}' is not UTF-8" in capsys.readouterr().err
+    with pytest.raises(UnicodeEncodeError), fail_on_our_errors():
+        "another-\udcff".encode()
 
 
 def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:

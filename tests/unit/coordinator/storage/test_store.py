@@ -261,6 +261,16 @@ def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> No
     reader.close()
 
 
+def test_upkeep_of_what_is_no_state_folder_makes_nothing(tmp_path: Path) -> None:
+    for upkeep_of in (
+        lambda: upkeep.collect(tmp_path / "nowhere", 0.0),
+        lambda: upkeep.use(tmp_path / "nowhere"),
+    ):
+        with pytest.raises(ConfigError, match="no coordinator's state folder"):
+            upkeep_of()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_upkeep_names_the_row_that_it_cannot_read(store: Store, path: Path) -> None:
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
