@@ -300,6 +300,17 @@ class Double:
         answer = await self._ask(keys.operator_key(CLUSTER, "cancel"), message)
         assert not isinstance(answer, Refused), answer
 
+    async def agent_gone(self) -> None:
+        """The operator says that the run's agent is not alive, from wherever it was."""
+        message = operator.AgentGone(token="operate", run=self.run_id)
+        answer = await self._ask(keys.operator_key(CLUSTER, "agent_gone"), message)
+        assert not isinstance(answer, Refused), answer
+
+    def has_permit(self) -> bool:
+        """Whether the run's agent may be alive somewhere."""
+        core = self.world.service._core
+        return core is not None and self.run_id in core.state.permits
+
     async def _ask(self, key: str, message: Message) -> Any:
         """Asks until there is an answer: while the core is loaded anew there is none."""
         while True:

@@ -5,6 +5,7 @@ leaves the run open: started again on the same folder it goes on where it was.
 
 Nothing is served, and so no agent started or told of, before the coordinator permits the agent to be alive where it is. The
 run's closing ends the permit, so it comes after the agent's end: the parent says so, or else the operator (`evopolicy finish`).
+Meanwhile the permit is asked for again and again: what was said of an agent that is gone elsewhere may have ended this one's.
 """
 
 from __future__ import annotations
@@ -117,6 +118,8 @@ class Gateway:
                 )
                 log.info("serving", run=run, env=opened.env.env, port=address.port)
                 self._on_ready(address.urls(), desk)
+                if not self._told.done():
+                    stack.callback(asyncio.ensure_future(session.keep_permit(self._agent_place)).cancel)
                 try:
                     close = await self._watch(desk, http)
                     return close is not None and await self._close(session, journal, desk, close)
@@ -126,14 +129,16 @@ class Gateway:
             sock.close()
             journal.close()
 
+    @property
+    def _agent_place(self) -> AgentPlace:
+        return self._place or agent_place(self._folder)
+
     async def _permitted(self, session: Session) -> bool:
         """Whether the agent may be alive, or need not be any more; False when told to leave the run open first."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
         asked = time.monotonic()
-        permit = asyncio.ensure_future(
-            session.permit(self._place or agent_place(self._folder), self._on_wait)
-        )
+        permit = asyncio.ensure_future(session.permit(self._agent_place, self._on_wait))
         waited: list[asyncio.Future[Any]] = [permit, self._told]
         await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
         self.permit_s = time.monotonic() - asked

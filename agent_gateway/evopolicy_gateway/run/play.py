@@ -30,7 +30,7 @@ from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.http.door import TOKEN_VARIABLE, said_of_place
+from evopolicy_gateway.http.door import TOKEN_VARIABLE, agent_place, said_of_place
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.operator import children, control
 from evopolicy_gateway.operator.alone import alone
@@ -451,7 +451,8 @@ class RunPlay:
             return  # nobody here knows
         with contextlib.suppress(EvopolicyError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_PATIENCE_S):
-                await self._operations.agent_gone(run)
+                # From here alone: the run may have been resumed elsewhere by the time that this arrives.
+                await self._operations.agent_gone(run, agent_place(self._folder).boot_id)
 
     async def _give_up(self, run: str, why: str | None) -> None:
         """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""

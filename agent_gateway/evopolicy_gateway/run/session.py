@@ -7,6 +7,7 @@ what a refusal means.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
@@ -43,6 +44,8 @@ RESULTS_WAIT_S = 10.0
 """How long the coordinator may hold a question for results."""
 HELD_WAIT_S = 1.0
 """The same while nothing of the submit runs: what it waits is given back to the agent's clock, which must not run out first."""
+RENEWAL_S = 5.0
+"""How often a permit is asked for again while the agent may be alive: an operator's word may have ended it by mistake."""
 FIRST_PERMIT_WAIT_S = 3.0
 """A permit that takes longer is shown as waited for."""
 STATE_PATIENCE_S = 1.0
@@ -51,6 +54,12 @@ STATE_PATIENCE_S = 1.0
 NOT_NOW_PAUSE_S = 0.5
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+def _permit_lost(waits_for: str) -> None:
+    log.warning("the agent's permit has ended; asking for another", waits_for=waits_for)
+
+
 Wanted = TypeVar("Wanted")
 
 
@@ -97,6 +106,13 @@ class Session:
                 return True
             on_wait(permit.waits_for)
             wait_s = RESULTS_WAIT_S
+
+    async def keep_permit(self, place: AgentPlace) -> None:
+        """Asks for the permit again and again, until cancelled or the run takes no more."""
+        with contextlib.suppress(RefusedError):
+            while True:
+                await asyncio.sleep(RENEWAL_S)
+                await self.permit(place, _permit_lost)
 
     async def state(self) -> RunState | None:
         """The run's state now; None when the coordinator does not answer at once."""

@@ -302,6 +302,8 @@ class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
 
     token: Word
     run: Word
+    boot_id: Word = ""
+    """Of the kernel that it is gone from; empty: from wherever it was. The run may go on elsewhere meanwhile."""
 
 
 class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):

@@ -65,9 +65,9 @@ class OperatorClient:
         """Ends a run as it is, without a score."""
         await self._done("cancel", CancelRun(token=self._token, run=run))
 
-    async def agent_gone(self, run: str) -> None:
-        """Ends the permit of a run's agent, which is no longer alive."""
-        await self._done("agent_gone", AgentGone(token=self._token, run=run))
+    async def agent_gone(self, run: str, boot_id: str = "") -> None:
+        """Ends the permit of a run's agent, which is no longer alive, or not on the kernel `boot_id`."""
+        await self._done("agent_gone", AgentGone(token=self._token, run=run, boot_id=boot_id))
 
     async def repin(self, run: str, fingerprint_class: str, reason: str) -> None:
         """Lets a run go on with workers of another fingerprint class."""

@@ -17,6 +17,7 @@ from evopolicy_common.processes import host
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_gateway.http import door
 from evopolicy_gateway.http.door import AgentPlace, Door
+from evopolicy_gateway.run import session
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
 
@@ -91,8 +92,26 @@ def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
             for _ in range(2):
                 async with gateway_on(folder, double):
                     pass
-        assert len(asked(double, RequestPermit)) == 2
+        assert len(asked(double, RequestPermit)) >= 2
         assert double.closed is None
+
+    asyncio.run(main())
+
+
+def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "RENEWAL_S", 1.0)
+
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found, double)
+            async with gateway_on(folder, double):
+                await double.agent_gone()
+                assert not double.has_permit()
+                await until(double.has_permit)
+            assert double.closed is None
 
     asyncio.run(main())
 

@@ -137,11 +137,13 @@ def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: St
 # ---- the end ----
 
 
-def end(state: State, run: str, step: Step, why: str) -> None:
-    """A run's agent is gone, wherever it was."""
-    state.timers.disarm(("cancelled", run))
+def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> None:
+    """A run's agent is gone, from one kernel or from wherever it was. Its permit for any kernel ends in both cases."""
     for kernel, row in held(state, run):
-        _end(state, kernel, row, step, why)
+        if boot_id in ("", kernel.boot_id) or kernel is state.everywhere:
+            _end(state, kernel, row, step, why)
+    if not held(state, run):
+        state.timers.disarm(("cancelled", run))
 
 
 def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:

@@ -83,7 +83,7 @@ def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step
     if message.run not in state.capabilities:
         step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
-    permits.end(state, message.run, step, "by an operator's word")
+    permits.end(state, message.run, step, "by an operator's word", boot_id=message.boot_id)
     step.reply(event.request, operator.Done())
 
 

@@ -28,8 +28,8 @@ def scored(rig: Rig, session: str, run: str = "r0") -> None:
     rig.close(run)
 
 
-def gone(rig: Rig, run: str = "r1") -> Any:
-    return rig.tell(asked(operator.AgentGone, request=rig.request(), run=run))
+def gone(rig: Rig, run: str = "r1", boot_id: str = "") -> Any:
+    return rig.tell(asked(operator.AgentGone, request=rig.request(), run=run, boot_id=boot_id))
 
 
 def reboot(rig: Rig, name: str = "w1", boot_id: str = "another", machine_id: str = "m") -> str:
@@ -75,6 +75,33 @@ def test_an_agent_of_a_run_with_other_hidden_cases_is_no_obstacle_unless_all_are
         scored(rig, session)
         rig.create("r1", agent=HERE, hidden_from=5000)
         assert splits(rig.poll(session, 8)) == wanted
+
+
+def test_who_knows_an_agent_gone_from_one_kernel_does_not_end_it_elsewhere() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create("r1", agent="lost")
+    rig.permit("r1", HERE)
+    gone(rig, boot_id="lost")
+    assert rig.row(PermitRow, "r1", "lost").ended_at is not None
+    assert rig.row(PermitRow, "r1", HERE).ended_at is None
+    gone(rig)
+    assert rig.row(PermitRow, "r1", HERE).ended_at is not None
+
+
+def test_an_agent_whose_permit_was_ended_by_mistake_stops_hidden_jobs_when_it_asks_again() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE)
+    gone(rig)
+    leases = rig.poll(session, 8)
+    hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
+    assert hidden
+    assert not rig.permit("r1", HERE).granted
+    assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
+    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    assert rig.permit("r1", HERE).granted
 
 
 def test_one_shared_case_makes_runs_related() -> None:
