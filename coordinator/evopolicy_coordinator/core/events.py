@@ -16,10 +16,10 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import CreateRun, Evaluate
 from evopolicy_common.messages.worker import Message, Register
+from evopolicy_coordinator.core.records import EvaluationRow, RunRow
 
 RequestId = int | str
 M_co = TypeVar("M_co", bound=Message, covariant=True)
@@ -41,37 +41,17 @@ class Asked(Event, Generic[M_co], frozen=True, kw_only=True):
 
 
 class RunCreated(Asked[CreateRun], frozen=True, kw_only=True):
-    """An operator asked for a run. All numbers are resolved; a known `key` gives the run it made before."""
+    """An operator asked for a run; a known `key` gives the run it made before."""
 
-    run: str
-    """A fresh id, valid in a Zenoh key (`keys.valid_name`)."""
-    capability: str
-    secret: bytes
-    """32 fresh random bytes."""
-    budget: int
-    min_episodes_per_submit: int
-    max_episodes_per_submit: int
-    train: tuple[Case, ...]
-    validation: tuple[Case, ...]
-    heldout: tuple[Case, ...]
-    split_hashes: dict[str, str]
-    split_secret: bool
-    allowed_imports: tuple[str, ...] = ()
-    denied_imports: tuple[str, ...] = ()
-    max_steps: int = 0
-    """As in `Job`."""
+    row: RunRow
+    """All but when, in which event, and what of it is audited. The id is fresh, and valid in a Zenoh key (`keys.valid_name`)."""
 
 
 class EvaluationRequested(Asked[Evaluate], frozen=True, kw_only=True):
     """An operator asked for cases to be played outside any run. A known `key` gives the evaluation it made before."""
 
-    evaluation: str
-    case_ids: tuple[int, ...]
-    cases: tuple[Case, ...]
-    """In the order of `case_ids`."""
-    secret: bytes
-    max_steps: int = 0
-    """As in `Job`."""
+    row: EvaluationRow
+    """All but when and in which event."""
 
 
 class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):

@@ -165,7 +165,7 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     record: Record
     tier: Tier
     limits: ResourceLimits
-    created_at: float
+    created_at: float = 0.0
     stimulus_id: str = ""
     fingerprint_class: str | None = None
     finished: bool = False

@@ -28,7 +28,7 @@ from evopolicy_common.wire.credentials import Role
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
-from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.core.records import EvaluationRow, RunRow
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
@@ -282,13 +282,12 @@ class Intake:
             self._check_published(len(cases.train))
         if wanted.policy_scope == "submit":
             check_job((*cases.train, *cases.validation, *cases.heldout), most)
-        return events.RunCreated(
-            stimulus_id=stimulus,
-            request=request,
-            message=m,
+        row = RunRow(
             run=f"r-{secrets.token_hex(8)}",
+            key=m.key,
             capability=secrets.token_urlsafe(32),
             secret=secrets.token_bytes(32),
+            settings=wanted,
             budget=budget,
             min_episodes_per_submit=least,
             max_episodes_per_submit=most,
@@ -301,6 +300,7 @@ class Intake:
             denied_imports=self._denied_imports,
             max_steps=_max_steps(wanted.env, wanted.step_limit),
         )
+        return events.RunCreated(stimulus_id=stimulus, request=request, message=m, row=row)
 
     def evaluation_requested(
         self, m: operator.Evaluate, request: int, stimulus: str, of: RunRow | None = None
@@ -331,16 +331,23 @@ class Intake:
                 if ids
                 else "no cases are asked for",
             )
-        return events.EvaluationRequested(
-            stimulus_id=stimulus,
-            request=request,
-            message=m,
+        row = EvaluationRow(
             evaluation=f"e-{secrets.token_hex(8)}",
+            key=m.key,
+            env=m.env,
+            bundle=m.bundle,
+            split=m.split,
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
             secret=secrets.token_bytes(32) if of is None else of.secret,
+            record=m.record,
+            tier=m.sandbox_tier,
+            limits=m.limits,
+            replays=m.replays,
+            as_in=m.as_in,
             max_steps=_max_steps(m.env, m.step_limit),
         )
+        return events.EvaluationRequested(stimulus_id=stimulus, request=request, message=m, row=row)
 
     def _check_profile(self, wanted: operator.RunSettings) -> None:
         """ConfigError where a run of profile `published` has other settings, or would play other than case files."""

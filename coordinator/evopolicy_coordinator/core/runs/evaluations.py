@@ -25,32 +25,15 @@ from . import templates, waits
 
 def request(state: State, event: events.EvaluationRequested, step: Step) -> None:
     """Queue an operator's cases, once for each key."""
-    message = event.message
-    known = state.evaluation_keys.get(message.key)
+    row = event.row
+    known = state.evaluation_keys.get(row.key)
     if known is not None:
         step.reply(event.request, operator.EvaluationStarted(evaluation=known))
         return
-    if not event.cases or len(event.cases) != len(event.case_ids):
+    if not row.cases or len(row.cases) != len(row.case_ids):
         step.refuse(event.request, Refusal.BAD_REQUEST, because("evaluation_without_cases"))
         return
-    row = EvaluationRow(
-        evaluation=event.evaluation,
-        key=message.key,
-        env=message.env,
-        bundle=message.bundle,
-        split=message.split,
-        case_ids=event.case_ids,
-        cases=event.cases,
-        secret=event.secret,
-        record=message.record,
-        tier=message.sandbox_tier,
-        limits=message.limits,
-        replays=message.replays,
-        as_in=message.as_in,
-        max_steps=event.max_steps,
-        created_at=step.now,
-        stimulus_id=step.stimulus_id,
-    )
+    row = msgspec.structs.replace(row, created_at=step.now, stimulus_id=step.stimulus_id)
     step.persist(row)
     evaluation = enter(state, row)
     pins.pin(state, evaluation.flow, step)

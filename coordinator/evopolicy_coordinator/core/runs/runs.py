@@ -7,6 +7,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import msgspec
+
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.wire.refusals import Refusal
@@ -26,46 +28,31 @@ from . import waits
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:
     """Make a run, once for each key."""
-    message = event.message
-    known = state.run_keys.get(message.key)
+    row = event.row
+    known = state.run_keys.get(row.key)
     if known is not None:
         step.reply(event.request, operator.RunCreated(run=known, capability=state.capabilities[known]))
         return
-    fault = _fault(event)
-    if fault is None and event.run in state.capabilities:
-        fault = because("run_exists", run=event.run)
+    fault = _fault(row)
+    if fault is None and row.run in state.capabilities:
+        fault = because("run_exists", run=row.run)
     if fault is not None:
         step.refuse(event.request, Refusal.BAD_SETTINGS, fault)
         return
-    row = RunRow(
-        run=event.run,
-        key=message.key,
-        capability=event.capability,
-        secret=event.secret,
-        settings=message.settings,
-        budget=event.budget,
-        min_episodes_per_submit=event.min_episodes_per_submit,
-        max_episodes_per_submit=event.max_episodes_per_submit,
-        train=event.train,
-        validation=event.validation,
-        heldout=event.heldout,
-        split_hashes=event.split_hashes,
-        split_secret=event.split_secret,
-        allowed_imports=event.allowed_imports,
-        denied_imports=event.denied_imports,
-        max_steps=event.max_steps,
+    row = msgspec.structs.replace(
+        row,
         audit_share=state.settings.audit_share,
         reference_by_case=True,
         created_at=step.now,
         stimulus_id=step.stimulus_id,
     )
-    stored = RunStateRow(run=event.run, isolation=requests.stamp(state, row))
+    stored = RunStateRow(run=row.run, isolation=requests.stamp(state, row))
     step.persist(row)
     run = enter(state, row, stored)
     step.persist(stored)
     pins.pin(state, run.flow, step)
-    step.reply(event.request, operator.RunCreated(run=event.run, capability=event.capability))
-    step.log("info", "run_created", run=event.run, env=message.settings.env, budget=event.budget)
+    step.reply(event.request, operator.RunCreated(run=row.run, capability=row.capability))
+    step.log("info", "run_created", run=row.run, env=row.settings.env, budget=row.budget)
 
 
 def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
@@ -88,15 +75,15 @@ def forget(state: State, run: Run) -> None:
     pins.drop_flow(state, run.flow)
 
 
-def _fault(event: events.RunCreated) -> Reason | None:
-    least, most = event.min_episodes_per_submit, event.max_episodes_per_submit
-    if event.budget < 1:
-        return because("budget_below_one", budget=event.budget)
+def _fault(row: RunRow) -> Reason | None:
+    least, most = row.min_episodes_per_submit, row.max_episodes_per_submit
+    if row.budget < 1:
+        return because("budget_below_one", budget=row.budget)
     if not 1 <= least <= most:
         return because("submit_bounds", least=least, most=most)
-    if least > event.budget:
-        return because("minimum_over_budget", least=least, budget=event.budget)
-    for name, cases in (("train", event.train), ("validation", event.validation), ("heldout", event.heldout)):
+    if least > row.budget:
+        return because("minimum_over_budget", least=least, budget=row.budget)
+    for name, cases in (("train", row.train), ("validation", row.validation), ("heldout", row.heldout)):
         if not cases:
             return because("no_cases", split=name)
     return None

@@ -99,25 +99,29 @@ OPS = keys.operator_key("c", "any")
 
 def test_run_takes_its_numbers_and_cases_from_its_suite(intake: Intake) -> None:
     made = event(intake, OPS, create())
-    assert (made.budget, made.min_episodes_per_submit, made.max_episodes_per_submit) == (128, 1, 128)
-    assert (len(made.train), len(made.validation), len(made.heldout)) == (64, 16, 32)
-    assert made.split_secret
-    assert len(made.secret) == 32
-    assert keys.valid_name(made.run)
-    assert (made.allowed_imports, made.denied_imports) == (("numpy",), ("gymnasium",))
+    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (
+        128,
+        1,
+        128,
+    )
+    assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (64, 16, 32)
+    assert made.row.split_secret
+    assert len(made.row.secret) == 32
+    assert keys.valid_name(made.row.run)
+    assert (made.row.allowed_imports, made.row.denied_imports) == (("numpy",), ("gymnasium",))
     other = event(intake, OPS, create())
-    assert (other.train, other.split_hashes) == (made.train, made.split_hashes)
-    assert made.run != other.run
-    assert made.capability != other.capability
-    assert made.secret != other.secret
+    assert (other.row.train, other.row.split_hashes) == (made.row.train, made.row.split_hashes)
+    assert made.row.run != other.row.run
+    assert made.row.capability != other.row.capability
+    assert made.row.secret != other.row.secret
 
 
 def test_run_may_ask_for_other_numbers(intake: Intake) -> None:
     made = event(intake, OPS, create(budget=8, n_validation=3, n_heldout=4, min_episodes_per_submit=2))
-    assert (made.budget, made.min_episodes_per_submit, made.max_episodes_per_submit) == (8, 2, 8)
+    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (8, 2, 8)
     usual = event(intake, OPS, create())
-    assert made.validation == usual.validation[:3]
-    assert made.heldout == usual.heldout[:4]
+    assert made.row.validation == usual.row.validation[:3]
+    assert made.row.heldout == usual.row.heldout[:4]
 
 
 @pytest.mark.parametrize(
@@ -172,8 +176,8 @@ def test_a_submits_episodes_fit_into_one_lease_with_policy_scope_submit() -> Non
 def test_evaluation_plays_the_cases_named(intake: Intake) -> None:
     made = event(intake, OPS, evaluate(cases=(5, 0, 5)))
     run = event(intake, OPS, create())
-    assert made.cases == (run.train[5], run.train[0], run.train[5])
-    assert len(event(intake, OPS, evaluate(split="heldout")).cases) == 32
+    assert made.row.cases == (run.row.train[5], run.row.train[0], run.row.train[5])
+    assert len(event(intake, OPS, evaluate(split="heldout")).row.cases) == 32
     for cases in ((64,), (-1,), ()):
         assert refused(intake, OPS, evaluate(cases=cases)).status == "invalid_env_instance"
 
@@ -311,11 +315,11 @@ MINIGRID = "gymnasium/MiniGrid-DoorKey-16x16-v0"
 
 
 def test_episodes_are_cut_where_the_published_software_cuts_them_if_asked(intake: Intake) -> None:
-    assert event(intake, OPS, create(env=MINIGRID, step_limit="published")).max_steps == 1000
-    assert event(intake, OPS, create(env=MINIGRID, step_limit="natural")).max_steps == 0
-    assert event(intake, OPS, create(env="gym/acrobot", step_limit="published")).max_steps == 0
-    assert event(intake, OPS, evaluate(env=MINIGRID, step_limit="published")).max_steps == 1000
-    assert event(intake, OPS, evaluate(env=MINIGRID)).max_steps == 0
+    assert event(intake, OPS, create(env=MINIGRID, step_limit="published")).row.max_steps == 1000
+    assert event(intake, OPS, create(env=MINIGRID, step_limit="natural")).row.max_steps == 0
+    assert event(intake, OPS, create(env="gym/acrobot", step_limit="published")).row.max_steps == 0
+    assert event(intake, OPS, evaluate(env=MINIGRID, step_limit="published")).row.max_steps == 1000
+    assert event(intake, OPS, evaluate(env=MINIGRID)).row.max_steps == 0
 
 
 def published_tree(root: Path, n_train: int) -> Path:
@@ -340,8 +344,8 @@ def test_profile_published_plays_the_published_files_by_the_published_rules_or_n
     published = {**operator.PUBLISHED, "profile": "published"}
     whole = at(published_tree(tmp_path / "whole", 1024))
     made = event(whole, OPS, create(**published, n_validation=16, n_heldout=32))
-    assert (len(made.train), len(made.validation), len(made.heldout)) == (1024, 16, 32)
-    assert not made.split_secret
+    assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (1024, 16, 32)
+    assert not made.row.split_secret
     assert "start it with --data" in refused(at(None), OPS, create(**published)).message
     short = at(published_tree(tmp_path / "short", 64))
     assert "1,024 cases each" in refused(short, OPS, create(**published)).message
