@@ -170,7 +170,7 @@ def test_without_an_ok_submit_there_is_no_score_and_the_exit_code_says_so(
     exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
     assert exit_code == 3
     outcome = record_in(run_dir(tmp_path)).outcome
-    assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", None, None)
+    assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", 0.0, None)
     assert outcome.budget_used == 2
     assert "no_ok_submit" in out
 
