@@ -13,6 +13,10 @@ import msgspec
 MILLION = 1_000_000
 
 
+KINDS = ("input_noncached", "cache_read", "cache_creation", "output")
+"""Of tokens, each counted once."""
+
+
 class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """US dollars per million tokens."""
 
@@ -38,27 +42,19 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
         if self.reasoning is not None or other.reasoning is not None:
             reasoning = (self.reasoning or 0) + (other.reasoning or 0)
         return Usage(
-            input_noncached=self.input_noncached + other.input_noncached,
-            cache_read=self.cache_read + other.cache_read,
-            cache_creation=self.cache_creation + other.cache_creation,
-            output=self.output + other.output,
-            reasoning=reasoning,
+            reasoning=reasoning, **{kind: getattr(self, kind) + getattr(other, kind) for kind in KINDS}
         )
 
     def __sub__(self, other: Usage) -> Usage:
         """Without `other`, which is part of it; `reasoning` stays."""
-        return Usage(
-            input_noncached=self.input_noncached - other.input_noncached,
-            cache_read=self.cache_read - other.cache_read,
-            cache_creation=self.cache_creation - other.cache_creation,
-            output=self.output - other.output,
-            reasoning=self.reasoning,
+        return msgspec.structs.replace(
+            self, **{kind: getattr(self, kind) - getattr(other, kind) for kind in KINDS}
         )
 
     @property
     def total(self) -> int:
         """All tokens, cached ones too."""
-        return self.input_noncached + self.cache_read + self.cache_creation + self.output
+        return tokens_in(msgspec.structs.asdict(self))
 
     def cost(self, prices: Prices) -> float:
         """US dollars."""
@@ -88,3 +84,8 @@ def count(value: Any) -> int:
     return (
         min(value, MAX_COUNT) if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
     )
+
+
+def tokens_in(told: dict[str, Any] | None) -> int:
+    """All tokens of a usage as `run.json` has it, or a sweep's index; 0 for none."""
+    return 0 if told is None else sum(int(told.get(kind) or 0) for kind in KINDS)

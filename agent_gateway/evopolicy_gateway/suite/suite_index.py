@@ -15,6 +15,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import utc_text
+from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.suite.suite_file import SuiteRun
 
 SCHEMA_VERSION = 1
@@ -122,11 +123,8 @@ def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path
 
 def used(index: Index) -> tuple[int, float]:
     """Tokens and dollars of all runs, with their earlier attempts."""
-    kinds = ("input_noncached", "cache_read", "cache_creation", "output")
     told = [one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None]
-    return sum(int(one.get(kind, 0)) for one in told for kind in kinds), sum(
-        float(one.get("cost") or 0.0) for one in told
-    )
+    return sum(map(tokens_in, told)), sum(float(one.get("cost") or 0.0) for one in told)
 
 
 def added(one: dict[str, Any] | None, other: dict[str, Any] | None) -> dict[str, Any] | None:

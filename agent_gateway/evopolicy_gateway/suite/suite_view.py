@@ -15,6 +15,7 @@ from rich.text import Text
 
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.terminal import Terminal, say_json
+from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.watch import PHASES, Row, View
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
@@ -115,7 +116,7 @@ class SuiteView(View[SuiteRow]):
             parts.append(f"{len(failed)} failed")
         if cancelled := sum(row.state == "cancelled" for row in rows):
             parts.append(f"{cancelled} cancelled")
-        if tokens := sum(_tokens(row.tokens) for row in rows):
+        if tokens := sum(tokens_in(row.tokens) for row in rows):
             parts.append(f"{_short(tokens)} tokens")
         cost = sum(float((row.tokens or {}).get("cost") or 0.0) for row in rows)
         if cost:
@@ -196,7 +197,7 @@ def results_table(entries: list[Entry]) -> Table:
     for title in ("run", "state", "score", "random", "budget used", "tokens"):
         table.add_column(title, justify="right" if title in ("score", "random", "tokens") else "left")
     for entry in entries:
-        tokens = _tokens(entry.tokens)
+        tokens = tokens_in(entry.tokens)
         table.add_row(
             Text(entry.name),
             entry.state.replace("_", " ")
@@ -219,7 +220,7 @@ def _ended(row: SuiteRow) -> str:
 
 
 def _cells(row: SuiteRow) -> tuple[str, ...]:
-    progress, tokens = row.progress, _tokens(row.tokens)
+    progress, tokens = row.progress, tokens_in(row.tokens)
     state = row.state.replace("_", " ")
     if row.state == "running" and row.phase is not None:
         state = f"{PHASES[row.phase.phase]} {row.phase.done}/{row.phase.total}"
@@ -241,11 +242,6 @@ def _cells(row: SuiteRow) -> tuple[str, ...]:
         state,
         f"waiting for {row.waits_for}" if row.state == "running" and row.waits_for else row.action,
     )
-
-
-def _tokens(told: dict[str, Any] | None) -> int:
-    kinds = ("input_noncached", "cache_read", "cache_creation", "output")
-    return 0 if told is None else sum(int(told.get(kind) or 0) for kind in kinds)
 
 
 def _short(number: int) -> str:
