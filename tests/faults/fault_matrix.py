@@ -325,7 +325,7 @@ def check(cluster: FaultCluster, row: Row, folder: Path, undisturbed: Path) -> N
     used = record(folder)["outcome"]["budget_used"]
     if used != SUBMITS * EPISODES:
         row.wrong.append(f"budget used: {used} of {SUBMITS * EPISODES}")
-    told_s = record(folder)["timing"]["wall_s"]
+    told_s = record(folder)["timing"]["wall_time_seconds"]
     if not 0.0 <= told_s <= row.took_s + 1.0:
         row.wrong.append(f"wall time told: {told_s:g} s of {row.took_s:g} s")
     deadline = time.monotonic() + 5.0

@@ -32,6 +32,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "timing": "times",
         "agent.retries": "counts what was asked again",
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",
+        "rejected_submits.at": "a time",
         "audit": "which workers played, and played again",
         "versions.agents_md_hash": "of a file that names the gateway's port",
     },
@@ -47,16 +48,13 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
 """Fields that are not compared, by the name of their file, and why. The text files hold JSON lines."""
 
 OLD_FILES = ("checkpoints/*/_meta.json", "checkpoints/*/metrics.json")
-OLD_FIELDS = {
-    "run.json": (
-        *("outcome.auxiliary.code_metrics_best", "outcome.auxiliary.code_metrics_by_submit"),
-        *("outcome.auxiliary.code_metrics_trend", "artifacts", "versions"),
-    ),
+OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
+    "run.json": ("versions.data_train_hash", "versions.data_valid_hash", "versions.data_heldout_hash"),
     "summary.json": ("schema_version", "env_instances", "first_global_episode"),
     "errors.txt": ("schema_version",),
     "error.txt": ("schema_version",),
 }
-"""What earlier versions wrote otherwise or not at all."""
+"""What earlier versions wrote otherwise. Fields that only one of the two runs has are left out too."""
 
 _OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
 
@@ -113,13 +111,9 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
     if filecmp.cmp(left, right, shallow=False):
         return []
     file = name.rpartition("/")[2]
-    excluded = (
-        None
-        if file not in EXCLUDED_FIELDS
-        else (*EXCLUDED_FIELDS[file], *(OLD_FIELDS.get(file, ()) if old else ()))
-    )
-    if excluded is None or max(sizes) > MAX_PARSED_BYTES:
+    if file not in EXCLUDED_FIELDS or max(sizes) > MAX_PARSED_BYTES:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
+    excluded = (*EXCLUDED_FIELDS[file], *(OLD_FIELDS.get(file, ()) if old else ()))
     try:
         ours, theirs = (_parse(name, path.read_bytes()) for path in (left, right))
         return [
@@ -127,6 +121,7 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
             for path, a, b in _value_differences("", ours, theirs)
             if not any(path == each or path.startswith(f"{each}.") for each in excluded)
             and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
+            and not (old and (a is ... or b is ...))
         ]
     except (ValueError, TypeError, AttributeError) as error:
         return [f"{name}: cannot be read: {error}"]
@@ -152,8 +147,14 @@ def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any,
             below = f"{path}.{key}" if path else str(key)
             found += _value_differences(below, left.get(key, ...), right.get(key, ...))
         return found
+    if _objects(left) and _objects(right) and len(left) == len(right):
+        return [found for a, b in zip(left, right, strict=True) for found in _value_differences(path, a, b)]
     # NaN is no JSON here, so equality is exact.
     return [] if type(left) is type(right) and left == right else [(path, left, right)]
+
+
+def _objects(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, dict) for item in value)
 
 
 def _short(value: Any) -> str:

@@ -10,8 +10,12 @@ from typing import Any
 
 import pytest
 from published_checker import check_run
+from published_checker import code_metrics as published_metrics
 
 from evopolicy_common import catalogue
+from evopolicy_common.records.code_metrics import code_metrics
+
+ROOT = Path(__file__).parents[3]
 
 CORE16 = catalogue.suites()["core16"].environments
 AGENT = """
@@ -60,6 +64,22 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "runs" / "small"
 
 
+@pytest.mark.parametrize(
+    "folder", ["common/evopolicy_common/records", "examples/policies", "tests/conformance/hostile"]
+)
+def test_code_metrics_agree_with_the_published_checker(folder: str) -> None:
+    root = ROOT / folder
+    files = {
+        path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()
+    }
+    ours = json.loads(
+        json.dumps({name: getattr(code_metrics(files), name) for name in published_metrics(root)})
+    )
+    assert ours == published_metrics(root)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("env", CORE16)
 def test_run_directory_passes_the_published_checker(runs: Path, env: str) -> None:
     folder = runs / env.replace("/", "_") / "t"

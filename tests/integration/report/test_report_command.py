@@ -303,7 +303,7 @@ def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -
     (tmp_path / "secret.png").write_bytes(png())
     folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], replays={"a.mp4": MP4})
     record = json.loads((folder / "run.json").read_text())
-    record["artifacts"]["replays"][0]["path"] = "../../../../secret.png"
+    record["replays"][0]["path"] = "../../../../secret.png"
     (folder / "run.json").write_text(json.dumps(record))
     assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
     assert not list((tmp_path / "report").rglob("*.png.*"))

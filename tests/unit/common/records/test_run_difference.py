@@ -17,7 +17,8 @@ def make_run(root: Path, name: str, **changes: Any) -> Path:
     summary = {"returns": [1.0], "submit_started_at": name, "wall_time_seconds": 1.0, **changes}
     record = {
         "exp_id": name,
-        "timing": {"wall_s": len(name)},
+        "timing": {"wall_time_seconds": len(name)},
+        "rejected_submits": [{"status": "budget_invalid", "at": name}],
         "outcome": {"final_score": 1.0, "auxiliary": {"infrastructure_retries": len(name)}},
     }
     files = {

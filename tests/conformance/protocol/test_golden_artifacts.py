@@ -1,0 +1,30 @@
+"""Every artifact of a run has the fields, the order and the values of its golden file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from golden_artifacts import AGENT, BUDGET, GOLDEN, artifacts
+from played import play
+from published_checker import check_run
+
+pytestmark = pytest.mark.timeout(600)
+NAMES = sorted(path.name for path in GOLDEN.iterdir())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("golden")
+    (root / "agent.py").write_text(AGENT)
+    return play(root, root / "agent.py", BUDGET)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_artifact_is_what_its_golden_file_says(run: Path, name: str) -> None:
+    assert artifacts(run)[name] == (GOLDEN / name).read_text()
+
+
+def test_every_artifact_has_a_golden_file(run: Path) -> None:
+    assert sorted(artifacts(run)) == NAMES
+    assert check_run(run) == []

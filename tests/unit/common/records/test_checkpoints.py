@@ -1,0 +1,154 @@
+"""A checkpoint's folder: the policy's files with their metadata, read back whole, in this form and the one before."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.records import bundles, checkpoints
+from evopolicy_common.records.bundles import MAX_FILES, BundleFile, pack
+from evopolicy_common.records.checkpoints import CheckpointMeta
+from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, code_metrics
+
+META = CheckpointMeta(
+    submit_index=2,
+    submit_time="2026-01-01T00:00:00.000000Z",
+    n_episodes_requested=4,
+    remaining_budget_before=6,
+    remaining_budget_after=2,
+    validation_status="ok",
+    mean_return=1.0,
+    val_mean=2.0,
+)
+
+
+def test_a_bundle_comes_back_from_its_checkpoint_with_names_that_metadata_have_too(tmp_path: Path) -> None:
+    bundle = pack(
+        [
+            BundleFile("policy.py", False, b"class Policy: ...\n"),
+            BundleFile("run.sh", True, b"true\n"),
+            BundleFile("_meta.json", True, b"\xff mine"),
+            BundleFile("metrics.json", False, b"{}"),
+            BundleFile("deep/metrics.json", False, b"[]"),
+            BundleFile("system/policy.py", False, b"1"),
+        ]
+    )
+    folder = tmp_path / "submit_002"
+    checkpoints.write(folder, META, bundle)
+    assert checkpoints.bundle_of(folder) == bundle
+    assert checkpoints.policy_folder(folder) == folder
+    meta = checkpoints.read_meta(folder, 8)
+    assert meta is not None
+    assert (meta.bundle, meta.snapshot_files) == (bundle.digest, [file.path for file in bundle.files])
+    assert [file.path for file in meta.shadowed_files] == ["_meta.json", "metrics.json"]
+    assert (folder / "deep/metrics.json").read_bytes() == b"[]"
+    assert not (folder / "policy.py").stat().st_mode & 0o222
+    assert (folder / "run.sh").stat().st_mode & 0o100
+    system = checkpoints.without_metadata(bundle.files)
+    assert [file.path for file in system.files] == [
+        "deep/metrics.json",
+        "policy.py",
+        "run.sh",
+        "system/policy.py",
+    ]
+
+
+def test_a_bundle_of_as_many_files_as_there_may_be_comes_back(tmp_path: Path) -> None:
+    bundle = pack([BundleFile(f"f{number}", False, b"") for number in range(MAX_FILES)])
+    checkpoints.write(tmp_path / "c", META, bundle)
+    assert checkpoints.bundle_of(tmp_path / "c").digest == bundle.digest
+
+
+def test_a_submit_without_a_bundle_has_a_checkpoint_of_metadata_alone(tmp_path: Path) -> None:
+    metrics = checkpoints.write(tmp_path / "c", META, None)
+    assert {path.name for path in (tmp_path / "c").iterdir()} == checkpoints.METADATA
+    assert (metrics.files, metrics.cyclomatic_max) == (0, 0)
+
+
+def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    (tmp_path / "system").mkdir()
+    (tmp_path / "system" / "policy.py").write_text("1")
+    old = {"schema_version": 1, "submit_index": 1, "status": "ok", "digest": "d", "n_episodes": 3}
+    (tmp_path / "metrics.json").write_text(json.dumps(old | {"consumed_budget": 5, "val_mean": 2.5}))
+    meta = checkpoints.read_meta(tmp_path, 8)
+    assert meta is not None
+    assert (meta.remaining_budget_before, meta.remaining_budget_after, meta.bundle) == (6, 3, "d")
+    assert checkpoints.policy_folder(tmp_path) == tmp_path / "system"
+    assert checkpoints.bundle_of(tmp_path) == bundles.snapshot(tmp_path / "system")
+
+
+def test_damaged_metadata_are_told(tmp_path: Path) -> None:
+    assert checkpoints.read_meta(tmp_path, 8) is None
+    checkpoints.write(tmp_path / "c", META, None)
+    (tmp_path / "c" / "_meta.json").write_text("{}")
+    with pytest.raises(ProtocolError, match=r"_meta\.json is not a checkpoint's"):
+        checkpoints.read_meta(tmp_path / "c", 8)
+    with pytest.raises(BundleError, match=r"_meta\.json"):
+        checkpoints.bundle_of(tmp_path / "c")
+
+
+def test_code_metrics_follow_the_published_definitions() -> None:
+    text = """# a comment
+import os.path, sys
+from . import near
+from numpy.linalg import norm
+
+
+class A:
+    async def outer(self, xs):
+        def inner(x):
+            return x if x and x > 1 and x < 5 else 0
+        try:
+            async for y in xs:
+                pass
+        except (KeyError, OSError):
+            pass
+        except ValueError:
+            pass
+        match xs:
+            case []:
+                return [x for x in xs if x if not x]
+            case _:
+                while True:
+                    pass
+"""
+    found = code_metrics(
+        {
+            "policy.py": text.encode(),
+            "test_a.py": b"if 1:\n    x = 1\n",
+            "bad.py": b"def f(:\n",
+            "_meta.json": b"not counted",
+            "d/.keep": b"",
+            "__pycache__/x.py": b"x",
+            "data.bin": b"\x00\xff",
+        }
+    )
+    # outer: 1, inner's conditional expression 1 and its two operators 2, except handlers 2 and the try's two 2, async for 1,
+    # two cases 2, two conditions of the comprehension 2, while 1; inner: 1 + 1 + 2; the module of test_a.py: 1 + 1.
+    assert (found.cyclomatic_max, found.cyclomatic_total) == (14, 14 + 4 + 2)
+    assert (found.files, found.python_files, found.test_files) == (4, 3, 1)
+    assert (found.functions, found.classes) == (2, 1)
+    assert found.imports == ("numpy", "os", "sys")
+    assert found.parse_errors == ("bad.py",)
+    assert (found.lines, found.source_lines) == (23 + 2 + 1, 20 + 2 + 1)
+    assert found.bytes == len(text) + 16 + 8 + 2
+
+
+def test_hostile_sources_are_measured_in_bounded_time() -> None:
+    sources = {
+        "dots.py": b"import " + b".".join([b"a"] * 200_000),
+        "nested.py": b"(" * 100_000,
+        "unary.py": b"x = " + b"-" * 200_000 + b"1",
+        "null.py": b"\0",
+        "deep.py": b"".join(b" " * depth + b"def f():\n" for depth in range(99)) + b" " * 99 + b"pass\n",
+        "large.py": b"#" * (MAX_PARSED_BYTES + 1),
+    }
+    started = time.process_time()
+    found = code_metrics(sources)
+    assert time.process_time() - started < 60.0
+    assert set(found.parse_errors) >= {"dots.py", "nested.py", "null.py", "large.py"}
+    assert found.functions == 99
