@@ -47,7 +47,7 @@ demo: install
 # One process more than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
 test: install
 	@bash deploy/setup-host.sh --tests
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 5 )) --dist loadfile --basetemp="$$short/t" $(ARGS); status=$$?; \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 5 )) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
 check: install

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="write the core's transcripts (coordinator/evopolicy_coordinator/core/transcripts) anew from what it does now",
     )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first, unit tests last, else in the order of their paths.
+
+    With `--dist loadfile --no-loadscope-reorder` processes take files in this order, so that they end at about the same
+    time. By itself xdist begins with the files of most tests, and the longest tests, alone in their files, come last.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
+    unit = Path(__file__).parent / "unit"
+    items.sort(key=lambda item: (item.path not in slow, item.path.is_relative_to(unit)))
 
 
 def pytest_configure(config: pytest.Config) -> None:

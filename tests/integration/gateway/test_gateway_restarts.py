@@ -278,7 +278,7 @@ def test_a_gateway_that_stops_with_a_submit_open_tells_so_without_a_traceback(
 
 
 def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: Path) -> None:
-    n, cases = 200, tuple(range(1001, 1401, 2))
+    n, cases = 100, tuple(range(1001, 1201, 2))
 
     async def main() -> None:
         budget = 30 * n
