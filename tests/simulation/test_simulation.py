@@ -10,6 +10,25 @@ from simulate import play, replay_command
 
 SEEDS = 1000
 SEEDS_PER_BUG = 500
+NOTICED_BY = {
+    "count late limit verdicts": 332,
+    "show episodes before the gate": 15,
+    "let ties go to the earlier submit": 68,
+    "forget idempotency keys at a restart": 49,
+    "take submits of a closed run": 47,
+    "lease to a poll that was given up unread": 150,
+    "leave runs unpinned when a worker is taken back": 15,
+    "take a liveliness hint for the truth": 14,
+    "expire leases after the loop stood still": 121,
+    "adopt a job that is leased elsewhere": 60,
+    "forget to tell a worker to stop": 13,
+    "leave a lost worker's leases with it": 26,
+    "forget at a restart what is to be audited": 16,
+    "forget at a restart who is quarantined": 68,
+    "let an agent start before hidden episodes have stopped": 19,
+    "forget permits at a restart": 13,
+}
+"""Seeds that are tried first, of bugs that few seeds notice. When the core changes, others may: then all are searched."""
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, 100))
@@ -24,7 +43,7 @@ def test_every_seed_ends_as_it_does_without_faults(first: int) -> None:
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.title)
 def test_a_planted_bug_is_caught(bug: Bug) -> None:
     with planted(bug):
-        for seed in range(SEEDS_PER_BUG):
+        for seed in (NOTICED_BY.get(bug.title, 0), *range(SEEDS_PER_BUG)):
             try:
                 play(seed)
             except AssertionError:
