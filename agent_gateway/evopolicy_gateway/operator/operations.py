@@ -24,6 +24,7 @@ from evopolicy_common.messages.operator import (
     WaitRun,
 )
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.processes.notices import told_if_slow
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import PATIENCE_S, WAIT_S, OperatorClient
@@ -106,7 +107,8 @@ class Operations(OperatorClient):
         if not folder.opened.exists():
             return
         run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
-        await until_free(folder.keeper_lock, folder.root)
+        with told_if_slow(f"the agent of {folder.root} to end"):
+            await until_free(folder.keeper_lock, folder.root)
         with contextlib.suppress(EvopolicyError):
             await self.cancel(run)
             if not folder.door.exists():

@@ -84,6 +84,9 @@ async def local_cluster(
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Of this process alone: the folder may be in use, and the file that is there another's.
         ready_file = root / f"{kind}-{os.getpid()}.json"
+        for left in root.glob(f"{kind}-[0-9]*.json"):
+            if not Path("/proc", left.stem.rpartition("-")[2]).exists():
+                left.unlink(missing_ok=True)
         ready_file.unlink(missing_ok=True)
         folders.callback(ready_file.unlink, missing_ok=True)
         coordinator = [
@@ -110,7 +113,8 @@ async def local_cluster(
                 ) from error
             yield LocalCluster(ready, processes, audited=bool(audit))
         finally:
-            await processes.end()
+            with told_if_slow("the local cluster to end"):
+                await processes.end()
 
 
 async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:

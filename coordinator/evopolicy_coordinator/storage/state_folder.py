@@ -213,7 +213,11 @@ def _linked(root: Path) -> Path:
                 folder.mkdir(parents=True, mode=0o700, exist_ok=True)
                 found = folder.lstat()
                 if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+                    for left in folder.iterdir():  # of states that are gone
+                        if left.is_symlink() and not left.exists():
+                            left.unlink(missing_ok=True)
                     new = folder / f"{name}.{os.getpid()}"
+                    new.unlink(missing_ok=True)
                     new.symlink_to(root)
                     new.replace(link)
                     return link

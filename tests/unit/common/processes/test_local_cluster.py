@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -86,6 +87,22 @@ def test_a_coordinator_that_died_is_started_again_and_refused_options_end_the_co
     programs(monkeypatch, DIES_FIRST + SERVES, refuses)
     assert bring_up(tmp_path) == "--slots 1: what for?"
     assert (tmp_path / "died").exists()
+
+
+def test_what_a_killed_command_left_in_the_state_folder_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "test-999999999.json").write_text("{}")
+    others = tmp_path / f"test-{os.getppid()}.json"
+    others.write_text("{}")
+    programs(monkeypatch, SERVES)
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path):
+            pass
+
+    asyncio.run(main())
+    assert list(tmp_path.glob("*.json")) == [others]
 
 
 def test_a_worker_that_dies_again_and_again_is_given_up(

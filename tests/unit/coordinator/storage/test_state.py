@@ -89,6 +89,18 @@ def test_too_long_a_path_has_a_short_link_that_is_the_same_again(tmp_path: Path,
     assert found[0].startswith(str(short_home))
 
 
+def test_links_of_states_that_are_gone_go_with_the_next(tmp_path: Path, short_home: Path) -> None:
+    links = short_home / "evopolicy" / "sockets"
+    links.mkdir(parents=True, mode=0o700)
+    (links / "gone").symlink_to(tmp_path / "nowhere")
+    (links / "there").symlink_to(tmp_path)
+    state = StateFolder.open(tmp_path / ("x" * 100))
+    assert state.socket_endpoint.startswith(f"unixsock-stream/{links}/")
+    assert not (links / "gone").is_symlink()
+    assert (links / "there").is_symlink()
+    state.close()
+
+
 def test_a_folder_that_others_may_change_holds_no_link(tmp_path: Path, short_home: Path) -> None:
     (short_home / "evopolicy").mkdir()
     (short_home / "evopolicy" / "sockets").mkdir()
