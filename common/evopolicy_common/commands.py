@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 import evopolicy_common
 from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
 from evopolicy_common.processes.preflight import EXTRAS, missing
-from evopolicy_common.terminal import end_without_reader, say
+from evopolicy_common.terminal import end_without_reader, open_streams, say
 
 # typer brings click with it, under a name of its own in newer versions: only its public exceptions lead there.
 _ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -111,6 +111,7 @@ class App(typer.Typer):
 def run_app(app: typer.Typer) -> NoReturn:
     """Runs the command that `sys.argv` names, and exits."""
     setup_notices()
+    open_streams()
     end_without_reader()
     try:
         with needed_extras(), fail_on_our_errors():

@@ -88,6 +88,19 @@ class _WatchedStdout(io.FileIO):
             raise SystemExit(READER_GONE) from None
 
 
+def open_streams() -> None:
+    """Gives a program that was started without stdin, stdout or stderr (`2>&-`) ones that lead nowhere.
+
+    Else the next file that is opened, a database perhaps, gets what is written there.
+    """
+    for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(fd)
+        except OSError:
+            assert os.open(os.devnull, os.O_RDWR) == fd
+            setattr(sys, name, os.fdopen(fd, mode, closefd=False))
+
+
 def end_without_reader() -> None:
     """From now on the program ends with `READER_GONE` when it prints what nobody reads, as in `evopolicy status | head -1`."""
     stream = sys.stdout

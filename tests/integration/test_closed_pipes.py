@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from commands import SMALL
 from documents import commands
+from waiting import wait_until
 
 from evopolicy_common.terminal import READER_GONE
 
@@ -64,6 +65,27 @@ def test_a_run_that_nobody_watches_any_more_ends_as_with_ctrl_c(tmp_path: Path) 
     run += ["--runs", str(tmp_path / "runs"), "--state", str(tmp_path / "state")]
     assert closed(*run, lines=1) == (READER_GONE, "")
     assert not [pid for pid in os.listdir("/proc") if pid.isdecimal() and mentions(int(pid), tmp_path)]
+
+
+def test_a_command_without_streams_does_its_work_and_says_nothing_elsewhere(tmp_path: Path) -> None:
+    evopolicy, coordinator = (
+        f"{sys.executable} -m {MODULES[name]}" for name in ("evopolicy", "evopolicy-coordinator")
+    )
+    wrong = subprocess.run(
+        ["sh", "-c", f"exec {evopolicy} diff a b 2>&-"], stdout=subprocess.PIPE, cwd=tmp_path
+    )
+    assert (wrong.returncode, wrong.stdout) == (2, b"")
+    nowhere = subprocess.run(["sh", "-c", f"exec {evopolicy} --help <&- >&- 2>&-"])
+    assert nowhere.returncode == 0
+    ready = tmp_path / "ready"
+    serve = f"exec {coordinator} --state {tmp_path / 's'} --ready-file {ready} <&- >&- 2>&-"
+    process = subprocess.Popen(["sh", "-c", serve])
+    try:
+        wait_until(ready.exists)
+        opened = [os.readlink(f"/proc/{process.pid}/fd/{fd}") for fd in range(3)]
+    finally:
+        process.terminate()
+    assert (process.wait(), opened) == (0, [os.devnull] * 3)
 
 
 def mentions(pid: int, folder: Path) -> bool:
