@@ -232,7 +232,6 @@ BUGS = (
     ),
     Bug("take siblings for strangers", Families, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
     Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True"),
-    Bug("forget what a silent worker may play", stays, "left", "if sure:", "if True:"),
     Bug(
         "take a lease on its way for one that was let go of",
         stays,

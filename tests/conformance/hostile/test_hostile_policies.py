@@ -322,7 +322,7 @@ def test_no_pickle_is_ever_opened(slots: Slots, tmp_path: Path) -> None:
         assert not Path("/tmp/evopolicy-pickled").exists()
 
 
-@pytest.mark.parametrize("way", ["files", "shm", "abstract", "lock", "record", "futex", "device"])
+@pytest.mark.parametrize("way", ["files", "shm", "abstract", "lock", "record", "futex", "device", "signals"])
 def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
     heard = {}
     for tier in ("bwrap", "none"):

@@ -83,8 +83,34 @@ def device():
     before = os.stat("/dev/null").st_mtime
     return seen(lambda: os.stat("/dev/null").st_mtime != before)
 
+def queued(most):
+    # Signals that wait are counted for a user, whose processes all policies' are outside.
+    mask, sent = ctypes.create_string_buffer(struct.pack("<Q", 1 << 39)), 0
+    libc.sigprocmask(0, ctypes.create_string_buffer(mask.raw[:8].ljust(128, b"\0")), None)
+    number = 234 if os.uname().machine == "x86_64" else 131
+    while sent < most and libc.syscall(number, os.getpid(), os.getpid(), 40) == 0:
+        sent += 1
+    return sent
+
+def taken_back():
+    import signal
+    while signal.sigtimedwait([40], 0) is not None:
+        pass
+
+def signals():
+    if TARGET["role"] == "tell":
+        queued(200)
+        time.sleep(1.0)
+        return None
+    def missing():
+        room = queued(240)
+        taken_back()
+        return room < 240
+    return seen(missing)
+
 def attempts():
     yield {"files": ("in /tmp", file("/tmp/evopolicy-talk")), "shm": ("in shared memory", file("/dev/shm/evopolicy-talk")),
            "abstract": ("abstract socket", abstract), "lock": ("a lock on a shared file", lock),
            "futex": ("who waits on a page of a shared file", futex), "device": ("a device's times", device),
-           "record": ("a record lock on a shared file", record_lock)}[TARGET["way"]]
+           "record": ("a record lock on a shared file", record_lock),
+           "signals": ("how many signals may wait", signals)}[TARGET["way"]]
