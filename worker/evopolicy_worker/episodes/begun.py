@@ -57,8 +57,11 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
     failure: PolicyFailure | None = None
 
     def unpacked(self) -> Begun:
-        """To go on from. ProtocolError when it is not what `Begun.packed` makes."""
-        rows = decode(self.actions).rows() if self.actions else ()
+        """To go on from; as good as nothing where another worker has told what cannot be read."""
+        try:
+            rows = decode(self.actions).rows() if self.actions else ()
+        except ProtocolError:
+            return Begun()
         return Begun([Returned(row.action, row.action) for row in rows], self.failure)
 
 

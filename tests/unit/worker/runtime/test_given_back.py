@@ -49,6 +49,11 @@ def going_on(job: Job, slot: Slot) -> Job:
     return msgspec.structs.replace(job, begun=ref)
 
 
+def begun_by(actions: bytes) -> bytes:
+    """What another worker may have told."""
+    return msgspec.msgpack.encode({0: begun.PackedBegun(actions=actions), 7: begun.PackedBegun()})
+
+
 async def stopped(
     slots: Slots, slot: Slot, job: Job, source: str, steps: int, episodes: int = 0
 ) -> tuple[EpisodeOutcome, ...]:
@@ -168,8 +173,8 @@ def test_a_failure_by_a_limit_is_told_as_one(slots: Slots) -> None:
     assert back.limit_verdict
 
 
-def test_what_cannot_be_read_is_begun_anew(slots: Slots) -> None:
-    data = b"\xc1 none of it"
+@pytest.mark.parametrize("data", [b"\xc1 none of it", begun_by(b"no recording"), begun_by(b"")])
+def test_what_cannot_be_read_is_begun_anew(slots: Slots, data: bytes) -> None:
     job = hidden(begun=BlobRef(digest=digest_of(data), size=len(data), inline=data))
     (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *told: None))
     assert outcome.failure is None
