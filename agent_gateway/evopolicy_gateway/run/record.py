@@ -49,7 +49,7 @@ from evopolicy_gateway.run.layout import RunFolder, Staged
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.submits.formatting import submit_id
-from evopolicy_gateway.submits.journal import Journal, Rejected
+from evopolicy_gateway.submits.journal import Accepted, AnyEntry, Journal, Rejected, Requested
 
 
 async def write(
@@ -67,8 +67,14 @@ async def write(
     selected: Bundle | None = None
     code: dict[int, CodeMetrics] = {}
     folder.checkpoints.mkdir(exist_ok=True)
+    entries = await asyncio.to_thread(_journal, folder)
+    kept = _kept(entries)
     for submit in finished.submits:
-        bundle = None if submit.bundle is None else await _bundle(folder, submit.bundle, operations)
+        bundle: Bundle | None
+        if submit.bundle is not None:
+            bundle = await _bundle(folder, submit.bundle, operations)
+        else:
+            bundle = await asyncio.to_thread(_own_bundle, folder, kept.get(submit.submit_index))
         code[submit.submit_index] = await asyncio.to_thread(
             _write_checkpoint, folder, finished, submit, bundle
         )
@@ -79,7 +85,8 @@ async def write(
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, status="error", error=error)
     recorded = await replays.fetch(folder.root, finished, operations)
-    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded, code)
+    rejected = [entry for entry in entries if isinstance(entry, Rejected)]
+    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded, code, rejected)
 
 
 def run_record(
@@ -248,12 +255,35 @@ def _std(values: Sequence[float]) -> float:
 
 async def _bundle(folder: RunFolder, digest: str, operations: Operations) -> Bundle:
     """From the gateway's own store, or else from the coordinator."""
-    if folder.blobs.is_dir():
-        try:
-            return bundles.load(await asyncio.to_thread(BlobStore(folder.blobs).read, digest), digest)
-        except StorageError:
-            pass
-    return bundles.load(await operations.download(digest), digest)
+    own = await asyncio.to_thread(_own_bundle, folder, digest)
+    return own if own is not None else bundles.load(await operations.download(digest), digest)
+
+
+def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
+    """From the gateway's own store; None where it is not there."""
+    if digest is None or not folder.blobs.is_dir():
+        return None
+    try:
+        return bundles.load(BlobStore(folder.blobs).read(digest), digest)
+    except StorageError:
+        return None
+
+
+def _journal(folder: RunFolder) -> list[AnyEntry]:
+    if not folder.journal.exists():
+        return []
+    journal = Journal(folder.journal)
+    journal.close()
+    return journal.entries
+
+
+def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
+    """Submit index to the bundle of a `system/` that held no policy, which the coordinator does not have."""
+    kept = {
+        entry.key: entry.kept for entry in entries if isinstance(entry, Requested) and entry.kept is not None
+    }
+    accepted = [entry for entry in entries if isinstance(entry, Accepted) and entry.key in kept]
+    return {entry.submit_index: kept[entry.key] for entry in accepted}
 
 
 def _write_checkpoint(
@@ -330,6 +360,7 @@ def _write_record(
     times: Times,
     recorded: tuple[Replay, ...],
     code: Mapping[int, CodeMetrics],
+    rejected: Sequence[Rejected],
 ) -> RunRecord:
     staged = None
     if folder.staged.exists():
@@ -337,11 +368,6 @@ def _write_record(
         # The agent's log is there also where nothing was said.
         folder.agent_log.touch()
     write_atomically(folder.env_log, _env_log(finished))
-    rejected: list[Rejected] = []
-    if folder.journal.exists():
-        journal = Journal(folder.journal)
-        rejected = [entry for entry in journal.entries if isinstance(entry, Rejected)]
-        journal.close()
     done = run_record(plan, finished, staged, rejected, times, recorded, code, folder.artifacts())
     write_atomically(folder.run_json, encode_run_record(done))
     remove_tree(folder.state)

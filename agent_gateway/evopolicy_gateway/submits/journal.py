@@ -35,6 +35,8 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     bundle: str | None
     """Digest of the snapshot; its bytes are in the blob store beside the journal."""
     bundle_error: PolicyFailure | None
+    kept: str | None = None
+    """As in `Snapshot`."""
 
 
 class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):

@@ -16,10 +16,12 @@ POLICY_FILE = "policy.py"
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """Exactly one of the two is set."""
+    """Exactly one of `digest` and `error` is set."""
 
     digest: str | None
     error: PolicyFailure | None
+    kept: str | None = None
+    """Digest of a bundle that holds no policy: stored for the run's checkpoint, and not sent."""
 
 
 def take(system: Path, blobs: BlobStore) -> Snapshot:
@@ -35,7 +37,8 @@ def take(system: Path, blobs: BlobStore) -> Snapshot:
     except OSError as error:
         return _failed(system, f"system/ cannot be read: {error.strerror or error}")
     if all(file.path != POLICY_FILE for file in bundle.files):
-        return _failed(system, "system/policy.py is missing; write a class Policy there")
+        failed = _failed(system, "system/policy.py is missing; write a class Policy there")
+        return msgspec.structs.replace(failed, kept=blobs.put(bundle.packed))
     return Snapshot(digest=blobs.put(bundle.packed), error=None)
 
 

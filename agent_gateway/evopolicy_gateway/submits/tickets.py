@@ -65,7 +65,9 @@ class Ticket:
 
     def attach(self, taken: Snapshot) -> None:
         """The bundle, or why there is none."""
-        self.request = msgspec.structs.replace(self.request, bundle=taken.digest, bundle_error=taken.error)
+        self.request = msgspec.structs.replace(
+            self.request, bundle=taken.digest, bundle_error=taken.error, kept=taken.kept
+        )
 
     def accept(self, accepted: Accepted) -> None:
         """The coordinator has taken it: from now on it has its name."""

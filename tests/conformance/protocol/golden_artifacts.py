@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 GOLDEN = Path(__file__).parent / "golden"
-BUDGET = 4
+BUDGET = 5
 AGENT = '''
 import json, os, urllib.error, urllib.request
 from pathlib import Path
@@ -55,6 +55,8 @@ submit([1])
 submit([99])
 (system / "policy.py").write_text(POLICY.replace("FAILS_AFTER", "2"))
 submit([2, 1])
+(system / "policy.py").unlink()
+submit([3])
 '''
 
 _TIMES = re.compile(r"(^|_)(at|time|timestamp|start_time|end_time|wall_time_seconds)$")
@@ -81,6 +83,7 @@ def artifacts(run: Path) -> dict[str, str]:
         "metrics.json": _json(checkpoints / "submit_000" / "metrics.json", None),
         "summary.json": _json(feedback / "submit_000" / "summary.json", None),
         "summary.import_error.json": _json(feedback / "submit_001" / "summary.json", None),
+        "summary.missing_policy.json": _json(feedback / "submit_003" / "summary.json", None),
         "summary.policy_failed.json": _json(last / "summary.json", _without_numbers),
         "errors.txt": _lines(feedback / "submit_001" / "errors.txt"),
         "error.txt": _lines(last / "episodes" / "ep_002" / "error.txt"),
