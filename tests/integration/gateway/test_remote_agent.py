@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from gateway_double import Double, Served, answering, gateway_on, opened, prepare
+from typer.testing import CliRunner
 from waiting import wait_until
 
 from evopolicy_common.errors import ConfigError
@@ -204,31 +205,24 @@ def test_a_door_is_what_the_operator_named() -> None:
         (["--agent", "evolve", "--agent-host", "elsewhere"], "goes with --agent remote"),
         (["--agent", "remote", "--http", "127.0.0.1:0", "--agent-host", "my-laptop"], "boot_id"),
         (["--agent", "evolve", "--hidden-isolation", "off"], "evopolicy-coordinator --hidden-isolation"),
-        (["--agent", "evolve", "--local", "--hidden-isolation", "none"], "related, strict, off"),
-        (["--agent", "evolve", "--hidden-cases", "mine"], "shared, per-run"),
+        (["--agent", "evolve", "--local", "--hidden-isolation", "none"], "'related', 'strict', 'off'"),
+        (["--agent", "evolve", "--hidden-cases", "mine"], "'shared', 'per-run'"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], told: str) -> None:
-    words = ["run", "--env", "toy/line", "--runs", str(tmp_path), *options]
-    done = subprocess.run(
-        [sys.executable, "-m", "evopolicy_gateway.cli", *words],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert done.returncode == 2, done.stderr
+    done = CliRunner().invoke(evopolicy, ["run", "--env", "toy/line", "--runs", str(tmp_path), *options])
+    assert done.exit_code == 2, done.stderr
     assert told in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 class RemoteRun:
-    """`evopolicy run --agent remote` on a cluster of its own, and what it tells its operator."""
+    """`evopolicy run --agent remote` on the module's cluster, and what it tells its operator."""
 
-    def __init__(self, root: Path, *options: str) -> None:
+    def __init__(self, operator_file: Path, root: Path, *options: str) -> None:
         self.folder = RunFolder(root / "runs" / "theirs" / "toy_line" / "r")
-        words = ["run", "--local", "--env", "toy/line", "--agent", "remote", "--http", f"{HOST}:0"]
-        words += ["--entry", "theirs", "--exp-id", "r", "--runs", str(root / "runs"), "--slots", "1"]
+        words = ["run", "--credentials", str(operator_file), "--env", "toy/line", "--agent", "remote"]
+        words += ["--http", f"{HOST}:0", "--entry", "theirs", "--exp-id", "r", "--runs", str(root / "runs")]
         words += ["--budget", "4", "--validation", "1", "--heldout", "1", *options]
         self.said = root / "said"
         with self.said.open("wb") as said:
@@ -271,8 +265,10 @@ class RemoteRun:
                 self.process.wait(timeout=PATIENCE_S)
 
 
-def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(tmp_path: Path) -> None:
-    run = RemoteRun(tmp_path)
+def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    run = RemoteRun(operator_file, tmp_path)
     try:
         run.wait_until_served()
         token = token_of(run.folder)
@@ -294,8 +290,10 @@ def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(tmp
     assert not run.folder.state.exists()
 
 
-def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_ended(tmp_path: Path) -> None:
-    run = RemoteRun(tmp_path)
+def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_ended(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    run = RemoteRun(operator_file, tmp_path)
     try:
         run.wait_until_served()
         assert "it may be any: no hidden case" in run.said.read_text()
@@ -311,8 +309,10 @@ def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_end
     assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "exclusive")
 
 
-def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(tmp_path: Path) -> None:
-    run = RemoteRun(tmp_path, "--agent-host", "elsewhere")
+def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(
+    operator_file: Path, tmp_path: Path
+) -> None:
+    run = RemoteRun(operator_file, tmp_path, "--agent-host", "elsewhere")
     try:
         run.wait_until_served()
         assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
@@ -323,8 +323,8 @@ def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(tmp_pa
     assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "waived")
 
 
-def test_a_remote_run_ends_when_its_agents_time_is_over(tmp_path: Path) -> None:
-    run = RemoteRun(tmp_path, "--agent-wall-s", "1", "--agent-host", "elsewhere")
+def test_a_remote_run_ends_when_its_agents_time_is_over(operator_file: Path, tmp_path: Path) -> None:
+    run = RemoteRun(operator_file, tmp_path, "--agent-wall-s", "1", "--agent-host", "elsewhere")
     assert run.end() == 3, run.said.read_text()
     assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "wall_limit"
 
