@@ -35,9 +35,10 @@ def in_processes(
 
     The children find `function` by its name; items and results are pickled. Call it on the main thread.
     """
+    children = [_Child(function) for _ in range(jobs)]
     idle: queue.SimpleQueue[_Child] = queue.SimpleQueue()
-    for _ in range(jobs):
-        idle.put(_Child(function))
+    for each in children:
+        idle.put(each)
 
     def work(some: Sequence[Item]) -> list[Result]:
         child = idle.get()
@@ -51,10 +52,11 @@ def in_processes(
         for results in pool.map(work, [items[i : i + _AT_ONCE] for i in range(0, len(items), _AT_ONCE)]):
             yield from results
     finally:
-        # Nobody wants what is not done yet, and a child has done what it was given soon.
+        for each in children:
+            each.end()  # nobody wants what is not done yet
         pool.shutdown(cancel_futures=True)
-        for _ in range(jobs):
-            idle.get().end()
+        for each in children:
+            each.end()  # who was just being started again
 
 
 class _Child:
@@ -62,6 +64,7 @@ class _Child:
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self._function = function
+        self._over = False
         self._process = self._started()
 
     def results(self, items: Sequence[Item], when_lost: Callable[[Item, str], Result]) -> list[Result]:
@@ -70,7 +73,9 @@ class _Child:
             found: list[Result] = pickle.load(self._output)
             return found
         except (OSError, EOFError, pickle.UnpicklingError):
-            self.end()
+            if self._over:
+                raise
+            self._kill()
             why = f"the process that read it ended with status {self._process.returncode}"
             self._process = self._started()
         if len(items) == 1:
@@ -79,7 +84,11 @@ class _Child:
         return [result for item in items for result in self.results([item], when_lost)]
 
     def end(self) -> None:
-        """Kills it. Nothing when it has ended."""
+        """Kills it for good. Nothing when it has ended."""
+        self._over = True
+        self._kill()
+
+    def _kill(self) -> None:
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,13 @@ def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
     assert found[:5] + found[6:19] == [*range(5), *range(6, 19)]
     assert found[5] == (items[5], "the process that read it ended with status 7")
     assert found[19][1] == "the process that read it ended with status -9"
+
+
+def test_who_stops_reading_waits_for_no_item() -> None:
+    items: list[Any] = [partial(abs, -1)] * 8 + [partial(time.sleep, 1000.0)] * 8
+    found = in_processes(operator.call, items, 1, lambda item, why: (item, why))
+    assert next(found) == 1
+    found.close()
 
 
 READS = (
