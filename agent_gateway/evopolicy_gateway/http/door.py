@@ -19,7 +19,7 @@ import msgspec
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import ELSEWHERE
 from evopolicy_common.processes import host
-from evopolicy_gateway.run.layout import IntendedRun, RunFolder
+from evopolicy_gateway.run.layout import IntendedRun, RunFolder, saved
 
 AGENT = "remote"
 """What `--agent` calls an agent that somebody else starts."""
@@ -121,10 +121,9 @@ def ends_unseen(folder: RunFolder) -> bool:
 
 def _agent_host(folder: RunFolder) -> str:
     try:
-        intended = folder.intended.read_bytes()
+        return saved(folder.intended, IntendedRun).settings.agent_host
     except FileNotFoundError:
         return ""
-    return msgspec.json.decode(intended, type=IntendedRun).settings.agent_host
 
 
 def said_of_place(agent_host: str, root: Path) -> str:

@@ -20,7 +20,7 @@ from evopolicy_common.processes.preflight import LOOPBACK, no_loopback
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_gateway.http.door import Door
 from evopolicy_gateway.http.patience import PatientProtocol
-from evopolicy_gateway.run.layout import RunFolder, save
+from evopolicy_gateway.run.layout import RunFolder, save, saved
 from evopolicy_gateway.workspace.agents_md import Urls, urls_at, urls_below
 
 _REBIND_TRIES = 20
@@ -54,7 +54,7 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
     ConfigError when the old port, or the one that was asked for, is not to be had.
     """
     if folder.service.exists():
-        address = msgspec.json.decode(folder.service.read_bytes(), type=Address)
+        address = saved(folder.service, Address)
         return await _rebind(address), address
     token = secrets.token_hex(16)
     if not folder.door.exists():
@@ -64,7 +64,7 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
             raise ConfigError(no_loopback(error)) from error
         address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
     else:
-        door = msgspec.json.decode(folder.door.read_bytes(), type=Door)
+        door = saved(folder.door, Door)
         try:
             sock = _bound(door.host, door.port)
         except OSError as error:

@@ -8,7 +8,6 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
 import structlog
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
@@ -30,7 +29,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import PATIENCE_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_gateway.operator.alone import until_free
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 
 T = TypeVar("T")
 
@@ -106,7 +105,7 @@ class Operations(OperatorClient):
         """
         if not folder.opened.exists():
             return
-        run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+        run = saved(folder.opened, OpenedRun).run
         with told_if_slow(f"the agent of {folder.root} to end"):
             await until_free(folder.keeper_lock, folder.root)
         with contextlib.suppress(EvopolicyError):

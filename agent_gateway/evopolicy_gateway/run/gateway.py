@@ -27,7 +27,7 @@ from evopolicy_common.wire.refusals import RUN_OVER
 from evopolicy_gateway.http.door import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.http.server import bind, serving
 from evopolicy_gateway.http.service import make_app
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 from evopolicy_gateway.run.session import Session
 from evopolicy_gateway.submits.desk import Desk
 from evopolicy_gateway.submits.journal import Closed, Journal
@@ -212,7 +212,7 @@ def _load(
             " runs are opened by `evopolicy run`"
         )
     found = credentials.read(folder.credentials)
-    run = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+    run = saved(folder.opened, OpenedRun).run
     if file is not None:
         found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
     return credentials.at(found, connect), run

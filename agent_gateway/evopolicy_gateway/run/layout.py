@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.wire import keys
+
+T = TypeVar("T")
 
 _ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
 
@@ -210,6 +213,16 @@ def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
 def save(path: Path, value: msgspec.Struct) -> None:
     """Writes a small private file of the gateway's folder."""
     write_atomically(path, msgspec.json.encode(value), mode=0o600)
+
+
+def saved(path: Path, kind: type[T]) -> T:
+    """What `save` wrote. FileNotFoundError where there is nothing, ConfigError where a disk has damaged it."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except DECODE_ERRORS as error:
+        raise ConfigError(
+            f"{path} is damaged: {error}; restore it from a backup, or begin the run anew with --overwrite"
+        ) from error
 
 
 def folder_of(path: Path) -> RunFolder:

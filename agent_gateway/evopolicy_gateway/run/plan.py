@@ -16,7 +16,7 @@ from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.http.door import Door, check_agent
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.alone import check_free
-from evopolicy_gateway.run.layout import IntendedRun, RunFolder, run_folder
+from evopolicy_gateway.run.layout import IntendedRun, RunFolder, run_folder, saved
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,7 +82,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     def intended(self) -> IntendedRun | None:
         """What was begun in the folder; None for nothing."""
         try:
-            return msgspec.json.decode(self.folder.intended.read_bytes(), type=IntendedRun)
+            return saved(self.folder.intended, IntendedRun)
         except FileNotFoundError:
             return None
 

@@ -52,7 +52,7 @@ from evopolicy_gateway.operator.control import (
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.watch import Watch
 from evopolicy_gateway.run import record
-from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, save
+from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, save, saved
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.workspace import staging as workspace
@@ -181,7 +181,7 @@ class RunPlay:
         return await self._resume()
 
     async def _resume(self) -> RunRecord:
-        run = msgspec.json.decode(self._folder.opened.read_bytes(), type=OpenedRun).run
+        run = saved(self._folder.opened, OpenedRun).run
         capability = credentials.read(self._folder.credentials).token
         found = msgspec.structs.replace(self._credentials, token=capability)
         credentials.write(found, self._folder.credentials)

@@ -45,7 +45,7 @@ from evopolicy_common.records.run_record import (
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import replays
-from evopolicy_gateway.run.layout import RunFolder, Staged
+from evopolicy_gateway.run.layout import RunFolder, Staged, saved
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.submits.formatting import submit_id
@@ -364,7 +364,7 @@ def _write_record(
 ) -> RunRecord:
     staged = None
     if folder.staged.exists():
-        staged = msgspec.json.decode(folder.staged.read_bytes(), type=Staged)
+        staged = saved(folder.staged, Staged)
         # The agent's log is there also where nothing was said.
         folder.agent_log.touch()
     write_atomically(folder.env_log, _env_log(finished))

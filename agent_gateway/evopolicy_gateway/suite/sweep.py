@@ -35,7 +35,7 @@ from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.runs import why_failed
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.play import RunPlay
 from evopolicy_gateway.suite import suite_index
@@ -410,7 +410,7 @@ async def look(run: SuiteRun, root: Path, started_in: Path, index: Index, operat
     phase: str | None = None
     has_session = False
     if opened:
-        identity = msgspec.json.decode(folder.opened.read_bytes(), type=OpenedRun).run
+        identity = saved(folder.opened, OpenedRun).run
         phase = await operations.phase(identity)
         resumable = harnesses.make(run.harness, started_in, run.config).resumable
         has_session = resumable and session.load(folder.session).session is not None

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from evopolicy_common.messages.gateway import RunOpened
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
-from evopolicy_gateway.run.layout import RunFolder, Staged, save
+from evopolicy_gateway.run.layout import RunFolder, Staged, save, saved
 from evopolicy_gateway.workspace.agents_md import NO_URLS, Urls, agents_md
 from evopolicy_gateway.workspace.initial_policy import initial_policy
 
@@ -29,7 +27,7 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
     `AGENTS.md` gets mode 0444. StorageError when the disk refuses.
     """
     if folder.staged.exists():
-        return msgspec.json.decode(folder.staged.read_bytes(), type=Staged)
+        return saved(folder.staged, Staged)
     folder.system.mkdir(parents=True, exist_ok=True)
     folder.feedback.mkdir(exist_ok=True)
     policy = initial_policy(run.env.action_space).encode()
