@@ -48,7 +48,7 @@ its first with no leases.
 blobs an outcome names are stored before it hands a `HandIn` in. Inline trajectories travel in the outcome; whether a
 row keeps them inline or as a blob is the store's business, as long as digests stay.
 
-*Status* is read, not an event: `core.status(now)` gives workers, runs, stalls, episodes done and their rate as the parts of
+*Status* is read, not an event: `core.status(now, words)` gives workers, runs, stalls, episodes done and their rate as the parts of
 a `StatusReply`. `core.story(key)` tells what happened to a job, lease, run or worker, as far back as is kept.
 
 *Memory.* A core holds open work only: for each open group of episodes their returns and order of arrival, for each

@@ -7,6 +7,7 @@ these tables: that the loop's own lateness expires nobody's lease.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -125,21 +126,25 @@ class Core:
 
     def _end(self, this: Step) -> list[Effect]:
         """Let those above hear what happened, and hand out what became available."""
-        drain(self.state, this)
+        if this.news:
+            drain(self.state, this)
+        if this.last is not None:
+            this.add(this.last)
         scheduler.dispatch(self.state, this)
         return this.effects()
 
 
 def drain(state: State, this: Step) -> None:
     """Tell the news of a step, in order; what follows from a piece of news comes before what was told after it."""
-    news = this.news
-    while news:
-        piece = news.popleft()
-        later = tuple(news)
-        news.clear()
-        for rule in NEWS[type(piece), step.kind_of(piece)]:
+    pending = this.news
+    while pending:
+        piece = pending.popleft()
+        this.news = deque()
+        for rule in NEWS[type(piece), piece.kind]:
             rule(state, piece, this)
-        news.extend(later)
+        if this.news:
+            pending.extendleft(reversed(this.news))
+    this.news = pending
 
 
 # ---- the tables ----
@@ -172,10 +177,6 @@ EVENTS: dict[type, Rule] = {
 """Who takes an event: by the message that it carries, or by its own type where it carries none."""
 
 
-def _answer(state: State, news: step.Answered, this: Step) -> None:
-    this.reply(news.request, news.message)
-
-
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.HandedIn, ""): (handin.take,),
     (step.EpisodesDone, "train"): (audits.sample, submits.progressed),
@@ -190,9 +191,8 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.FlowPinned, "evaluation"): (evaluations.pinned,),
     (step.JobRetried, ""): (runs.retried,),
     (step.ResultsDiffered, ""): (runs.differed,),
-    (step.Answered, ""): (_answer,),
 }
-"""Who hears a piece of news: by its type and the kind of group or flow that it is of (`step.kind_of`)."""
+"""Who hears a piece of news: by its type and the kind of group or flow that it is of (`kind`)."""
 
 
 # ---- timers ----

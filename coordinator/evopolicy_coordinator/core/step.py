@@ -11,7 +11,8 @@ Rules that this module owns:
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
@@ -27,16 +28,22 @@ from .reasons import Reason
 from .records import AuditRow, Row, SubmitRow
 
 # ---- news ----
+#
+# `kind` is what the table in `machine` tells apart beside the type; empty where there is but one.
 
 
-class HandedIn(NamedTuple):
+@dataclass(slots=True, eq=False)
+class HandedIn:
     """A worker handed in what came of one lease."""
 
     worker: Worker
     result: JobResult
 
+    kind: ClassVar[str] = ""
 
-class EpisodesDone(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class EpisodesDone:
     """Episodes of a group have their outcomes."""
 
     group: JobGroup
@@ -44,60 +51,63 @@ class EpisodesDone(NamedTuple):
     """Who played them; None: before the core was loaded."""
     outcomes: tuple[EpisodeOutcome, ...]
 
+    @property
+    def kind(self) -> str:
+        """Of the group."""
+        return self.group.kind
 
-class JobRetried(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class JobRetried:
     """A job is played again for a failure of ours."""
 
     job: JobState
 
+    kind: ClassVar[str] = ""
 
-class ResultsDiffered(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class ResultsDiffered:
     """Two results of one episode differed."""
 
     group: JobGroup
 
+    kind: ClassVar[str] = ""
 
-class FlowPinned(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class FlowPinned:
     """A run or an evaluation has a class of workers now."""
 
     flow: Flow
     profile: Profile
 
+    @property
+    def kind(self) -> str:
+        """Of the flow."""
+        return self.flow.of
 
-class SubmitEnded(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class SubmitEnded:
     """A submit has its verdict."""
 
     run: Run
     row: SubmitRow
 
+    kind: ClassVar[str] = ""
 
-class AuditsMoved(NamedTuple):
+
+@dataclass(slots=True, eq=False)
+class AuditsMoved:
     """An audit of a run is over, or goes on: the run may have waited for it."""
 
     run: Run
 
-
-class Answered(NamedTuple):
-    """A request is to be answered after what it led to."""
-
-    request: RequestId
-    message: Message
+    kind: ClassVar[str] = ""
 
 
-News = (
-    HandedIn | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved | Answered
-)
-
-
-def kind_of(news: News) -> str:
-    """What `machine`'s table tells apart beside the news itself: the kind of group or flow; else empty."""
-    match news:
-        case EpisodesDone():
-            return news.group.kind
-        case FlowPinned():
-            return news.flow.of
-        case _:
-            return ""
+News = HandedIn | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved
 
 
 # ---- steps ----
@@ -106,7 +116,7 @@ def kind_of(news: News) -> str:
 class Step:
     """Collects the effects of one step, its news, and what is to be looked at when it ends."""
 
-    __slots__ = ("_out", "_rows", "dirty", "news", "now", "stimulus_id", "stops")
+    __slots__ = ("_out", "_rows", "dirty", "last", "news", "now", "stimulus_id", "stops")
 
     def __init__(self, now: float, stimulus_id: str) -> None:
         self.now = now
@@ -115,6 +125,8 @@ class Step:
         self._out: list[Effect] = []
         self.news: deque[News] = deque()
         """What those above are to hear, in order."""
+        self.last: Reply | None = None
+        """What is answered once the news was told."""
         self.dirty: dict[Lane, None] = {}
         """Lanes in which something waits that did not before."""
         self.stops: dict[str, list[str]] = {}
@@ -138,6 +150,10 @@ class Step:
         """Answer a request; the shell puts what is waited for into the message's words."""
         effect = Reply(request=request, message=message, waits_for=waits_for, stimulus_id=self.stimulus_id)
         self._out.append(effect)
+
+    def reply_last(self, request: RequestId, message: Message) -> None:
+        """Answer a request after what it led to; one in a step."""
+        self.last = Reply(request=request, message=message, stimulus_id=self.stimulus_id)
 
     def refuse(self, request: RequestId, status: Refusal, reason: Reason) -> None:
         """Answer a request with the reason why it is not carried out."""

@@ -118,8 +118,6 @@ def ask_ended(state: State, key: tuple[str, str], step: Step) -> None:
 
 def settle(state: State, step: Step) -> None:
     """At the end of a step: grant what has become possible."""
-    if not state.grantable:
-        return
     state.grantable = False
     for ask in list(state.asks.values()):
         _preempt(state, ask.family, ask.kernel, step)

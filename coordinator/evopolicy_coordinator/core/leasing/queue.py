@@ -129,38 +129,30 @@ def _settle(lane: Lane) -> None:
 
 def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None:
     """Let a job wait, and see at the end of the step whether someone waits for it."""
-    lane = _push(state, job, front=front)
-    if lane is not None:
-        step.dirty[lane] = None
-
-
-def _push(state: State, job: JobState, *, front: bool = False) -> Lane | None:
-    """Let a job wait; gives its lane, None while its flow is not pinned."""
-    flow, priority = job.group.flow, job.priority
+    flow, priority, lane = job.group.flow, job.priority, job.group.flow.lane
     job.move("queued")
     job.ticket += 1
-    if flow.lane is not None:
-        flow.lane.count(priority, flow, 1)
+    if lane is not None:
+        lane.count(priority, flow, 1)
+        step.dirty[lane] = None
     if job.alone:
         state.suspects[job] = None
-        return flow.lane
+        return
     ready = flow.ready[priority]
     (ready.appendleft if front else ready.append)((job.ticket, job))
     if flow.n_ready[priority] == 0:
         flow.served[priority] = max(flow.served[priority], state.clock[_RANK[priority]])
     flow.n_ready[priority] += 1
-    lane = flow.lane
     if lane is not None:
         lane.n_ready[priority] += 1
         _enter(flow, lane, priority)
         if lane.n_ready[priority] == 1:
             _settle(lane)
-    return lane
 
 
 def withdraw(state: State, job: JobState) -> None:
     """Take a waiting job out, wherever it stands, to be leased or closed at once."""
-    if not job.queued:
+    if job.place != "queued":
         return
     flow, priority = job.group.flow, job.priority
     job.ticket += 1
@@ -249,13 +241,14 @@ def _serve(state: State, job: JobState) -> None:
 def _best(
     state: State, worker: Worker, rank: tuple[int, ...], warm: Collection[str]
 ) -> tuple[Flow, int] | None:
+    if not worker.profile.busy:
+        return None
     best: tuple[Flow, int] | None = None
     best_score = 0.0
     concerned = [priority for priority in rank if bars.concerns(state, priority, worker)]
     for lane in worker.profile.busy:
         for priority in rank:
-            heap = lane.heaps[priority]
-            if not heap or not lane.n_ready[priority]:
+            if not lane.n_ready[priority] or not (heap := lane.heaps[priority]):
                 continue
             if priority in concerned and not _open(state, lane, priority, worker):
                 continue

@@ -30,7 +30,7 @@ from evopolicy_coordinator.core.step import EpisodesDone, HandedIn, ResultsDiffe
 
 def take(state: State, news: HandedIn, step: Step) -> None:
     """Take in one result of a hand-in."""
-    worker, result = news
+    worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
     granted = leases.granted(state, result.lease_id, result.job_id, result.attempt, worker)

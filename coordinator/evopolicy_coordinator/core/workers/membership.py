@@ -23,7 +23,7 @@ from evopolicy_coordinator.core.model import Worker
 from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import WorkerRow
 from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Answered, HandedIn, Step
+from evopolicy_coordinator.core.step import HandedIn, Step
 
 from . import scheduler
 
@@ -120,7 +120,7 @@ def handed_in(state: State, event: events.Asked[wire.HandIn], step: Step) -> Non
         return
     for result in event.message.results:
         step.tell(HandedIn(worker, result))
-    step.tell(Answered(event.request, wire.HandInReply(n=len(event.message.results))))
+    step.reply_last(event.request, wire.HandInReply(n=len(event.message.results)))
 
 
 def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:

@@ -130,20 +130,16 @@ def _limit(state: State, worker: Worker, n: int, free: int) -> int:
 
 def dispatch(state: State, step: Step) -> None:
     """Hand out what this step made available."""
-    permits.settle(state, step)
+    if state.grantable:
+        permits.settle(state, step)
     while state.freed:
         name = next(iter(state.freed))
         del state.freed[name]
         worker = state.workers.get(name)
         if worker is not None and worker.poll is not None and name not in worker.profile.parked:
             reconsider(state, worker, step)
-    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
-        lane = job.group.flow.lane
-        if lane is not None and job.queued:
-            if job.priority == TRAIN:
-                avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
-                preemption.clear(state, lane, job.group.flow.family, avoided, step)
-            _try_parked(state, lane, step, TRIES_MAX)
+    if state.suspects:
+        _place_suspects(state, step)
     fed = list(step.dirty)
     step.dirty.clear()
     for lane in fed:
@@ -160,6 +156,17 @@ def dispatch(state: State, step: Step) -> None:
         precedence.watch(state, lane, step)
     for name, stops in step.stops.items():
         _tell(state, name, tuple(stops), step)
+
+
+def _place_suspects(state: State, step: Step) -> None:
+    """Have hidden jobs make room for suspects that wait, and see whether an idle worker takes one."""
+    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
+        lane = job.group.flow.lane
+        if lane is not None and job.queued:
+            if job.priority == TRAIN:
+                avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
+                preemption.clear(state, lane, job.group.flow.family, avoided, step)
+            _try_parked(state, lane, step, TRIES_MAX)
 
 
 def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
