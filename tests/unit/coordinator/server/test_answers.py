@@ -16,6 +16,7 @@ from evopolicy_common.messages.operator import EvaluationPage
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec
+from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.server import uploads as uploads_module
@@ -199,6 +200,6 @@ def test_run_gets_only_the_blobs_that_its_train_feedback_names(desk: Desk) -> No
     assert desk.get(None, "no digest").status == "unknown_blob"
 
 
-def test_store_that_cannot_be_read_leaves_the_asker_to_ask_again(desk: Desk) -> None:
+def test_a_row_that_cannot_be_read_is_told_as_damaged(desk: Desk) -> None:
     desk.store._db.execute("UPDATE submits SET data = x'00'")
-    assert desk.results(0, 1) is None
+    assert desk.results(0, 1).status == Refusal.DAMAGED
