@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
 from golden_artifacts import AGENT, BUDGET, GOLDEN, artifacts
-from played import play
+from played import DATA, play
 from published_checker import check_run
 
 pytestmark = pytest.mark.timeout(600)
@@ -28,3 +30,11 @@ def test_artifact_is_what_its_golden_file_says(run: Path, name: str) -> None:
 def test_every_artifact_has_a_golden_file(run: Path) -> None:
     assert sorted(artifacts(run)) == NAMES
     assert check_run(run) == []
+
+
+def test_hashes_are_of_the_files_bytes(run: Path) -> None:
+    versions = json.loads((run / "run.json").read_bytes())["versions"]
+    files = {"agents_md": run / "workspace" / "AGENTS.md"}
+    files |= {f"data_{split}": DATA / "toy_line" / f"{split}.json" for split in ("train", "valid", "heldout")}
+    for name, path in files.items():
+        assert versions[f"{name}_hash"] == f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"

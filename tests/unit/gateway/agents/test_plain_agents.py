@@ -78,6 +78,22 @@ def test_staging_replaces_everything_and_keeps_links_for_the_service_to_judge(tm
     assert os.readlink(system / "link") == "/etc"
 
 
+def test_a_checkpoint_is_replayed_without_what_the_run_has_put_beside_it(tmp_path: Path) -> None:
+    checkpoint, system = tmp_path / "submit_000", tmp_path / "system"
+    (checkpoint / "deep").mkdir(parents=True)
+    for name in ("policy.py", "_meta.json", "metrics.json", "deep/metrics.json"):
+        (checkpoint / name).write_text(name)
+    (tmp_path / "plain").mkdir()
+    for name in ("policy.py", "metrics.json"):
+        (tmp_path / "plain" / name).write_text(name)
+    for source, kept in (
+        (checkpoint, {"policy.py", "deep/metrics.json"}),
+        (tmp_path / "plain", {"policy.py", "metrics.json"}),
+    ):
+        stage(source, system)
+        assert {path.relative_to(system).as_posix() for path in system.rglob("*") if path.is_file()} == kept
+
+
 def test_replay_submits_each_policy_with_its_share(tmp_path: Path) -> None:
     for name in "abc":
         policy(tmp_path / "given" / name, name)
