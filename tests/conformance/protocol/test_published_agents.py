@@ -11,6 +11,7 @@ from typing import NamedTuple
 import published_agents as agents
 import pytest
 from commands import command, record_in, toy_cluster
+from published_checker import check_run
 
 from evopolicy_common.records.run_record import RunRecord
 
@@ -139,6 +140,11 @@ def test_an_agent_of_the_published_protocol_comes_to_what_it_would_there(
     published: Played, name: str
 ) -> None:
     check(published, name, PUBLISHED)
+
+
+def test_run_directories_of_the_profile_pass_the_published_checker(published: Played) -> None:
+    for folder, _ in published.values():
+        assert check_run(folder) == [], folder
 
 
 def test_runs_of_the_profile_are_stamped_with_every_choice_and_marked_as_public(published: Played) -> None:
