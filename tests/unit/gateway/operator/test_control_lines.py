@@ -20,7 +20,8 @@ def filled(kind: type[control.Event]) -> control.Event:
         if field.type in (str, str | None):
             required[field.encode_name] = "long" * 2_000_000
         elif "dict" in str(field.type):
-            required[field.encode_name] = LONG
+            # Only maps of anything come from agents.
+            required[field.encode_name] = LONG if "Any" in str(field.type) else {"name": "value"}
         elif field.required:
             required[field.encode_name] = [1] if "tuple" in str(field.type) else 1
     return msgspec.convert(required | {"event": kind.__struct_config__.tag}, kind)
