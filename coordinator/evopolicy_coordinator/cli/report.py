@@ -100,7 +100,9 @@ def report(
         _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
     except ConfigError as error:
         _fail(str(error), code_of(error))
-    if unknown := sum(run.record.hidden_isolation == "unknown" for run in study.runs):
+    if unknown := sum(
+        run.record.hidden_isolation == "unknown" and not run.is_published for run in study.runs
+    ):
         say(
             f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
             " they are from before it was recorded",
