@@ -15,13 +15,14 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import rich.console
 from rich.console import ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
@@ -138,6 +139,17 @@ class Terminal(rich.console.Console):
         for segment in super().render(renderable, options):
             # Control segments are rich's own: they move the cursor of a live table.
             yield segment if segment.control else segment._replace(text=harmless(segment.text))
+
+
+def table(*headings: str, right: Collection[str] = ()) -> Table:
+    """A table that cuts nothing: where the terminal is narrow, cells fold, as other commands need what stands in them.
+
+    `right`: headings of columns that are aligned at the right.
+    """
+    made = Table(box=None, pad_edge=False)
+    for heading in headings:
+        made.add_column(heading, overflow="fold", justify="right" if heading in right else "left")
+    return made
 
 
 def terminal(*, stderr: bool = False) -> Terminal:

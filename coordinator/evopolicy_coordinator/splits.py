@@ -11,6 +11,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import json
@@ -24,10 +25,13 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
+from evopolicy_common.records.blobs import fsync_directory
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 FILE_STEMS: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}
 SECRET_BYTES = 32
+SECRET, UNJAILED_SECRET = "secret", "secret-unjailed"
+"""Files of the state folder: what splits derive from, for runs with jailed and with unjailed agents."""
 _SEED_LIMIT = 2**31
 
 
@@ -132,12 +136,34 @@ def public_secret(seed: int) -> bytes:
     return hashlib.sha256(f"evopolicy public split seed {seed}".encode()).digest()
 
 
-def load_or_create_secret(state: Path) -> bytes:
-    """The coordinator's 256-bit secret in `state/secret` (mode 0600), made on first use.
+def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
+    """The 256-bit secret that new runs' splits derive from, and a note where it is not the one before.
 
-    ConfigError when the file is not 32 bytes, or others may read it.
+    An agent without a full jail is the user who owns the state: it can read everything there. So runs with `unjailed` agents
+    have a secret of their own, and the other one is removed before any such agent is alive: the next run with jailed agents
+    gets a new one. Runs keep their cases in the database, so earlier ones can still be verified.
     """
-    path = state / "secret"
+    usual, own = state / SECRET, state / UNJAILED_SECRET
+    if unjailed:
+        data = load_or_create_secret(own)
+        with contextlib.suppress(FileNotFoundError):
+            usual.unlink()
+            fsync_directory(state)
+        return data, (
+            "agents of this run have no full jail and could read the cluster's state: its cases are of its own, and later"
+            " runs with jailed agents get new ones"
+        )
+    is_new = own.exists() and not usual.exists()
+    return load_or_create_secret(usual), (
+        "an agent without a full jail has run on this state: the cases are new from here on, and do not compare with those of"
+        " earlier runs"
+        if is_new
+        else ""
+    )
+
+
+def load_or_create_secret(path: Path) -> bytes:
+    """The 256 bits in the file (mode 0600), made on first use. ConfigError when it is not 32 bytes, or others may read it."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:

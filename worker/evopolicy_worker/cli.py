@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import secrets
 import signal
@@ -14,7 +15,6 @@ from typing import Annotated, cast
 
 import structlog
 import typer
-from rich.table import Table
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
@@ -25,7 +25,7 @@ from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
 from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.terminal import say, say_json, table, terminal
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_worker import environments
 from evopolicy_worker.fingerprint import fingerprint
@@ -59,7 +59,8 @@ def work(
         int | None, typer.Option(min=1, max=1024, help="Episodes at once; default: one per core.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="This worker's name; default: host and a random part.")
+        str | None,
+        typer.Option(help="This worker's name; default: that of its certificate, or host and a random part."),
     ] = None,
     credentials_file: Annotated[
         Path | None,
@@ -103,9 +104,8 @@ def work(
             raise ConfigError(
                 f"--env is missing: name a suite ({', '.join(catalogue.suites())}), an id or a glob"
             )
-        worker_name = name or f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
-        if not keys.valid_name(worker_name):
-            raise ConfigError(f"--name {worker_name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
+        if name is not None and not keys.valid_name(name):
+            raise ConfigError(f"--name {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
         wanted = catalogue.resolve(env)
         missing = [env_id for env_id in wanted if env_id not in environments.offered()]
         if missing:
@@ -116,6 +116,7 @@ def work(
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
         found = credentials.find("worker", tuple(connect or ()), credentials_file)
+        worker_name = name or default_name(found)
         tiers = available_tiers(unsandboxed=unsandboxed)
         if not tiers:
             raise MachineError(
@@ -150,16 +151,33 @@ def doctor(
     if as_json:
         say_json({"tier": best, "checks": checks})
     else:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("check", "verdict", "found", "what to do"):
-            table.add_column(heading, overflow="fold")
+        shown = table("check", "verdict", "found", "what to do")
         for check in checks:
-            table.add_row(check.name, check.verdict, check.found, check.advice)
-        terminal().print(table)
+            shown.add_row(check.name, check.verdict, check.found, check.advice)
+        terminal().print(shown)
         say(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )
     raise typer.Exit(0 if best else 1)
+
+
+def default_name(found: credentials.Credentials) -> str:
+    """The name that the machine's certificate was issued for, or the host's with a random part.
+
+    A further worker with the same certificate on this machine has a random part too: no two have one name.
+    """
+    certified = found.user.partition("/")[2]
+    if not certified:
+        return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
+    assert found.tls is not None
+    # Never closed: the lock is held as long as this process lives.
+    fd = os.open(found.tls.certificate, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # held by another worker, or a file system without locks
+        os.close(fd)
+        return f"{certified[:50]}-{secrets.token_hex(3)}"
+    return certified
 
 
 async def describe_all(env_ids: list[str], tier: Tier, scratch: Path) -> tuple[EnvironmentDescription, ...]:

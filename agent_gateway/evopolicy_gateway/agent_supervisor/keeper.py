@@ -43,6 +43,7 @@ END_GRACE_S = 3.0
 """From SIGTERM to SIGKILL."""
 LAST_WORDS_S = 2.0
 _TEXT_SHOWN = 2000
+_LINES_SHOWN = 8
 _TELL_TIME_S = 5.0
 _SURVIVORS_PAUSE_S = 1.0
 
@@ -87,10 +88,18 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         control.emit(AgentTime(used_s=clock.used_s()))
         agent_log.close()
     if isinstance(ending, AgentEnded):
-        return ending if reason is None else msgspec.structs.replace(ending, reason=reason, detail="")
+        if reason is not None:
+            return msgspec.structs.replace(ending, reason=reason, detail="")
+        failed = ending.reason == "agent_failed"
+        return msgspec.structs.replace(ending, said=_last_words(agent_log)) if failed else ending
     if isinstance(ending, EvopolicyError) or reason is not None:
         return AgentEnded(reason=reason or "agent_failed", detail=str(ending))
     raise ending
+
+
+def _last_words(agent_log: AgentLog) -> tuple[str, ...]:
+    lines = [agent_log.redact(line.encode()).decode("utf-8", "replace") for line in agent_log.last_errors]
+    return tuple(line for line in lines if line)[-_LINES_SHOWN:]
 
 
 async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:

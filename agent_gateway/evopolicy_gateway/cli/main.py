@@ -14,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import msgspec
 import typer
 
 from evopolicy_common import catalogue
@@ -22,7 +23,7 @@ from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.processes.preflight import EXTRAS, missing
-from evopolicy_common.records.run_difference import differences, left_out
+from evopolicy_common.records.run_difference import differences, left_out, shortened
 from evopolicy_common.terminal import say_json, say_lines, terminal
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import spread
@@ -75,6 +76,8 @@ def run(
     jail: JailOptions,
     served: DoorOptions,
     slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    fresh: options.Fresh = False,
     data: options.DataFolder = None,
     hidden_isolation: options.Isolation = None,
     as_json: options.Json = False,
@@ -85,16 +88,23 @@ def run(
             raise ConfigError(
                 "--local brings up a cluster of its own; it does not go with --connect or --credentials"
             )
-        if data is not None and not local:
+        if (data is not None or state is not None or fresh) and not local:
             raise ConfigError(
-                "--data goes with --local; elsewhere it is the coordinator's: evopolicy-coordinator --data"
+                "--data, --state and --fresh go with --local; elsewhere cases are the coordinator's: evopolicy-coordinator"
+                " --data, --state"
             )
         options.check_isolation(hidden_isolation, local=local)
         held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
         plans = _plans(given, [options.one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
-            where = Cluster(local_slots=slots, data=data, hidden_isolation=hidden_isolation)
+            where = Cluster(
+                local_slots=slots,
+                state=options.state_of(state, fresh=fresh),
+                unjailed=_unjailed(plans),
+                data=data,
+                hidden_isolation=hidden_isolation,
+            )
         _play(plans, where, 1, as_json)
 
 
@@ -116,6 +126,7 @@ def local(
     ] = 1,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
+    fresh: options.Fresh = False,
     data: options.DataFolder = None,
     audit: options.Audit = 0.0,
     hidden_isolation: options.Isolation = None,
@@ -125,7 +136,12 @@ def local(
     with fail_on_our_errors():
         plans = _plans(given, catalogue.resolve(env), jail.settings())
         where = Cluster(
-            local_slots=slots, state=state, data=data, audit=audit, hidden_isolation=hidden_isolation
+            local_slots=slots,
+            state=options.state_of(state, fresh=fresh),
+            unjailed=_unjailed(plans),
+            data=data,
+            audit=audit,
+            hidden_isolation=hidden_isolation,
         )
         _play(plans, where, parallel, as_json)
 
@@ -139,8 +155,7 @@ def try_policy(
     cases: Annotated[
         str,
         typer.Option(
-            help="Train ids and ranges. The same ids are the same cases with --state, --data or --connect; a cluster that is "
-            "thrown away has cases of its own."
+            help="Train ids and ranges. The same ids are the same cases in each call, unless with --fresh."
         ),
     ] = "0-3",
     out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
@@ -152,6 +167,7 @@ def try_policy(
     limit: options.Limits = None,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
+    fresh: options.Fresh = False,
     data: options.DataFolder = None,
     as_json: options.Json = False,
 ) -> None:
@@ -169,7 +185,8 @@ def try_policy(
             tier=tier,
             limits=options.limits_of(limit or ()),
         )
-        where = _trial_cluster(connect, credentials_file, slots, state, data)
+        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
+        where = msgspec.structs.replace(where, unjailed=tier == "none")
         _exit(_run(trials.try_policy(trial, where, as_json=as_json)))
 
 
@@ -184,13 +201,14 @@ def play_random(
     credentials_file: CredentialsFile = None,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
+    fresh: options.Fresh = False,
     data: options.DataFolder = None,
     as_json: options.Json = False,
 ) -> None:
     """Plays uniform random actions on a split: the reference that scores are held against."""
     with fail_on_our_errors():
         chosen = None if cases is None else options.cases_of(cases)
-        where = _trial_cluster(connect, credentials_file, slots, state, data)
+        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
         _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
 
 
@@ -220,7 +238,7 @@ def diff_runs(
     if as_json:
         say_json(found, indent=False)
     else:
-        say_lines(found or ["no difference (times and logs aside)"])
+        say_lines(shortened(found, left, right) or ["no difference (times and logs aside)"])
     raise typer.Exit(1 if found else 0)
 
 
@@ -274,7 +292,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> No
     if as_json:
         say_json(results)
     else:
-        report_runs(results, console)
+        report_runs(results, plans[0].runs, console)
     _exit(exit_code(ends_of(results)))
 
 
@@ -284,6 +302,11 @@ def _trial_cluster(
     if connect or file:
         return Cluster(connect=tuple(connect or ()), file=file)
     return Cluster(local_slots=slots, state=state, data=data)
+
+
+def _unjailed(plans: list[Plan]) -> bool:
+    """Whether an agent, or a policy that nothing locks in, could read what this user can."""
+    return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
 
 
 def _run(work: Coroutine[Any, Any, T]) -> T:

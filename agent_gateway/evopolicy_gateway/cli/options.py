@@ -15,6 +15,7 @@ from evopolicy_common.errors import ConfigError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.messages.operator import PUBLISHED
+from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
 
 RUN, SCORE, POLICY, AGENT, JAIL, REMOTE, CLUSTER = (
@@ -51,7 +52,18 @@ DataFolder = Annotated[
 StateFolder = Annotated[
     Path | None,
     typer.Option(
-        help="Keep the coordinator's state here; default: thrown away at the end.", rich_help_panel=CLUSTER
+        help="Folder of the local cluster's state; default: one that all your local runs share, so that they have the same"
+        " cases ($XDG_STATE_HOME/evopolicy/local).",
+        rich_help_panel=CLUSTER,
+        show_default=False,
+    ),
+]
+Fresh = Annotated[
+    bool,
+    typer.Option(
+        "--fresh",
+        help="A state for this command alone, thrown away at its end: cases that no other run has, nothing to verify with.",
+        rich_help_panel=CLUSTER,
     ),
 ]
 TierName = Annotated[Tier, typer.Option(help="Sandbox around the policy.", rich_help_panel=POLICY)]
@@ -120,6 +132,13 @@ def settings_of(profile: str | None, **told: str | None) -> dict[str, str]:
                 f"profile published has {name} = {usual[name]}, and {value} is asked for: leave out one of them"
             )
     return usual | {name: value for name, value in told.items() if value is not None} | {"profile": chosen}
+
+
+def state_of(state: Path | None, *, fresh: bool) -> Path | None:
+    """The state folder of a local cluster; None for one that is thrown away. ConfigError for both options."""
+    if fresh and state is not None:
+        raise ConfigError(f"--fresh and --state {state}: leave out one of them")
+    return None if fresh else state or local_state_dir()
 
 
 def default_exp_id() -> str:

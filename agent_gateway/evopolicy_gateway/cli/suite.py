@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
@@ -22,7 +22,7 @@ from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.alone import alone
-from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code
+from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code, next_step
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
@@ -115,8 +115,8 @@ def suite(
         )
         try:
             code = asyncio.run(_suite(order))
-        except asyncio.CancelledError:
-            raise KeyboardInterrupt from None
+        except (asyncio.CancelledError, KeyboardInterrupt):
+            fail("interrupted; the same command goes on where the sweep was", 130)
     if code:
         raise typer.Exit(code)
 
@@ -162,6 +162,8 @@ async def _suite(order: Order) -> int:
         if (told := suite_index.told(index)) is not None:
             console.print(told)
         console.print(f"index: {order.root / suite_index.FILE_NAME}", soft_wrap=True)
+        if any(entry.state == "completed" for entry in entries):
+            console.print(next_step(order.root), soft_wrap=True)
     return exit_code([_end(order, index.runs.get(name), name) for name in names])
 
 

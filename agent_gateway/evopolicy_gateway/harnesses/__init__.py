@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -63,7 +64,10 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
             raise ConfigError(f"--agent {agent}: {folder} is not a folder")
         return CommandHarness("replay", [*_ours("replay"), str(folder)], {"folder": str(folder)})
     if kind == "command" and rest.strip():
-        return CommandHarness("command", _program(agent, _split(rest), started_in))
+        words = _split(rest)
+        return CommandHarness(
+            "command", _program(agent, words, started_in), hint=_no_files(words, started_in)
+        )
     raise ConfigError(f"--agent {agent!r} is not an agent; there are {FORMS}")
 
 
@@ -95,6 +99,13 @@ def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     if shutil.which(resolved[0]) is None:
         raise ConfigError(f"--agent {agent}: no program {words[0]!r}, neither a file here nor on the PATH")
     return resolved
+
+
+def _no_files(words: Sequence[str], started_in: Path) -> str:
+    """Which words of a command look like files next to the operator, and are none; empty for none of them."""
+    looks = re.compile(r"(\./|\.\./)?[\w./-]+\.(py|sh|js|ts|rb|pl|toml|yaml|json)")
+    lost = [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
+    return f"{started_in} has no {', '.join(lost)}: relative paths are looked for there first" if lost else ""
 
 
 def _absolute(words: Sequence[str], started_in: Path) -> list[str]:

@@ -30,11 +30,15 @@ _IDLE_PAUSE_S = 10.0
 class CommandHarness(Harness):
     """`command:PROGRAM…`, and the agents that come with this package."""
 
-    def __init__(self, name: str, program: list[str], settings: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, name: str, program: list[str], settings: dict[str, Any] | None = None, hint: str = ""
+    ) -> None:
+        """`hint`: what may be wrong with the program, should it fail."""
         self.name = name
         self._program = program
         self.command = program
         self._settings = settings or {}
+        self._hint = hint
 
     async def play(self, stage: Stage) -> AgentEnded:
         process = await stage.start(self._program, talks=True)
@@ -69,9 +73,8 @@ class CommandHarness(Harness):
         if exit_code == 0:
             return AgentEnded(reason="agent_stopped", turns=turns, facts=facts)
         how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"
-        return AgentEnded(
-            reason="agent_failed", detail=f"{self._program[0]} ended with {how}", turns=turns, facts=facts
-        )
+        detail = f"{self._program[0]} ended with {how}" + (f"; {self._hint}" if self._hint else "")
+        return AgentEnded(reason="agent_failed", detail=detail, turns=turns, facts=facts)
 
 
 async def _silence(stage: Stage) -> str:

@@ -113,6 +113,8 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     retries: int = 0
     facts: dict[str, Any] = {}
     """What else `run.json` tells: `cli_version`, `model_string`, `settings`, `tokens`."""
+    said: tuple[str, ...] = ()
+    """What a failed agent said last on stderr, without keys."""
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +28,7 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import PATIENCE_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
+from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.operator.alone import until_free
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 
@@ -40,6 +41,16 @@ _UNAVAILABLE_PAUSE_S = 1.0
 
 class Operations(OperatorClient):
     """An operator's link as runs need it: where settings are why the coordinator says no, it is a ConfigError."""
+
+    def __init__(self, link: Link, opened: Callable[[str, Sequence[Path]], None] | None = None) -> None:
+        """`opened`: as `LocalCluster.opened`; None for a cluster that is not ours."""
+        super().__init__(link)
+        self._opened = opened
+
+    def watched_by(self, run: str, locks: Sequence[Path]) -> None:
+        """The run's agent is alive only as long as one of these locks is held."""
+        if self._opened is not None:
+            self._opened(run, locks)
 
     async def create(self, settings: RunSettings, key: str) -> RunCreated:
         """Opens a run; the same key gives the same run."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shlex
 import traceback
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-from rich.table import Table
 
 from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError
@@ -19,7 +19,7 @@ from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.terminal import Terminal, say_lines
+from evopolicy_common.terminal import Terminal, say, say_lines, table
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials
@@ -40,6 +40,9 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """The operator's credentials."""
     local_slots: int | None = None
     state: Path | None = None
+    """Of a local one: its folder; None for one that is thrown away."""
+    unjailed: bool = False
+    """Of a local one with a state: agents could read it."""
     data: Path | None = None
     audit: float = 0.0
     """Of a local one: share of the episodes that a second worker plays again."""
@@ -93,7 +96,7 @@ async def connected(
     end_on_sigterm()
     async with contextlib.AsyncExitStack() as stack:
         failed: asyncio.Future[None] | None = None
-        file = where.file
+        file, opened = where.file, None
         if where.local_slots is not None:
             cluster = await stack.enter_async_context(
                 local_cluster(
@@ -102,13 +105,16 @@ async def connected(
                     data=where.data,
                     audit=where.audit,
                     hidden_isolation=where.hidden_isolation,
+                    unjailed=where.unjailed,
                 )
             )
+            if cluster.note:
+                say(f"note: {cluster.note}", err=True)
             await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
-            file, failed = cluster.operator_file, cluster.failed
+            file, failed, opened = cluster.operator_file, cluster.failed, cluster.opened
         operator, gateway = find_credentials(where.connect, file)
         link = await stack.enter_async_context(transport.connect(operator))
-        yield Operations(link), gateway, failed
+        yield Operations(link, opened), gateway, failed
 
 
 async def play_all(
@@ -183,15 +189,14 @@ def ends_of(results: Sequence[RunResult]) -> list[End]:
     return [End(one.env, one.status, one.closed_reason, one.error, one.run_directory) for one in results]
 
 
-def report(results: Sequence[RunResult], console: Terminal) -> None:
-    """A table of what the runs came to, and where each of them is."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("environment", "score", "random", "best submit", "budget used", "ended"):
-        table.add_column(title, justify="right" if title in ("score", "random") else "left")
+def report(results: Sequence[RunResult], runs: Path, console: Terminal) -> None:
+    """A table of what the runs came to, where each of them is, and what to do with all that are in the folder `runs`."""
+    headings = ("environment", "score", "random", "best submit", "budget used", "ended")
+    made = table(*headings, right=("score", "random"))
     for result in results:
         best = "" if result.best_submit_index is None else f"submit {result.best_submit_index}"
         shown = result.closed_reason.replace("_", " ") if result.status == "completed" else result.status
-        table.add_row(
+        made.add_row(
             result.env,
             _number(result.final_score),
             _number(result.random_score),
@@ -199,12 +204,19 @@ def report(results: Sequence[RunResult], console: Terminal) -> None:
             str(result.budget_used),
             shown,
         )
-    console.print(table)
+    console.print(made)
     for result in results:
         if result.in_question:
             text = f"{result.env}: audits put these results in question; see `audit` in run.json"
             console.print(text, soft_wrap=True)
         console.print(f"run directory: {result.run_directory}", soft_wrap=True)
+    if any(result.status == "completed" for result in results):
+        console.print(next_step(runs), soft_wrap=True)
+
+
+def next_step(runs: Path) -> str:
+    """What to do with the runs in that folder."""
+    return f"next: evopolicy report {shlex.quote(str(runs))} --out report"
 
 
 async def _play(

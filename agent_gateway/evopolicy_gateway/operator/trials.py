@@ -11,7 +11,6 @@ from statistics import pstdev
 
 import msgspec
 from rich.progress import Progress
-from rich.table import Table
 
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
@@ -22,7 +21,7 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records import bundles
 from evopolicy_common.records.checkpoints import bundle_of
-from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
+from evopolicy_common.terminal import Terminal, one_line, say_json, table, terminal
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.runs import Cluster, connected
 from evopolicy_gateway.submits.episode_files import trajectory_files
@@ -249,13 +248,12 @@ def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> 
         say_json(results)
         return
     for result in results:
-        table = Table(box=None, pad_edge=False)
-        for title in ("case", "return", "steps", "played by", "failure"):
-            table.add_column(title, justify="right" if title in ("case", "return", "steps") else "left")
+        headings = ("case", "return", "steps", "played by", "failure")
+        made = table(*headings, right=("case", "return", "steps"))
         for one in result.episodes:
             shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
-            table.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
-        console.print(table)
+            made.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
+        console.print(made)
         console.print(_summary(result), soft_wrap=True)
         if result.folder is not None:
             console.print(f"trajectories: {result.folder}", soft_wrap=True)
@@ -282,18 +280,17 @@ def _tell_of_cases(results: Sequence[TrialResult], console: Terminal) -> None:
     if any(result.other_cases_next_time for result in results):
         console.print(
             "note: this cluster's cases end with it, the next call has others under the same ids;"
-            " --state DIR, --data DIR or --connect keeps them the same",
+            " leave out --fresh, or give --data DIR or --connect, to keep them the same",
             soft_wrap=True,
         )
 
 
 def _print_means(results: Sequence[TrialResult], console: Terminal) -> None:
-    table = Table(box=None, pad_edge=False)
-    for title in ("environment", "episodes", "mean return", "population std"):
-        table.add_column(title, justify="left" if title == "environment" else "right")
+    numbers = ("episodes", "mean return", "population std")
+    made = table("environment", *numbers, right=numbers)
     for result in results:
-        table.add_row(
+        made.add_row(
             result.env, str(len(result.episodes)), f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
         )
-    console.print(table)
+    console.print(made)
     _tell_of_cases(results, console)

@@ -193,6 +193,7 @@ class RunPlay:
 
     async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
         self.run = run
+        self._operations.watched_by(run, (self._folder.lock, self._folder.keeper_lock))
         plan = self._plan
         self._stopwatch = Stopwatch(self._folder.times)
         try:
@@ -259,6 +260,10 @@ class RunPlay:
         reason = CANCELLED if self._cancelled else reason
         how = f"agent ended: {reason.replace('_', ' ')}"
         self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
+        if reason == "agent_failed":
+            for line in ended.said or ("nothing",):
+                self._watch.note(self._name, f"stderr: {line}")
+            self._watch.note(self._name, f"its whole log: {self._folder.agent_log}")
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
         self._order = CloseRun(reason=reason, agent=about)
         if self._gateway is not None:

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.messages.gateway import FREE_SLOT
-from evopolicy_common.terminal import Terminal, say_json
+from evopolicy_common.terminal import Terminal, say_json, table
 from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.watch import PHASES, Row, View
@@ -193,12 +193,11 @@ def view_of(names: list[str], parallel: int, console: Terminal, *, as_json: bool
 
 def results_table(entries: list[Entry]) -> Table:
     """What the runs came to."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("run", "state", "score", "random", "budget used", "tokens"):
-        table.add_column(title, justify="right" if title in ("score", "random", "tokens") else "left")
+    headings = ("run", "state", "score", "random", "budget used", "tokens")
+    made = table(*headings, right=("score", "random", "tokens"))
     for entry in entries:
         tokens = tokens_in(entry.tokens)
-        table.add_row(
+        made.add_row(
             Text(entry.name),
             entry.state.replace("_", " ")
             + (f" on {entry.host}" if entry.host and not entry.directory else ""),
@@ -207,7 +206,7 @@ def results_table(entries: list[Entry]) -> Table:
             str(entry.budget_used),
             _short(tokens) if tokens else "",
         )
-    return table
+    return made
 
 
 def _order(row: SuiteRow) -> int:

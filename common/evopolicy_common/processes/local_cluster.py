@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import sys
 import time
@@ -21,6 +22,9 @@ from evopolicy_common.processes.child_process import ChildProcess, last_words
 from evopolicy_common.processes.notices import told_if_slow
 from evopolicy_common.processes.preflight import check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_common.wire.ready import Ready, read_ready
 
 START_PATIENCE_S = 60.0
@@ -35,13 +39,24 @@ _SOON_S = 60.0
 class LocalCluster:
     """A running coordinator, and the means to give it workers."""
 
-    def __init__(self, ready: Ready, processes: _Processes, *, audited: bool) -> None:
+    def __init__(
+        self, ready: Ready, processes: _Processes, *, audited: bool, kept: Path | None = None
+    ) -> None:
         self.operator_file = Path(ready.credentials["operator"])
         self.failed = processes.failed
         """Done only with the ConfigError that tells which process cannot be kept up, and why."""
         self._worker_file = ready.credentials["worker"]
         self._processes = processes
         self._audited = audited
+        self._kept = kept
+        """Folder of what `opened` remembers; None where the state is thrown away."""
+        self.note = ready.note
+        """What the operator is to know of the cases of new runs; empty for nothing."""
+
+    def opened(self, run: str, locks: Sequence[Path]) -> None:
+        """Remembers who watches over the agent of a run: it is alive only as long as one of these locks is held."""
+        if self._kept is not None:
+            write_atomically(self._kept / run, "\n".join(map(str, locks)).encode(), mode=0o600)
 
     async def start_workers(
         self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
@@ -71,11 +86,14 @@ async def local_cluster(
     data: Path | None = None,
     audit: float = 0.0,
     hidden_isolation: str | None = None,
+    unjailed: bool = False,
 ) -> AsyncIterator[LocalCluster]:
     """A coordinator inside the `async with`; it and its workers are taken down at its end. Enter it on the main thread.
 
     `kind` names its logs and its folder. `state` None: a folder that is thrown away. `audit`: share of the episodes that
-    a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. ConfigError when the coordinator does not come up (the folder may be in use).
+    a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
+    read the folder; see the coordinator's `--unjailed-agents`. ConfigError when the coordinator does not come up (the folder
+    may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
@@ -97,6 +115,8 @@ async def local_cluster(
             coordinator += ["--data", str(data.absolute())]
         if audit:
             coordinator += ["--audit", str(audit)]
+        if unjailed and state is not None:
+            coordinator += ["--unjailed-agents"]
         if hidden_isolation is not None:
             coordinator += ["--hidden-isolation", hidden_isolation]
         processes = _Processes(root / "logs", kind)
@@ -111,10 +131,46 @@ async def local_cluster(
                 raise ConfigError(
                     f"the local coordinator did not start within {START_PATIENCE_S:g} s: {why}"
                 ) from error
-            yield LocalCluster(ready, processes, audited=bool(audit))
+            kept = None if state is None else root / "open"
+            if kept is not None:
+                kept.mkdir(mode=0o700, exist_ok=True)
+                await _end_permits_of_killed(kept, Path(ready.credentials["operator"]))
+            yield LocalCluster(ready, processes, audited=bool(audit), kept=kept)
         finally:
             with told_if_slow("the local cluster to end"):
                 await processes.end()
+
+
+async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
+    """Tells the coordinator that agents of commands that were killed are gone, so that no later run waits for them.
+
+    The kernel ends a jailed agent with the process that watches over it, and that one with its command.
+    """
+    watched = {path.name: path.read_text().splitlines() for path in kept.iterdir()}
+    gone = [run for run, locks in watched.items() if not any(_is_held(Path(lock)) for lock in locks)]
+    if not gone:
+        return
+    async with transport.connect(credentials.find("operator", (), operator_file)) as link:
+        operator = OperatorClient(link)
+        alive = {run.run for run in (await operator.status()).runs if run.agent_host}
+        for run in gone:
+            if run in alive:
+                await operator.agent_gone(run)
+            (kept / run).unlink()
+
+
+def _is_held(lock: Path) -> bool:
+    try:
+        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
 
 
 async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:

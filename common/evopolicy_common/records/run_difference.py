@@ -11,7 +11,7 @@ import filecmp
 import fnmatch
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,25 @@ def differences(left: Path, right: Path) -> list[str]:
     for name in sorted(ours.keys() & theirs.keys()):
         found += _file_differences(name, ours[name], theirs[name], old)
     return found
+
+
+def shortened(found: Sequence[str], left: Path, right: Path) -> list[str]:
+    """The lines of `differences(left, right)` for people: scores first, and folders in place of files that one run lacks."""
+    ends = tuple(f": only in {side}" for side in (left, right))
+    scores = [line for line in found if line.startswith("run.json: outcome.")]
+    scores.sort(key=lambda line: not line.startswith("run.json: outcome.final_score:"))
+    others = [line for line in found if line not in scores and not line.endswith(ends)]
+    lacking: dict[str, list[str]] = {}
+    for line in found:
+        for end in ends:
+            if line.endswith(end):
+                name = line.removesuffix(end)
+                folder = "/".join(name.split("/")[: 3 if name.startswith("workspace/feedback/") else 2])
+                lacking.setdefault(f"{folder}{end}", []).append(line)
+    folders = [
+        lines[0] if len(lines) == 1 else f"{name} ({len(lines)} files)" for name, lines in lacking.items()
+    ]
+    return [*scores, *others, *folders]
 
 
 def _is_old(root: Path) -> bool:

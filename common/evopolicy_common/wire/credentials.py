@@ -60,6 +60,11 @@ def default_state_dir() -> Path:
     return Path(named) if named else state_home() / "coordinator"
 
 
+def local_state_dir() -> Path:
+    """The state folder that clusters of a command's own share (`evopolicy local`, `try`, …) when none is named."""
+    return state_home() / "local"
+
+
 def registry_dir() -> Path:
     """Where this user's clusters on this machine are found by endpoint."""
     return state_home() / "clusters"

@@ -21,6 +21,8 @@ class Ready(msgspec.Struct, frozen=True, kw_only=True):
     credentials: dict[Role, str]
     """Paths of this machine's credentials files by role."""
     state: str
+    note: str = ""
+    """What its operator is to know of the cases of new runs; empty for nothing."""
 
 
 async def read_ready(path: Path, keeper: asyncio.Future[None]) -> Ready:

@@ -10,12 +10,11 @@ from typing import Annotated
 
 import msgspec
 import typer
-from rich.table import Table
 
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.terminal import say, say_json, table, terminal
 from evopolicy_common.wire.credentials import MachineRole, default_state_dir
 from evopolicy_coordinator.pki import certs, machines
 from evopolicy_coordinator.pki.machines import Machine, Machines
@@ -176,13 +175,11 @@ def list_(state: State = None, as_json: Json = False) -> None:
             told = {"hosts": own.hosts, "expires": own.expires}
             say_json({"coordinator": told, "machines": rows})
             return
-        table = Table(box=None, pad_edge=False)
-        for heading in ("name", "role", "expires", "state"):
-            table.add_column(heading, overflow="fold")
-        table.add_row(", ".join(own.hosts), "coordinator", *_validity(own.expires, None, now))
+        shown = table("name", "role", "expires", "state")
+        shown.add_row(", ".join(own.hosts), "coordinator", *_validity(own.expires, None, now))
         for machine in Machines(root).all():
-            table.add_row(machine.name, machine.role, *_validity(machine.expires, machine.revoked, now))
-        terminal().print(table)
+            shown.add_row(machine.name, machine.role, *_validity(machine.expires, machine.revoked, now))
+        terminal().print(shown)
 
 
 def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetime) -> tuple[str, str]:

@@ -13,14 +13,12 @@ from typing import Annotated, Any, NoReturn
 
 import msgspec
 import typer
-from rich import box
-from rich.table import Table
 
 from evopolicy_common import catalogue
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.terminal import say, say_json, table, terminal
 from evopolicy_coordinator import splits
 
 app = App(
@@ -152,20 +150,17 @@ def _report(folder: Path) -> dict[str, Any]:
 
 
 def _print(reports: list[dict[str, Any]]) -> None:
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("environment", "train", "valid", "heldout", "secret", "sha256 of each", "checks"):
-        table.add_column(heading, no_wrap=True)
+    shown = table("environment", "train", "valid", "heldout", "secret", "sha256 of each", "checks")
     for report in reports:
         verdict = f"{len(report['findings'])} findings" if report["findings"] else "ok"
         if report["env"] is None:
-            table.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
+            shown.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
             continue
         counts = [str(report["cases"][split]) for split in splits.SPLITS]
         hashes = " ".join(report["sha256"][split][:8] for split in splits.SPLITS)
-        table.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
+        shown.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
     console = terminal()
-    # A row broken over several lines is worse than one that the terminal wraps.
-    console.print(table, width=max(console.width, 130))
+    console.print(shown)
     for report in reports:
         for finding in report["findings"]:
             console.print(finding, style="red", soft_wrap=True)

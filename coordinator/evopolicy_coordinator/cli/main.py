@@ -102,6 +102,13 @@ def serve(
     log_level: Annotated[
         Literal["debug", "info", "warning", "error"], typer.Option(help="Least level that is logged.")
     ] = "info",
+    unjailed_agents: Annotated[
+        bool,
+        typer.Option(
+            "--unjailed-agents",
+            help="The agents of its runs may read this state folder: they get cases of their own, and later runs new ones.",
+        ),
+    ] = False,
     _: Version = False,
 ) -> None:
     """Coordinates a cluster: workers and gateways connect to it, with the credentials that it writes.
@@ -119,6 +126,7 @@ def serve(
             insecure_tcp=insecure_tcp,
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
+            unjailed=unjailed_agents,
             core=CoreSettings(
                 audit_share=audit, hidden_isolation=hidden_isolation, hidden_wait_s=hidden_wait
             ),

@@ -20,7 +20,7 @@ from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json, say_lines, terminal
-from evopolicy_coordinator.analysis.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError
+from evopolicy_coordinator.analysis.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, read_score_csv
 from evopolicy_coordinator.analysis.study import Study, study_of
@@ -97,7 +97,12 @@ def report(
                 for one in error.mixtures
             }
         )
-        _fail(f"{error}\nGive runs that agree, or {' '.join(options)} to compare them all the same.", MIXED)
+        same = dict.fromkeys(REMEDIES[one.what] for one in error.mixtures if one.what in REMEDIES)
+        advice = f"\nRuns compare that were played with {'; '.join(same)}." if same else ""
+        _fail(
+            f"{error}{advice}\nGive runs that agree, or {' '.join(options)} to compare them all the same.",
+            MIXED,
+        )
     except ConfigError as error:
         _fail(str(error), code_of(error))
     if unknown := sum(

@@ -7,23 +7,24 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import typer
-from rich import box
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from evopolicy_common import catalogue
 from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.commands import App
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import (
     StatusReply,
 )
-from evopolicy_common.terminal import say, say_json, terminal
+from evopolicy_common.terminal import say, say_json, table, terminal
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 
@@ -93,42 +94,106 @@ async def _watch_lines(operator: OperatorClient) -> None:
         await asyncio.sleep(1.0)
 
 
+Json = Annotated[bool, typer.Option("--json", help="Print them as JSON.")]
+WorkerName = Annotated[
+    str, typer.Argument(help="The worker's name, as `evopolicy workers list` shows it.", show_default=False)
+]
+Absent = Annotated[
+    bool, typer.Option("--absent", help="The worker is not connected: it is so once it comes back.")
+]
+RunId = Annotated[
+    str, typer.Argument(help="The run's id, as `evopolicy runs list` shows it.", show_default=False)
+]
+
+
+@workers_app.command("list", epilog="Example: evopolicy workers list")
+def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
+    """The workers that are connected, or were lately, and what they play."""
+    reply = _asking(connect, file, OperatorClient.status)
+    if as_json:
+        say_json(reply.workers)
+        return
+    shown = table("worker", "host", "state", "slots", "running", "environments", right=("slots", "running"))
+    for worker in reply.workers:
+        counts = (str(worker.slots), str(worker.running))
+        shown.add_row(worker.worker, worker.host, worker.state, *counts, _names(worker.environments))
+    terminal().print(shown if reply.workers else "no worker is connected")
+
+
+def _names(env_ids: Sequence[str]) -> str:
+    """Environments as they are asked for: a suite's name for all of a suite."""
+    left, names = set(env_ids), []
+    for suite in catalogue.suites():
+        members = set(catalogue.resolve([suite]))
+        if members <= left:
+            left -= members
+            names.append(suite)
+    return " ".join([*names, *(env_id for env_id in env_ids if env_id in left)])
+
+
+def _set_worker(
+    worker: str,
+    state: Literal["active", "paused", "draining"],
+    connect: list[str] | None,
+    file: Path | None,
+    absent: bool,
+) -> None:
+    async def work(operator: OperatorClient) -> None:
+        if not absent:
+            reply = await operator.status()
+            known = {*(one.worker for one in reply.workers), *reply.quarantined}
+            if worker not in known:
+                raise ConfigError(
+                    f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
+                    " For one that is to come back, add --absent"
+                )
+        await operator.set_worker(worker, state)
+
+    _asking(connect, file, work)
+    say(f"{worker} is {state}")
+
+
 @workers_app.command(epilog="Example: evopolicy workers drain lab-3f2a")
 def drain(
-    worker: Annotated[str, typer.Argument(help="The worker's name, as `evopolicy status` shows it.")],
-    connect: Connect = None,
-    file: CredentialsFile = None,
+    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
 ) -> None:
     """Give a worker no more work: it finishes what runs, then ends."""
-    _asking(connect, file, lambda operator: operator.set_worker(worker, "draining"))
-    say(f"{worker} is draining")
+    _set_worker(worker, "draining", connect, file, absent)
 
 
 @workers_app.command(epilog="Example: evopolicy workers pause lab-3f2a")
 def pause(
-    worker: Annotated[str, typer.Argument(help="The worker's name.")],
-    connect: Connect = None,
-    file: CredentialsFile = None,
+    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
 ) -> None:
     """Give a worker no more work until it is resumed: it finishes what it holds, and stays."""
-    _asking(connect, file, lambda operator: operator.set_worker(worker, "paused"))
-    say(f"{worker} is paused")
+    _set_worker(worker, "paused", connect, file, absent)
 
 
 @workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
 def resume(
-    worker: Annotated[str, typer.Argument(help="The worker's name.")],
-    connect: Connect = None,
-    file: CredentialsFile = None,
+    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
 ) -> None:
     """Take a worker back that was paused or drained, or quarantined by an audit."""
-    _asking(connect, file, lambda operator: operator.set_worker(worker, "active"))
-    say(f"{worker} is active")
+    _set_worker(worker, "active", connect, file, absent)
+
+
+@runs_app.command("list", epilog="Example: evopolicy runs list")
+def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
+    """The unfinished runs, and what they wait for."""
+    reply = _asking(connect, file, OperatorClient.status)
+    if as_json:
+        say_json(reply.runs)
+        return
+    shown = table("run", "entry", "environment", "phase", "budget left", "waits for")
+    for run in reply.runs:
+        left = f"{run.remaining_budget}/{run.budget}"
+        shown.add_row(run.run, run.entry, run.env, run.phase, left, run.waits_for)
+    terminal().print(shown if reply.runs else "no run is open")
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
 def cancel(
-    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    run: RunId,
     connect: Connect = None,
     file: CredentialsFile = None,
 ) -> None:
@@ -139,7 +204,7 @@ def cancel(
 
 @runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")
 def agent_gone(
-    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    run: RunId,
     connect: Connect = None,
     file: CredentialsFile = None,
 ) -> None:
@@ -156,7 +221,7 @@ def agent_gone(
     epilog="Example: evopolicy runs repin r-0f2e9a7c11d04b35 b23d564d30c1 --reason 'the old workers are gone'"
 )
 def repin(
-    run: Annotated[str, typer.Argument(help="The run's id, as `evopolicy status` shows it.")],
+    run: RunId,
     fingerprint_class: Annotated[
         str, typer.Argument(metavar="CLASS", help="The workers' class, as `evopolicy status` shows it.")
     ],
@@ -188,11 +253,11 @@ def render(reply: StatusReply) -> RenderableType:
 
 
 def _workers(reply: StatusReply) -> Table:
-    table = _table(
+    shown = table(
         "worker", "host", "state", "slots", "running", "held", "environments", "tiers", "class", "seen"
     )
     for worker in reply.workers:
-        table.add_row(
+        shown.add_row(
             worker.worker,
             worker.host,
             worker.state,
@@ -204,7 +269,7 @@ def _workers(reply: StatusReply) -> Table:
             worker.fingerprint,
             f"{_age(worker.last_seen_s)} ago",
         )
-    return table
+    return shown
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:
@@ -214,7 +279,7 @@ def _classes(reply: StatusReply) -> Iterator[Text]:
 
 
 def _runs(reply: StatusReply) -> Table:
-    table = _table(
+    shown = table(
         "run",
         "entry",
         "environment",
@@ -227,7 +292,7 @@ def _runs(reply: StatusReply) -> Table:
         "agent on",
     )
     for run in reply.runs:
-        table.add_row(
+        shown.add_row(
             run.run,
             run.entry,
             run.env,
@@ -239,7 +304,7 @@ def _runs(reply: StatusReply) -> Table:
             str(run.done),
             run.agent_host,
         )
-    return table
+    return shown
 
 
 def _remarks(reply: StatusReply) -> Iterator[str]:
@@ -258,13 +323,6 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
         if worker.hidden_bar:
             yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
     yield from reply.stalls
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in headings:
-        table.add_column(heading, no_wrap=True)
-    return table
 
 
 def _age(seconds: float) -> str:

@@ -51,7 +51,7 @@ class _Options(msgspec.Struct, frozen=True, kw_only=True):
 
 @app.command(
     name="verify",
-    epilog="Example: evopolicy verify runs/evolve/gym_acrobot/20260131-120000 --sample 16 --local --state STATE",
+    epilog="Example: evopolicy verify runs/evolve/gym_acrobot/20260131-120000 --sample 16 --local",
 )
 def verify(
     run: Annotated[
@@ -72,7 +72,11 @@ def verify(
         bool, typer.Option("--local", help="Bring up a coordinator and a worker for this command.")
     ] = False,
     state: Annotated[
-        Path | None, typer.Option(help="With --local: the state folder that the run was made with.")
+        Path | None,
+        typer.Option(
+            help="With --local: the state folder that the run was made with; default: that of `evopolicy local`.",
+            show_default=False,
+        ),
     ] = None,
     data: Annotated[
         Path | None, typer.Option(help="With --local: the folder of split files that the run was made with.")
@@ -189,9 +193,9 @@ async def _link(options: _Options) -> AsyncIterator[tuple[transport.Link, LocalC
         if options.local:
             if options.state is not None and not options.state.is_dir():
                 raise ConfigError(f"--state {options.state}: there is no such state folder")
-            cluster = await stack.enter_async_context(
-                local_cluster("verify", state=options.state, data=options.data)
-            )
+            usual = credentials.local_state_dir()
+            kept = options.state or (usual if usual.is_dir() else None)
+            cluster = await stack.enter_async_context(local_cluster("verify", state=kept, data=options.data))
             file = cluster.operator_file
         found = credentials.find("operator", options.connect, file)
         yield await stack.enter_async_context(transport.connect(found)), cluster

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.environment import Case, Split, StepLimit
+from evopolicy_common.messages.environment import Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
@@ -48,7 +48,7 @@ from evopolicy_coordinator.server.request_checks import (
     finite_wait,
 )
 from evopolicy_coordinator.server.uploads import Uploads
-from evopolicy_coordinator.splits import SplitSource
+from evopolicy_coordinator.splits import SPLITS, SplitSource
 from evopolicy_coordinator.storage.state_folder import Identity
 from evopolicy_coordinator.storage.store import stored_blobs
 
@@ -305,15 +305,18 @@ class Intake:
     def evaluation_requested(
         self, m: operator.Evaluate, request: int, stimulus: str, of: RunRow | None = None
     ) -> AnyEvent:
-        """`of`: the finished run that it plays again: its policy seeds, and its hidden cases where they were its own."""
+        """`of`: the finished run that it plays again: its policy seeds, and its cases where they came from a secret."""
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
         check_limits(m.limits)
         try:
             suite = catalogue.suite_of(m.env)
-            cases = _own_cases(of, m.split) or self._source.splits(
-                suite.name, m.env, self._counts(suite, None, None)
-            ).cases(m.split)
+            run = _derived(of)
+            cases = (
+                self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
+                if run is None
+                else {"train": run.train, "validation": run.validation, "heldout": run.heldout}[m.split]
+            )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
@@ -372,10 +375,10 @@ class Intake:
     def split_hashes(self, m: operator.DescribeEnvironment, of: RunRow | None = None) -> dict[str, str]:
         """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits.
 
-        `of`: the finished run that is asked about: its own where it had hidden cases of its own.
+        `of`: the finished run that is asked about: its own where its cases came from a secret.
         """
-        if of is not None and of.settings.hidden_cases == "per_run":
-            return of.split_hashes
+        if (run := _derived(of)) is not None:
+            return run.split_hashes
         try:
             suite = catalogue.suite_of(m.env)
             return self._source.splits(
@@ -474,11 +477,9 @@ _EVENTS: dict[type[Message], Callable[[Intake, Any, int, str], AnyEvent]] = {
 """Requests that the shell adds something to: ids, secrets, cases."""
 
 
-def _own_cases(run: RunRow | None, split: Split) -> tuple[Case, ...]:
-    """The hidden cases that a run had for itself; none where all runs have the same."""
-    if run is None or run.settings.hidden_cases != "per_run":
-        return ()
-    return {"train": (), "validation": run.validation, "heldout": run.heldout}[split]
+def _derived(run: RunRow | None) -> RunRow | None:
+    """The run, where its cases came from a secret: its coordinator may have another now (see `splits.secret_of`)."""
+    return run if run is not None and run.split_hashes.keys() == set(SPLITS) else None
 
 
 def _or(value: int | None, otherwise: int) -> int:

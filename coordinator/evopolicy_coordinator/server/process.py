@@ -25,7 +25,7 @@ from evopolicy_coordinator.server.intake import Intake
 from evopolicy_coordinator.server.remote_door import declare_all, remote_door
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
-from evopolicy_coordinator.splits import SplitSource, load_or_create_secret
+from evopolicy_coordinator.splits import SplitSource, secret_of
 from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
 
@@ -45,6 +45,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     cluster: str | None = None
     allowed_packages: tuple[str, ...] = ()
     """What workers let policies import beside numpy; told in `/info`."""
+    unjailed: bool = False
+    """Agents of its runs may read the state folder: they play cases of their own; see `splits.secret_of`."""
     core: CoreSettings = CoreSettings()
 
 
@@ -57,7 +59,10 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     with contextlib.ExitStack() as opened:
         state = StateFolder.open(options.state, options.cluster)
         opened.callback(state.close)
-        source = SplitSource(data=options.data, secret=load_or_create_secret(state.root))
+        secret, note = secret_of(state.root, unjailed=options.unjailed)
+        if note and options.data is None:
+            log.warning(note)
+        source = SplitSource(data=options.data, secret=secret)
         machines = Machines(state.root)
         listen, remote = _listen(state, options, machines)
         store = Store(state.database)
@@ -82,7 +87,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
                 state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
             )
             async with door:
-                await _serve(state, options, listen, reachable(remote), service, stop, on_ready)
+                await _serve(state, options, listen, reachable(remote), service, stop, on_ready, note)
         finally:
             await service.stop()
         log.info("stopped; everything is on disk", state=str(state.root))
@@ -96,6 +101,7 @@ async def _serve(
     service: Service,
     stop: asyncio.Event,
     on_ready: Callable[[Ready], None],
+    note: str,
 ) -> None:
     """Serves this machine on `listen` until `stop`; other machines are served on `remote` meanwhile."""
     cluster = state.identity.cluster
@@ -113,6 +119,7 @@ async def _serve(
                     endpoints=(*endpoints, *remote),
                     credentials={role: str(path) for role, path in files.items()},
                     state=str(state.root),
+                    note="" if options.data is not None else note,
                 )
             )
             await _until(stop, service)

@@ -23,6 +23,7 @@ from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_ato
 
 KEPT_FILES = (
     "secret",
+    "secret-unjailed",
     "identity.json",
     *(
         f"certs/{name}"

@@ -2,6 +2,7 @@
 
     STATE/                        mode 0700, one coordinator at a time (`lock`)
       secret                      the 256 bits that hidden splits are derived from
+      secret-unjailed             those for runs whose agents have no full jail and could read this folder
       identity.json               the cluster's name, and each role's password and token
       certs/                      the certificates of other machines: see machines.py
       passwords                   the same passwords, for Zenoh's router
@@ -173,7 +174,7 @@ def _lock(root: Path) -> int:
         os.close(fd)
         raise ConfigError(
             f"state folder {root} is in use by another coordinator (process {holder or 'unknown'});"
-            " stop that one, or choose another folder with --state"
+            " wait for it, stop it, or choose another folder with --state (local, try, random: or none with --fresh)"
         ) from error
     os.ftruncate(fd, 0)
     os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)

@@ -101,6 +101,32 @@ def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
     asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
+def test_workers_and_runs_are_listed_and_a_worker_that_is_not_there_is_an_error(
+    coordinator: Coordinator,
+) -> None:
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator, working(coordinator, "w-listed"):
+            created = await operator.create("listed")
+            while "w-listed" not in [found.worker for found in (await operator.status()).workers]:
+                await asyncio.sleep(0.02)
+            shown = (await called(coordinator, "workers", "list")).stdout
+            assert "w-listed" in shown
+            assert "toy" in shown
+            listed = json.loads((await called(coordinator, "workers", "list", "--json")).stdout)
+            assert "w-listed" in [one["worker"] for one in listed]
+            assert created.run in (await called(coordinator, "runs", "list")).stdout
+            listed = json.loads((await called(coordinator, "runs", "list", "--json")).stdout)
+            assert created.run in [one["run"] for one in listed]
+            for command in ("pause", "drain", "resume"):
+                wrong = await called(coordinator, "workers", command, "nosuch")
+                assert wrong.exit_code == 2
+                assert "no worker 'nosuch' is connected; there are: " in wrong.stderr
+                assert "w-listed" in wrong.stderr
+                assert (await called(coordinator, "workers", command, "nosuch", "--absent")).exit_code == 0
+
+    asyncio.run(asyncio.wait_for(scenario(), 60))
+
+
 def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:
     async def scenario() -> None:
         async with operator_of(coordinator) as operator:

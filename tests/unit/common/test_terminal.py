@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 
 import pytest
 from rich.live import Live
@@ -11,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli import fail, setup_logging
-from evopolicy_common.terminal import Terminal, harmless, one_line, say, say_json, say_lines
+from evopolicy_common.terminal import Terminal, harmless, one_line, say, say_json, say_lines, table
 
 STEERING = [
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen
@@ -106,3 +107,23 @@ def test_log_lines_on_a_terminal_are_harmless(text: str, monkeypatch: pytest.Mon
 def test_printable_text_stays_as_it_is() -> None:
     text = "a – ü 漢 [/x] 100 %\n\tb"
     assert harmless(text) == text
+
+
+def test_a_table_cuts_nothing_on_a_narrow_terminal() -> None:
+    out = io.StringIO()
+    made = table("worker", "environments", "state")
+    names = " ".join(f"gymnasium/MiniGrid-ObstructedMaze-{number}Q-v1" for number in range(3))
+    made.add_row("a-worker-with-a-name-of-thirty-eight-l", names, "active")
+    Terminal(file=out, width=40).print(made)
+    shown = out.getvalue()
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 40
+    columns = ["".join(line[a:b].strip() for line in shown.splitlines()[1:]) for a, b in cells(shown)]
+    assert "a-worker-with-a-name-of-thirty-eight-l" in columns[0]
+    assert names.replace(" ", "") == columns[1].replace(" ", "")
+
+
+def cells(shown: str) -> list[tuple[int, int]]:
+    """Where the columns of a table without lines begin and end, by its headings."""
+    starts = [found.start() for found in re.finditer(r"\S+", shown.splitlines()[0])]
+    return list(zip(starts, [*starts[1:], 1000], strict=True))

@@ -21,7 +21,7 @@ from evopolicy_coordinator.splits import (
     derive,
     folders_below,
     load,
-    load_or_create_secret,
+    secret_of,
 )
 
 COUNTS = {"train": 64, "validation": 16, "heldout": 32}
@@ -166,17 +166,31 @@ def test_missing_file_and_missing_folder_are_told(folder: Path, tmp_path: Path) 
 
 
 def test_secret_is_made_once_and_only_its_owner_reads_it(tmp_path: Path) -> None:
-    secret = load_or_create_secret(tmp_path)
+    secret, note = secret_of(tmp_path)
     assert len(secret) == 32
+    assert note == ""
     assert (tmp_path / "secret").stat().st_mode & 0o777 == 0o600
-    assert load_or_create_secret(tmp_path) == secret
+    assert secret_of(tmp_path) == (secret, "")
+
+
+def test_unjailed_agents_find_no_secret_of_other_runs_and_those_get_a_new_one(tmp_path: Path) -> None:
+    usual, _ = secret_of(tmp_path)
+    own, note = secret_of(tmp_path, unjailed=True)
+    assert "cases are of its own" in note
+    files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert files == {"secret-unjailed": own}
+    assert secret_of(tmp_path, unjailed=True)[0] == own  # runs without a jail compare with each other
+    later, note = secret_of(tmp_path)
+    assert "the cases are new from here on" in note
+    assert len({usual, own, later}) == 3
+    assert secret_of(tmp_path) == (later, "")
 
 
 def test_secret_that_others_may_read_or_that_is_cut_short_is_refused(tmp_path: Path) -> None:
-    load_or_create_secret(tmp_path)
+    secret_of(tmp_path)
     (tmp_path / "secret").chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        load_or_create_secret(tmp_path)
+        secret_of(tmp_path)
     (tmp_path / "secret").write_bytes(b"short")
     with pytest.raises(ConfigError, match="5 bytes"):
-        load_or_create_secret(tmp_path)
+        secret_of(tmp_path)

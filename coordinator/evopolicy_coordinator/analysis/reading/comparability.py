@@ -71,6 +71,25 @@ _BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
 }
 
 
+_SAME_CASES = "the same cases (one --state or --data for all, none with --fresh, all in the same --jail)"
+REMEDIES = {
+    "episode budget": "the same --budget",
+    "policy scope": "the same --policy-scope",
+    "observation form": "the same --observations",
+    "simulation rule": "the same --simulation",
+    "finish rule": "the same --finish",
+    "profile": "the same --profile",
+    "jail": "the same --jail",
+    "hidden cases": "the same --hidden-cases",
+    **dict.fromkeys(("train split", "validation split", "held-out split"), _SAME_CASES),
+    "episodes a submit": "the same --min-episodes and --max-episodes",
+    "policy limits": "the same --limit",
+    "step limit": "the same --step-limit",
+    "videos in feedback": "the same --video",
+}
+"""How runs are to be played that agree in a thing, by `Mixture.what`."""
+
+
 def _split(run: Run, split: Split) -> str:
     if split != "train" and run.record.experiment_dimensions.hidden_cases == "per_run":
         return "its own"

@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from evopolicy_common.records.run_difference import differences
+from evopolicy_common.records.run_difference import differences, shortened
 from evopolicy_gateway.cli.main import app
 
 
@@ -113,3 +113,29 @@ def test_the_list_of_what_is_left_out_is_told_with_reasons_and_covers_what_diffe
     assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 0
     (right / "extra").touch()
     assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 1
+
+
+def test_people_see_scores_first_and_folders_in_place_of_the_files_in_them(tmp_path: Path) -> None:
+    left, right = make_run(tmp_path, "a", returns=[2.0]), make_run(tmp_path, "b")
+    record = json.loads((right / "run.json").read_text())
+    record["outcome"] |= {"best_submit_index": 3, "final_score": 7.0}
+    (right / "run.json").write_text(json.dumps(record))
+    for number in range(30):
+        folder = left / "workspace/feedback/submit_001/episodes" / f"ep_{number:03d}"
+        folder.mkdir(parents=True)
+        (folder / "trajectory.jsonl").write_text("{}")
+    (right / "extra").touch()
+    found = differences(left, right)
+    assert len(found) > 30
+    told = shortened(found, left, right)
+    assert told[:2] == [
+        "run.json: outcome.final_score: 1.0 and 7.0",
+        "run.json: outcome.best_submit_index: nothing and 3",
+    ]
+    assert told[-2:] == [
+        f"workspace/feedback/submit_001: only in {left} (30 files)",
+        f"extra: only in {right}",
+    ]
+    printed = CliRunner().invoke(app, ["diff", str(left), str(right)]).stdout
+    assert printed.startswith("run.json: outcome.final_score: 1.0 and 7.0\n")
+    assert json.loads(CliRunner().invoke(app, ["diff", str(left), str(right), "--json"]).stdout) == found

@@ -19,8 +19,10 @@ from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, Res
 from evopolicy_common.messages.operator import PUBLISHED, RunProgress, off_profile
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_common.terminal import Terminal
+from evopolicy_gateway.cli.main import _unjailed
 from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
 from evopolicy_gateway.cli.run_options import RunOptions
+from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import control
 from evopolicy_gateway.operator.control import AgentDoing, Progress
 from evopolicy_gateway.operator.runs import Cluster, RunResult, ends_of, exit_code, report
@@ -262,6 +264,31 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(capsys: pytest.CaptureFix
         "c: worker lost; see /r/c",
     ]
     out = io.StringIO()
-    report(seen, Terminal(file=out, width=100))
+    report(seen, Path("my runs"), Terminal(file=out, width=100))
+    assert "next: evopolicy report 'my runs' --out report" in out.getvalue()
     for needed in ("no_ok_submit", "run directory: /r/a", "agent failed", "cancelled"):
         assert needed in out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("jail", "tier", "exposed"),
+    [
+        ("bwrap", "bwrap", False),
+        ("open-network", "bwrap", True),
+        ("none", "bwrap", True),
+        ("bwrap", "none", True),
+    ],
+)
+def test_what_nothing_locks_in_could_read_the_state(
+    jail: Any, tier: Any, exposed: bool, tmp_path: Path
+) -> None:
+    settings = RunOptions(agent="evolve", tier=tier).settings("toy/line", "t")
+    plan = Plan(
+        settings=settings,
+        agent="evolve",
+        runs=tmp_path,
+        started_in=tmp_path,
+        wall_limit_s=1.0,
+        jail=JailSettings(mode=jail),
+    )
+    assert _unjailed([plan]) == exposed

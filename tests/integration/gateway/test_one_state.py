@@ -1,0 +1,149 @@
+"""Local runs share one state: what a user plays belongs together, and an agent without a jail learns nothing of later runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import SMALL, Command, agent, command, record_in, run_dir
+from waiting import wait_until
+
+from evopolicy_common.messages.environment import Split
+from evopolicy_coordinator.splits import SPLITS, cases_hash, derive
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def played(folder: Path, exp_id: str, *arguments: str) -> tuple[dict[str, str], str]:
+    """The cases' hashes of a run of `evopolicy local`, and what the command said on stderr."""
+    words = [
+        "local",
+        "--env",
+        "toy/line",
+        "--agent",
+        "random",
+        "--exp-id",
+        exp_id,
+        *SMALL,
+        "--json",
+        *arguments,
+    ]
+    with command(folder, *words) as running:
+        code, out, err = running.finish()
+    assert code == 0, err
+    (result,) = json.loads(out)
+    versions = record_in(Path(result["run_directory"])).versions
+    return {split: versions.cases_hash(split) for split in SPLITS}, err
+
+
+def done(folder: Path, *words: str) -> tuple[int, str, str]:
+    running = Command(folder, *words)
+    try:
+        return running.finish()
+    finally:
+        running.kill_all()
+
+
+def test_what_a_user_plays_shares_cases_compares_and_is_verified(tmp_path: Path) -> None:
+    first, _ = played(tmp_path, "a")
+    second, _ = played(tmp_path, "b")
+    assert first == second
+    assert (tmp_path / "xdg" / "evopolicy" / "local" / "coordinator.sqlite").exists()
+    run = run_dir(tmp_path, exp_id="a")
+    code, out, err = done(tmp_path, "verify", str(run), "--local")
+    assert code == 0, err
+    assert "identical" in out
+    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
+    assert code == 0, err
+    fresh, _ = played(tmp_path, "c", "--fresh")
+    assert fresh["heldout"] != first["heldout"]
+    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
+    assert code == 3
+    assert "--fresh" in err
+
+
+STEAL = """
+import os
+submit([0])
+found = {}
+for folder, _, files in os.walk(STATE):
+    for name in files:
+        if "secret" in name:
+            with open(os.path.join(folder, name), "rb") as file:
+                found[name] = file.read().hex()
+with open("system/stolen.json", "w") as file:
+    json.dump(found, file)
+submit([1])
+"""
+
+
+def test_a_run_without_a_jail_has_its_own_cases_and_later_runs_get_new_ones(tmp_path: Path) -> None:
+    state = tmp_path / "xdg" / "evopolicy" / "local"
+    before, note = played(tmp_path, "a")
+    assert "note: " not in note
+    steals = agent(tmp_path, f"STATE = {str(state)!r}\n" + STEAL)
+    words = [
+        "local",
+        "--env",
+        "toy/line",
+        "--agent",
+        steals,
+        "--entry",
+        "thief",
+        "--exp-id",
+        "s",
+        "--jail",
+        "none",
+    ]
+    with command(tmp_path, *words, *SMALL) as running:
+        code, _, err = running.finish()
+    assert code == 0, err
+    assert "note: agents of this run have no full jail" in err
+    thief = run_dir(tmp_path, exp_id="s")
+    versions = record_in(thief).versions
+    stolen = json.loads((thief / "workspace" / "system" / "stolen.json").read_text())
+    assert set(stolen) == {"secret-unjailed"}  # it reads what there is: the secret of its own run
+    after, note = played(tmp_path, "b")
+    assert "the cases are new from here on" in note
+    for split in SPLITS:
+        hashes = {before[split], versions.cases_hash(split), after[split]}
+        assert len(hashes) == 3, split
+    for text in stolen.values():
+        known = {known_hash(bytes.fromhex(text), split, after) for split in SPLITS}
+        assert not known & {*before.values(), *after.values()}
+    # The first run's cases are gone from the secret, not from the state.
+    code, _, err = done(tmp_path, "verify", str(run_dir(tmp_path, exp_id="a")), "--local")
+    assert code == 0, err
+
+
+def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
+    """What who has the secret takes the cases of `toy/line` in SMALL runs for."""
+    counts: dict[Split, int] = {"train": 16, "validation": 2, "heldout": 2}
+    return f"sha256:{cases_hash(derive(secret, 'toy', 'toy/line', counts)[split])}"
+
+
+def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) -> None:
+    waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
+    words = ["local", "--env", "toy/line", "--agent", waits, "--entry", "waits", "--exp-id", "t", *SMALL]
+    with command(tmp_path, *words) as running:
+        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
+        code, _, err = done(tmp_path, "random", "--env", "toy/line", "--split", "train", "--cases", "0")
+        assert code == 2
+        assert "--fresh" in err
+        assert "--state" in err
+        words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
+        code, _, err = done(tmp_path, *words)
+        assert code == 0, err
+        running.kill()
+    # What was killed keeps nobody from the state, and no later run waits for its agent.
+    played(tmp_path, "after")
+
+
+def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:
+    code, _, err = done(tmp_path, "random", "--env", "toy/line", "--fresh", "--state", "x")
+    assert code == 2
+    assert "leave out one of them" in err
+    code, _, err = done(tmp_path, "run", "--env", "toy/line", "--agent", "random", "--fresh")
+    assert code == 2
+    assert "go with --local" in err

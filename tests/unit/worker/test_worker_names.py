@@ -1,0 +1,30 @@
+"""What a worker is called that is given no name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evopolicy_common.wire.credentials import Credentials, TlsFiles
+from evopolicy_worker.cli import default_name
+
+
+def credentials(user: str, folder: Path) -> Credentials:
+    certificate = folder / "cert.pem"
+    certificate.touch()
+    tls = TlsFiles(root_ca=str(certificate), certificate=str(certificate), private_key=str(certificate))
+    return Credentials(
+        cluster="local", role="worker", endpoints=(), user=user, password="p", token="t", tls=tls
+    )
+
+
+def test_a_worker_has_its_certificates_name_and_a_second_one_beside_it_another(tmp_path: Path) -> None:
+    found = credentials("worker/second", tmp_path)
+    assert default_name(found) == "second"
+    beside = default_name(found)
+    assert beside.startswith("second-")
+    assert default_name(found) != beside
+
+
+def test_a_worker_without_a_certificate_has_its_hosts_name_and_a_random_part(tmp_path: Path) -> None:
+    found = credentials("worker", tmp_path)
+    assert default_name(found) != default_name(found)
