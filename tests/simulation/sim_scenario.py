@@ -32,9 +32,6 @@ PERMIT_S = 400.0
 ENVS = ("toy/line", "toy/maze")
 KINDS = ("good",) * 7 + ("raises", "raises", "none", "late")
 
-NOTICED_S = 2.0
-"""So long after a cut the transport takes the session for lost."""
-
 
 @dataclass(frozen=True)
 class Size:
@@ -183,7 +180,7 @@ class Simulation:
         for at in times(faults.worker_freeze):
             world.after(at, lambda: self._some_worker().freeze(chance.random() * 40.0))
         for at in times(faults.partition):
-            world.after(at, self._cut)
+            world.after(at, lambda: world.cut(self._some_endpoint(), chance.random() * 30.0))
         for at in times(faults.gateway_crash):
             world.after(at, self._crash_gateway)
         for at in times(faults.coordinator_stall):
@@ -213,17 +210,8 @@ class Simulation:
         if self.gateways:
             self.world.chance.choice(self.gateways).crash()
 
-    def _cut(self) -> None:
-        """An endpoint is cut off; of a worker the coordinator hears that its session is gone before its heartbeats are missed."""
-        name, seconds = self._some_endpoint(), self.world.chance.random() * 30.0
-        self.world.cut(name, seconds)
-        if name in self.workers and seconds > NOTICED_S:
-            self.world.after(NOTICED_S, self._lose_token, name)
-
     def _flap(self) -> None:
-        self._lose_token(self._some_worker().name)
-
-    def _lose_token(self, name: str) -> None:
+        name = self._some_worker().name
         self.coordinator.receive(name, events.LivenessLost, {"worker": name}, lambda message: None)
 
     def _drain(self) -> None:
