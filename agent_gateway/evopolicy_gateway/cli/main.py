@@ -25,6 +25,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.records.run_difference import differences, left_out, shortened
 from evopolicy_common.terminal import say_json, say_lines, terminal
+from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import spread
 from evopolicy_gateway.cli.run_options import DoorOptions, JailOptions, RunOptions
@@ -178,7 +179,7 @@ def try_policy(
     with fail_on_our_errors():
         trial = trials.Trial(
             env=options.one_environment(env),
-            policy=policy_dir,
+            policy=shipped.found(policy_dir, Path.cwd()),
             split="train",
             cases=options.cases_of(cases),
             out=out,

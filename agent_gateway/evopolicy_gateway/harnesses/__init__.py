@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_gateway import shipped
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, read_agent
 from evopolicy_gateway.harnesses.base import Harness
 from evopolicy_gateway.harnesses.claude_code import ClaudeCode
@@ -59,7 +60,7 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
     if agent == RemoteHarness.name:
         return RemoteHarness()
     if kind == "replay" and rest:
-        folder = (started_in / rest).resolve()
+        folder = shipped.found(rest, started_in).resolve()
         if not folder.is_dir():
             raise ConfigError(f"--agent {agent}: {folder} is not a folder")
         return CommandHarness("replay", [*_ours("replay"), str(folder)], {"folder": str(folder)})
