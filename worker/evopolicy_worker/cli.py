@@ -127,8 +127,7 @@ def work(
             if tier not in tiers:
                 raise ConfigError(
                     f"sandbox tier {tier} does not work here: {why_not(cast(Tier, tier))};"
-                    " `evopolicy-worker doctor` checks this machine. --tier none plays policies unconfined, which run.json"
-                    " then says"
+                    f" `evopolicy-worker doctor` checks this machine. {_other_tier(tiers)}"
                 )
         with scratch_folder("worker") as scratch:
             asyncio.run(
@@ -159,6 +158,14 @@ def doctor(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )
     raise typer.Exit(0 if best else 1)
+
+
+def _other_tier(tiers: tuple[Tier, ...]) -> str:
+    """What a run may ask for instead, the safest first."""
+    locked = [tier for tier in tiers if tier != "none"]
+    if locked:
+        return f"--tier {locked[0]} works here; run.json records it"
+    return "--tier none plays policies unconfined, which run.json then says"
 
 
 def default_name(found: credentials.Credentials) -> str:

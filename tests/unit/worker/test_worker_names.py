@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from evopolicy_common.wire.credentials import Credentials, TlsFiles
-from evopolicy_worker.cli import default_name
+from evopolicy_worker.cli import _other_tier, default_name
 
 
 def credentials(user: str, folder: Path) -> Credentials:
@@ -28,3 +28,8 @@ def test_a_worker_has_its_certificates_name_and_a_second_one_beside_it_another(t
 def test_a_worker_without_a_certificate_has_its_hosts_name_and_a_random_part(tmp_path: Path) -> None:
     found = credentials("worker", tmp_path)
     assert default_name(found) != default_name(found)
+
+
+def test_a_machine_without_a_tier_is_told_the_safest_that_works_there() -> None:
+    assert "--tier landlock works here" in _other_tier(("landlock", "none"))
+    assert "--tier none plays policies unconfined" in _other_tier(("none",))
