@@ -79,7 +79,7 @@ def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, numb
 
 def test_a_killed_local_command_takes_everything_with_it(tmp_path: Path) -> None:
     waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
-    arguments = ["local", "--env", "toy/line", "--agent", waits, "--exp-id", "t", *SMALL]
+    arguments = ["local", "--env", "toy/line", "--agent", waits, "--exp-id", "t", "--fresh", *SMALL]
     with command(tmp_path, *arguments) as running:
         wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
         below = running.alive()

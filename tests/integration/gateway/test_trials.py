@@ -89,7 +89,7 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
 
 
 def test_a_cluster_that_is_thrown_away_says_that_its_cases_are_too(tmp_path: Path) -> None:
-    for more, told in (((), True), (("--state", str(tmp_path / "kept")), False)):
+    for more, told in ((("--fresh",), True), ((), False)):
         with command(tmp_path, "random", "--env", "toy/line", "--cases", "0", *more) as running:
             code, out, err = running.finish()
         assert code == 0, err
