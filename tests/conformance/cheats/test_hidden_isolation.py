@@ -34,6 +34,9 @@ HERE = Path(__file__).parent
 POLICY = HERE / "signalling_policy.py"
 N_HIDDEN = 2
 """Of each hidden split."""
+HEARD_S = 20.0
+"""How long a listener without the rule is given for one run's hidden cases."""
+TRIES = 4
 QUIET_S = 6.0
 """How long a listener is given after a submit: much longer than what would be played takes."""
 
@@ -135,14 +138,28 @@ def recognised(heard: list[float], wanted: list[int]) -> int:
     return found
 
 
+def hears(run: Listening, wanted: list[int]) -> bool:
+    """Whether the listener recognises all of the wanted pulses within a while: other programs' memory can cover them."""
+    deadline = time.monotonic() + HEARD_S
+    while time.monotonic() < deadline:
+        if recognised(run.heard(), wanted) == len(wanted):
+            return True
+        time.sleep(0.05)
+    return False
+
+
 def test_without_the_rule_an_agent_hears_its_own_hidden_cases(shared: GoldenCluster) -> None:
-    with listening(shared, "own", 1) as run:
-        run.listens()
-        run.wait_for(lambda: recognised(run.heard(), pulses(shared, "valid")) == N_HIDDEN)
-        together = met(shared, moments(shared))
-        assert together
-        record = run.stop()
-    assert record.hidden_isolation == "shared"
+    heard = False
+    for attempt in range(TRIES):
+        with listening(shared, f"own{attempt}", 1) as run:
+            run.listens()
+            heard = hears(run, pulses(shared, "valid"))
+            record = run.stop()
+        assert record.hidden_isolation == "shared"
+        if heard:
+            break
+    assert heard
+    assert met(shared, moments(shared))
 
 
 def test_agent_that_listens_hears_no_hidden_case_and_none_is_played_beside_it(
@@ -166,10 +183,15 @@ def test_agent_that_listens_hears_no_hidden_case_and_none_is_played_beside_it(
 def test_without_the_rule_a_sibling_hears_what_another_run_is_scored_on(shared: GoldenCluster) -> None:
     with listening(shared, "sibling", 0) as sibling:
         sibling.listens()
-        with listening(shared, "scored", 1) as scored:
-            scored.listens()
-            scored.stop()
-        sibling.wait_for(lambda: recognised(sibling.heard(), pulses(shared, "heldout")) == N_HIDDEN)
+        heard = False
+        for attempt in range(TRIES):
+            with listening(shared, f"scored{attempt}", 1) as scored:
+                scored.listens()
+                scored.stop()
+            heard = hears(sibling, pulses(shared, "heldout"))
+            if heard:
+                break
+        assert heard
         sibling.process.terminate()
 
 
