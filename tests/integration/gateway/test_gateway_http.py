@@ -297,7 +297,6 @@ def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) -> None:
             assert summary["n_episodes"] == 2
             assert summary["remaining_budget"] == 10
             arrays = (
-                "env_instances",
                 "returns",
                 "mean_return",
                 "episode_lengths",
@@ -306,6 +305,7 @@ def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) -> None:
                 "max_return",
             )
             assert all(summary[name] is None for name in arrays)
+            assert summary["env_instances"] == [0, 1]
             folder = s.folder.feedback / "submit_000"
             assert files_below(folder) == ["errors.txt", "summary.json"]
             line = json.loads((folder / "errors.txt").read_text())
