@@ -36,6 +36,10 @@ _MAX_DEATHS = 10
 _SOON_S = 60.0
 
 
+WORKERS_ENDED = "workers-ended"
+"""File in a kept state folder: every worker of its last command has ended, so the next coordinator expects none of them."""
+
+
 class LocalCluster:
     """A running coordinator, and the means to give it workers."""
 
@@ -139,6 +143,8 @@ async def local_cluster(
         finally:
             with told_if_slow("the local cluster to end"):
                 await processes.end()
+            if state is not None:
+                write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
 
 
 async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:

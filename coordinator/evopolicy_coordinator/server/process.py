@@ -14,6 +14,8 @@ import msgspec
 import structlog
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes import host
+from evopolicy_common.processes.local_cluster import WORKERS_ENDED
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
@@ -67,6 +69,11 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         listen, remote = _listen(state, options, machines)
         store = Store(state.database)
         opened.callback(store.close)
+        ended = state.root / WORKERS_ENDED
+        if ended.exists():
+            # Else the first agent would wait for `silent_bar_s`, as a worker of the last command might still play.
+            store.forget_kernels(host.boot_id())
+            ended.unlink()
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
         uploads = Uploads()

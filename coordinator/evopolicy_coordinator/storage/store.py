@@ -162,6 +162,17 @@ class Store:
                 self._db.execute("ROLLBACK")
             raise
 
+    def forget_kernels(self, boot_id: str) -> None:
+        """Forgets, durably, which workers were on that kernel: they are known to have ended."""
+
+        def forget() -> None:
+            with self._transaction():
+                for row in list(rows(self._db, KernelRow)):
+                    if row.boot_id == boot_id:
+                        self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
+
+        _guard(self._path, forget)
+
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
         """Keeps a sweep's claim, durably; StorageError when it could not."""
         _guard(self._path, lambda: self._db.execute(_CLAIM, (suite, name, data)))

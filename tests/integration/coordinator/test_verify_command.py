@@ -49,7 +49,7 @@ class Played:
         self.play(*(word for env in ENVIRONMENTS for word in ("--env", env)))
 
     def play(self, *options: str) -> None:
-        command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--jail", "none", "--budget", "3"]
+        command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--budget", "3"]
         command += ["--agent", f"command:{sys.executable} {self.root / 'agent.py'}", "--validation", "1"]
         command += ["--heldout", "2", "--state", str(self.state), *options]
         done = subprocess.run(
