@@ -124,6 +124,7 @@ async def local_cluster(
         if hidden_isolation is not None:
             coordinator += ["--hidden-isolation", hidden_isolation]
         processes = _Processes(root / "logs", kind)
+        served = False
         try:
             await processes.keep_up("coordinator", coordinator)
             try:
@@ -135,6 +136,7 @@ async def local_cluster(
                 raise ConfigError(
                     f"the local coordinator did not start within {START_PATIENCE_S:g} s: {why}"
                 ) from error
+            served = True
             kept = None if state is None else root / "open"
             if kept is not None:
                 kept.mkdir(mode=0o700, exist_ok=True)
@@ -143,7 +145,8 @@ async def local_cluster(
         finally:
             with told_if_slow("the local cluster to end"):
                 await processes.end()
-            if state is not None:
+            # Not where the coordinator never served: the folder may be another command's, whose workers are alive.
+            if served and state is not None:
                 write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
 
 

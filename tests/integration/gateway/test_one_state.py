@@ -10,7 +10,10 @@ from commands import SMALL, Command, agent, command, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.processes.local_cluster import WORKERS_ENDED
+from evopolicy_coordinator.core.records import KernelRow
 from evopolicy_coordinator.splits import SPLITS, cases_hash, derive
+from evopolicy_coordinator.storage.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -45,11 +48,21 @@ def done(folder: Path, *words: str) -> tuple[int, str, str]:
         running.kill_all()
 
 
+def kernels(state: Path) -> tuple[KernelRow, ...]:
+    """Where the coordinator knows workers to have been."""
+    store = Store(state / "coordinator.sqlite")
+    try:
+        return store.load().kernels
+    finally:
+        store.close()
+
+
 def test_what_a_user_plays_shares_cases_compares_and_is_verified(tmp_path: Path) -> None:
     first, _ = played(tmp_path, "a")
     second, _ = played(tmp_path, "b")
     assert first == second
-    assert (tmp_path / "xdg" / "evopolicy" / "local" / "coordinator.sqlite").exists()
+    # The first run's worker has ended, and nobody waits for it.
+    assert len(kernels(tmp_path / "xdg" / "evopolicy" / "local")) == 1
     run = run_dir(tmp_path, exp_id="a")
     code, out, err = done(tmp_path, "verify", str(run), "--local")
     assert code == 0, err
@@ -132,6 +145,7 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
         assert code == 2
         assert "--fresh" in err
         assert "--state" in err
+        assert not (tmp_path / "xdg" / "evopolicy" / "local" / WORKERS_ENDED).exists()
         words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
         code, _, err = done(tmp_path, *words)
         assert code == 0, err

@@ -105,6 +105,24 @@ def test_what_a_killed_command_left_in_the_state_folder_is_removed(
     assert list(tmp_path.glob("*.json")) == [others]
 
 
+def test_only_the_command_whose_cluster_served_says_that_its_workers_have_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = tmp_path / local_cluster.WORKERS_ENDED
+    programs(monkeypatch, "import sys; print('error: in use', file=sys.stderr); sys.exit(2)")
+    assert bring_up(tmp_path) == "in use"
+    assert not ended.exists()
+    programs(monkeypatch, SERVES)
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+            await cluster.start_workers(["toy/line"], slots=1)
+            assert not ended.exists()
+
+    asyncio.run(main())
+    assert ended.exists()
+
+
 def test_a_worker_that_dies_again_and_again_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

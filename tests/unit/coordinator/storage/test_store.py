@@ -14,7 +14,7 @@ from store_rows import blob, outcome_row, run_row, state_row, submit_row
 from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.records import EvaluationRow, WorkerRow, head_of
+from evopolicy_coordinator.core.records import EvaluationRow, KernelRow, WorkerRow, head_of
 from evopolicy_coordinator.storage import store as store_module
 from evopolicy_coordinator.storage import upkeep
 from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
@@ -100,6 +100,17 @@ def test_row_is_replaced_under_its_key(store: Store) -> None:
     snapshot = store.load()
     assert [row.released for row in snapshot.submits] == [2]
     assert [row.phase for row in snapshot.states] == ["closed"]
+
+
+def test_workers_that_have_ended_are_forgotten_on_their_own_kernel_alone(store: Store) -> None:
+    store.write(
+        [
+            KernelRow(worker=name, boot_id=boot_id, machine_id="m")
+            for name, boot_id in (("here", "k1"), ("there", "k2"))
+        ]
+    )
+    store.forget_kernels("k1")
+    assert [row.worker for row in store.load().kernels] == ["there"]
 
 
 def test_write_that_fails_leaves_nothing_behind(store: Store) -> None:
