@@ -106,8 +106,8 @@ def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
     raise SystemExit(code)
 
 
-def code_of(error: ConfigError) -> int:
-    """What a program that cannot begin ends with: it is not started again with wrong options."""
+def code_of(error: ConfigError | DamagedStoreError) -> int:
+    """What a program that cannot begin ends with: it is not started again with wrong options, or on a damaged store."""
     return FAILURE if isinstance(error, MachineError) else USAGE_ERROR
 
 
@@ -117,10 +117,8 @@ def fail_on_our_errors() -> Iterator[None]:
     went wrong later."""
     try:
         yield
-    except ConfigError as error:
+    except (ConfigError, DamagedStoreError) as error:
         fail(str(error), code_of(error))
-    except DamagedStoreError as error:
-        fail(str(error), USAGE_ERROR)
     except EvopolicyError as error:
         fail(str(error), FAILURE)
     except OSError as error:

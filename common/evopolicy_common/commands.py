@@ -93,12 +93,11 @@ class App(typer.Typer):
     """A `typer.Typer` of ours: `-h`, plain help in groups, and no traceback of typer's."""
 
     def __init__(self, **options: Any) -> None:
-        settings = {"help_option_names": ["-h", "--help"]}
         usual = {
             "cls": Group,
             "rich_markup_mode": None,
             "add_completion": False,
-            "context_settings": settings,
+            "context_settings": _SETTINGS,
         }
         super().__init__(**(usual | options))
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
 
 METADATA = frozenset({"_meta.json", "metrics.json"})
+"""As `records.checkpoints.METADATA`: an agent's jail shows the agents alone, not the package of that module."""
 
 
 def policies_in(folder: Path) -> list[Path]:

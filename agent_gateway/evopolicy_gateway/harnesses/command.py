@@ -79,8 +79,9 @@ class CommandHarness(Harness):
 
 async def _silence(stage: Stage) -> str:
     """As `Activity.silence`; never returns where nobody asks."""
-    while stage.activity is None:
-        await asyncio.Event().wait()
+    if stage.activity is None:
+        never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        return await never
     return await stage.activity.silence()
 
 
