@@ -1,8 +1,10 @@
-"""What all commands share: how a cluster is named, logging to stderr, and errors of ours as one line and an exit code."""
+"""What all commands share: how a cluster is named, logging to stderr, and errors of ours as one line and an exit code.
+
+Help and completion import this: what is large, or needed for work only, is imported where it is used.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import signal
@@ -11,7 +13,6 @@ from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TextIO, cast
 
-import structlog
 import typer
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
@@ -69,6 +70,8 @@ def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> Mutabl
 
 def setup_logging(level: str = "info") -> None:
     """Structured logs on stderr: for people on a terminal, JSON lines otherwise."""
+    import structlog
+
     terminal = sys.stderr.isatty()
     structlog.configure(
         processors=[
@@ -87,6 +90,7 @@ def setup_logging(level: str = "info") -> None:
 
 def setup_notices() -> None:
     """For commands of people and scripts: warnings as plain lines on stderr, so that stdout holds results only."""
+    import structlog
 
     def plain(_: Any, __: str, event: Any) -> str:
         text, error = str(event.pop("event")), event.pop("exc_info", None)
@@ -140,6 +144,8 @@ def fail_on_our_errors() -> Iterator[None]:
 
 def end_on_sigterm() -> None:
     """From now on SIGTERM cancels the task that calls this: a command ends as with Ctrl-C, in order."""
+    import asyncio
+
     main = asyncio.current_task()
     assert main is not None
     with contextlib.suppress(RuntimeError, ValueError):  # not on the main thread: there are no signals here

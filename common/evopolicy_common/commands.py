@@ -66,6 +66,10 @@ class _Help:
         if isinstance(self, TyperGroup):
             self.format_commands(ctx, formatter)
 
+    def invoke(self, ctx: Any) -> Any:
+        setup_notices()  # not before: help and completion tell nothing, and do without structlog
+        return super().invoke(ctx)  # type: ignore[misc]
+
 
 class Command(_Help, TyperCommand):
     """A command whose help is grouped."""
@@ -75,12 +79,16 @@ class Group(_Help, TyperGroup):
     """A group of commands that, without one, shows its help and ends as wrong usage does."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        shown = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        # Whole sentences, folded: typer would cut them to one line.
-        rows = [(name, each.get_short_help_str(1000)) for name, each in shown if each and not each.hidden]
+        rows = self.command_rows(ctx)
         if rows:
             with formatter.section("Commands"):
                 formatter.write_dl(rows)
+
+    def command_rows(self, ctx: Any) -> list[tuple[str, str]]:
+        """Names of the commands, with what each does."""
+        shown = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        # Whole sentences, folded: typer would cut them to one line.
+        return [(name, each.get_short_help_str(1000)) for name, each in shown if each and not each.hidden]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if not args and self.no_args_is_help and not ctx.resilient_parsing:
@@ -109,7 +117,6 @@ class App(typer.Typer):
 
 def run_app(app: typer.Typer) -> NoReturn:
     """Runs the command that `sys.argv` names, and exits."""
-    setup_notices()
     open_streams()
     end_without_reader()
     try:

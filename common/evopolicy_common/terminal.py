@@ -15,15 +15,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
-
-import msgspec
-import rich.console
-from rich.console import ConsoleOptions, RenderableType
-from rich.segment import Segment
-from rich.table import Table
-from rich.text import Text
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -31,8 +24,6 @@ if TYPE_CHECKING:
 _ODD = re.compile(r"[^\n\t -~]")
 READER_GONE = 128 + signal.SIGPIPE
 """Exit status of a program that nobody reads any more, as a shell tells it."""
-WIDTH = 200
-"""Columns where there is no terminal: a table that is cut off is worse than a long line."""
 
 
 def harmless(text: str) -> str:
@@ -64,6 +55,8 @@ def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
 
 def say_json(value: Any, *, indent: bool = True) -> None:
     """Prints `value` as JSON on stdout: over several lines, or on one. Characters that are not printable are escaped."""
+    import msgspec
+
     try:
         data = msgspec.json.encode(value)
         text = (msgspec.json.format(data, indent=2) if indent else data).decode()
@@ -120,39 +113,3 @@ def end_without_reader() -> None:
 
 def _is_no_exit(record: logging.LogRecord) -> bool:
     return not (record.exc_info and isinstance(record.exc_info[1], SystemExit))
-
-
-class Terminal(rich.console.Console):
-    """A console that takes texts as they are: no markup, no emoji codes, nothing that is not printable."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(markup=False, emoji=False, highlight=False, **options)
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        return super().render_str(harmless(text), **options)
-
-    def on_broken_pipe(self) -> None:
-        # Of stderr: the results are on stdout, which ends the program by itself.
-        self.quiet = True
-
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        for segment in super().render(renderable, options):
-            # Control segments are rich's own: they move the cursor of a live table.
-            yield segment if segment.control else segment._replace(text=harmless(segment.text))
-
-
-def table(*headings: str, right: Collection[str] = ()) -> Table:
-    """A table that cuts nothing: where the terminal is narrow, cells fold, as other commands need what stands in them.
-
-    `right`: headings of columns that are aligned at the right.
-    """
-    made = Table(box=None, pad_edge=False)
-    for heading in headings:
-        made.add_column(heading, overflow="fold", justify="right" if heading in right else "left")
-    return made
-
-
-def terminal(*, stderr: bool = False) -> Terminal:
-    """For people: as wide as their terminal, and `WIDTH` columns where there is none."""
-    found = Terminal(stderr=stderr)
-    return found if found.is_terminal else Terminal(stderr=stderr, width=WIDTH)

@@ -10,17 +10,16 @@ from typing import Any, Literal, get_args, get_origin
 import typer
 
 from evopolicy_coordinator.cli.main import app as coordinator
-from evopolicy_gateway.cli import main as front
+from evopolicy_gateway.cli.main import app as front
 from evopolicy_gateway.cli.serve import app as gateway
 from evopolicy_worker.cli import app as worker
 
 
 def page() -> str:
     """The page's Markdown."""
-    front._add_commands_of_other_rooms([])
     parts = ["# Commands\n\nEvery command has `--help` with an example.\n"]
     for name, app in (
-        ("evopolicy", front.app),
+        ("evopolicy", front),
         ("evopolicy-coordinator", coordinator),
         ("evopolicy-worker", worker),
         ("evopolicy-gateway", gateway),

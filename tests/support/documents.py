@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +34,12 @@ def commands() -> Iterator[tuple[str, Any]]:
     """Every command of ours that does something, by its whole name."""
     for name, app in APPS.items():
         yield from _below(name, typer.main.get_command(app))
-    for name, app in _of_other_rooms().items():
-        yield from _below(f"evopolicy {name}", typer.main.get_command(app))
 
 
 def parse(words: list[str]) -> None:
     """Fails when the command does not take these words."""
-    other = _of_other_rooms().get(words[1]) if words[0] == "evopolicy" else None
-    command: Any = typer.main.get_command(other or APPS[words[0]])
-    arguments = words[1:] if other is None else words[2:]
+    command: Any = typer.main.get_command(APPS[words[0]])
+    arguments = words[1:]
     name: str | None = words[0]
     while name is not None:
         context = command.make_context(name, list(arguments))
@@ -51,10 +47,6 @@ def parse(words: list[str]) -> None:
         name = None
         if rest:
             name, command, arguments = command.resolve_command(context, rest)
-
-
-def _of_other_rooms() -> dict[str, typer.Typer]:
-    return {point.name: point.load() for point in entry_points(group=gateway_cli.COMMANDS_GROUP)}
 
 
 def _below(name: str, command: Any) -> Iterator[tuple[str, Any]]:

@@ -159,6 +159,7 @@ OWN_STDOUT = {
     "evopolicy_worker/slots/recording.py": "speaks with the process that started it",
     "evopolicy_worker/sandbox/inside": "inside the sandbox, with the standard library alone",
     "evopolicy_common/terminal.py": "is the one place",
+    "evopolicy_common/console.py": "is the one place for tables and live views",
 }
 
 

@@ -19,13 +19,14 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
+from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError, MachineError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
 from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.terminal import say, say_json, table, terminal
+from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_worker import environments
 from evopolicy_worker.fingerprint import fingerprint

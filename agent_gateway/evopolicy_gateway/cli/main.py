@@ -1,49 +1,123 @@
-"""`evopolicy`: the front door. Plays runs, and whole local clusters with them; other rooms add subcommands.
+"""`evopolicy`: the front door. A table of all commands; the module of one is imported when it is called.
 
-Exit codes: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without an ok submit, 4 an agent
-failed, 5 a run was cancelled, 130 Ctrl-C.
+So the help and a completed line cost little more than typer itself. `tests/unit/test_start.py` holds what may be imported
+here, and holds the table against the commands' own help.
 """
 
 from __future__ import annotations
 
-import asyncio
-import os
-import sys
-from collections.abc import Coroutine
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
-from typing import Annotated, Any, TypeVar
+import importlib
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
-import msgspec
 import typer
 
-from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors
-from evopolicy_common.commands import App, Version, run_app
-from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import Split
-from evopolicy_common.processes.preflight import EXTRAS, missing
-from evopolicy_common.records.run_difference import differences, left_out, shortened
-from evopolicy_common.terminal import say_json, say_lines, terminal
-from evopolicy_gateway import shipped
-from evopolicy_gateway.cli import options
-from evopolicy_gateway.cli.option_groups import spread
-from evopolicy_gateway.cli.run_options import DoorOptions, JailOptions, RunOptions
-from evopolicy_gateway.cli.suite import suite as play_suite
-from evopolicy_gateway.http import door
-from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator import trials
-from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
-from evopolicy_gateway.operator.runs import report as report_runs
+from evopolicy_common.commands import App, Group, Version, run_app
 from evopolicy_gateway.run import processes
-from evopolicy_gateway.run.layout import folder_of
-from evopolicy_gateway.run.plan import Plan
 
-T = TypeVar("T")
 
-COMMANDS_GROUP = "evopolicy.commands"
+class Place(NamedTuple):
+    """Where a command is, and what it does."""
 
-app = App(no_args_is_help=True, add_completion=True)
+    app: str
+    """`module:name` of a `typer.Typer`, which holds the command or is it."""
+    help: str
+    """What it does, in the words of its own help."""
+
+
+_PLAY = "evopolicy_gateway.cli.play:app"
+_COORDINATOR = "evopolicy_coordinator.cli"
+
+PLACES = {
+    "run": Place(
+        _PLAY,
+        "Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json.",
+    ),
+    "local": Place(
+        _PLAY,
+        "Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again.",
+    ),
+    "try": Place(
+        _PLAY,
+        "Plays a policy on train cases, without a run, an agent or a budget: a first look at what it does.",
+    ),
+    "random": Place(
+        _PLAY, "Plays uniform random actions on a split: the reference that scores are held against."
+    ),
+    "diff": Place(
+        _PLAY,
+        "Says where two runs differ, leaving out times, logs and what else may differ between equal runs.",
+    ),
+    "finish": Place(
+        _PLAY,
+        "Says that a remote agent is done: its run takes no more submits, is scored, and its `evopolicy run` ends.",
+    ),
+    "suite": Place("evopolicy_gateway.cli.suite:app", "Plays a sweep: agents × environments × repeats."),
+    "status": Place(f"{_COORDINATOR}.status:status_app", "What a cluster is doing."),
+    "workers": Place(f"{_COORDINATOR}.status:workers_app", "Take workers out of service and back."),
+    "runs": Place(f"{_COORDINATOR}.status:runs_app", "An operator's word on runs."),
+    "report": Place(
+        f"{_COORDINATOR}.report:app", "Turn run directories into a leaderboard, figures and diagnostics."
+    ),
+    "verify": Place(
+        f"{_COORDINATOR}.verify:app",
+        "Play a run's recorded actions again and compare rewards, observations and returns bit for bit.",
+    ),
+    "data": Place(
+        f"{_COORDINATOR}.data:app",
+        "Make and check the split files of environments (hidden cases: keep them from agents).",
+    ),
+    "disk": Place(
+        f"{_COORDINATOR}.upkeep:disk_app",
+        "What the stored runs take by environment, and whether a planned sweep fits; its run directories come on top.",
+    ),
+    "gc": Place(
+        f"{_COORDINATOR}.upkeep:gc_app",
+        "Removes the episodes and bundles of runs that finished long ago, and blobs that nothing names.",
+    ),
+}
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands by name, each imported when it is asked for."""
+
+    def __getitem__(self, name: str) -> Any:
+        module, _, app = PLACES[name].app.partition(":")
+        command: Any = typer.main.get_command(getattr(importlib.import_module(module), app))
+        command = getattr(command, "commands", {}).get(name, command)
+        command.name = name
+        return command
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(PLACES)
+
+    def __len__(self) -> int:
+        return len(PLACES)
+
+
+class _FrontDoor(Group):
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.commands = _Commands()  # type: ignore[assignment]  # nobody adds to it
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(PLACES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        try:
+            return super().get_command(ctx, cmd_name)
+        except ModuleNotFoundError:
+            if (
+                ctx.resilient_parsing
+            ):  # a line is completed: a command whose extra is missing completes nothing
+                return None
+            raise
+
+    def command_rows(self, ctx: Any) -> list[tuple[str, str]]:
+        return [(name, place.help) for name, place in PLACES.items()]
+
+
+app = App(cls=_FrontDoor, no_args_is_help=True, add_completion=True)
 
 
 @app.callback()
@@ -55,308 +129,7 @@ def evopolicy(_: Version = False) -> None:
     """
 
 
-@app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
-@spread
-def run(
-    *,
-    env: Annotated[
-        str,
-        typer.Option(help="Suite id, such as gym/acrobot.", show_default=False, rich_help_panel=options.RUN),
-    ],
-    connect: Connect = None,
-    credentials_file: CredentialsFile = None,
-    local: Annotated[
-        bool,
-        typer.Option(
-            "--local",
-            help="Bring up a coordinator and a worker here, as `evopolicy local` does.",
-            rich_help_panel=options.CLUSTER,
-        ),
-    ] = False,
-    given: RunOptions,
-    jail: JailOptions,
-    served: DoorOptions,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    hidden_isolation: options.Isolation = None,
-    as_json: options.Json = False,
-) -> None:
-    """Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json."""
-    with fail_on_our_errors():
-        if local and (connect or credentials_file):
-            raise ConfigError(
-                "--local brings up a cluster of its own; it does not go with --connect or --credentials"
-            )
-        if (data is not None or state is not None or fresh) and not local:
-            raise ConfigError(
-                "--data, --state and --fresh go with --local; elsewhere cases are the coordinator's: evopolicy-coordinator"
-                " --data, --state"
-            )
-        options.check_isolation(hidden_isolation, local=local)
-        held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
-        plans = _plans(given, [options.one_environment(env)], held, served)
-        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
-        if local:
-            where = Cluster(
-                local_slots=slots,
-                state=options.state_of(state, fresh=fresh),
-                unjailed=_unjailed(plans),
-                data=data,
-                hidden_isolation=hidden_isolation,
-            )
-        _play(plans, where, 1, as_json)
-
-
-@app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
-@spread
-def local(
-    env: Annotated[
-        list[str],
-        typer.Option(
-            help="Suite (core16), suite id or glob (gymnasium/MiniGrid-*); may be repeated.",
-            show_default=False,
-            rich_help_panel=options.RUN,
-        ),
-    ],
-    given: RunOptions,
-    jail: JailOptions,
-    parallel: Annotated[
-        int, typer.Option(min=1, max=64, help="Runs at once.", rich_help_panel=options.RUN)
-    ] = 1,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    audit: options.Audit = 0.0,
-    hidden_isolation: options.Isolation = None,
-    as_json: options.Json = False,
-) -> None:
-    """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
-    with fail_on_our_errors():
-        plans = _plans(given, catalogue.resolve(env), jail.settings())
-        where = Cluster(
-            local_slots=slots,
-            state=options.state_of(state, fresh=fresh),
-            unjailed=_unjailed(plans),
-            data=data,
-            audit=audit,
-            hidden_isolation=hidden_isolation,
-        )
-        _play(plans, where, parallel, as_json)
-
-
-@app.command(
-    "try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3"
-)
-def try_policy(
-    policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
-    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
-    cases: Annotated[
-        str,
-        typer.Option(
-            help="Train ids and ranges. The same ids are the same cases in each call, unless with --fresh."
-        ),
-    ] = "0-3",
-    out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
-        "tries"
-    ),
-    connect: Connect = None,
-    credentials_file: CredentialsFile = None,
-    tier: options.TierName = "bwrap",
-    limit: options.Limits = None,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    as_json: options.Json = False,
-) -> None:
-    """Plays a policy on train cases, without a run, an agent or a budget: a first look at what it does.
-
-    Brings up a local cluster unless --connect or --credentials name one. Exit code 1 when the policy failed.
-    """
-    with fail_on_our_errors():
-        trial = trials.Trial(
-            env=options.one_environment(env),
-            policy=shipped.found(policy_dir, Path.cwd()),
-            split="train",
-            cases=options.cases_of(cases),
-            out=out,
-            tier=tier,
-            limits=options.limits_of(limit or ()),
-        )
-        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
-        where = msgspec.structs.replace(where, unjailed=tier == "none")
-        _exit(_run(trials.try_policy(trial, where, as_json=as_json)))
-
-
-@app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
-def play_random(
-    env: Annotated[
-        list[str], typer.Option(help="Suite, suite id or glob; may be repeated.", show_default=False)
-    ],
-    split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
-    cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
-    connect: Connect = None,
-    credentials_file: CredentialsFile = None,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    as_json: options.Json = False,
-) -> None:
-    """Plays uniform random actions on a split: the reference that scores are held against."""
-    with fail_on_our_errors():
-        chosen = None if cases is None else options.cases_of(cases)
-        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
-        _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
-
-
-def _tell_left_out(wanted: bool) -> None:
-    if wanted:
-        say_lines(left_out())
-        raise typer.Exit
-
-
-@app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
-def diff_runs(
-    left: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="A run directory.")],
-    right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
-    _: Annotated[
-        bool,
-        typer.Option(
-            "--left-out", is_eager=True, callback=_tell_left_out, help="Print what is left out, and why."
-        ),
-    ] = False,
-) -> None:
-    """Says where two runs differ, leaving out times, logs and what else may differ between equal runs.
-
-    Exit code 0 when they are equal, 1 when they are not.
-    """
-    found = differences(left, right)
-    if as_json:
-        say_json(found, indent=False)
-    else:
-        say_lines(shortened(found, left, right) or ["no difference (times and logs aside)"])
-    raise typer.Exit(1 if found else 0)
-
-
-@app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")
-def finish(
-    run_directory: Annotated[
-        Path, typer.Argument(help="Folder of an open run with --agent remote.", show_default=False)
-    ],
-) -> None:
-    """Says that a remote agent is done: its run takes no more submits, is scored, and its `evopolicy run` ends."""
-    with fail_on_our_errors():
-        door.finish(folder_of(run_directory))
-
-
-app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")(play_suite)
-
-
-def _plans(
-    given: RunOptions, env_ids: list[str], jail: JailSettings, served: DoorOptions | None = None
-) -> list[Plan]:
-    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
-    if given.resume and (given.overwrite or given.exp_id is None):
-        raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
-    started_in = Path.cwd()
-    exp_id = given.exp_id or options.default_exp_id()
-    served = served or DoorOptions()
-    where, agent_host = served.door(), served.host_of(given.agent)
-    plans = [
-        Plan(
-            settings=given.settings(env_id, exp_id, agent_host),
-            agent=given.agent,
-            runs=given.runs,
-            started_in=started_in,
-            wall_limit_s=given.agent_wall_s,
-            silence_s=given.agent_silence_s,
-            overwrite=given.overwrite,
-            resume=given.resume,
-            jail=jail,
-            door=where,
-        )
-        for env_id in env_ids
-    ]
-    for plan in plans:
-        plan.check()
-    return plans
-
-
-def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
-    console = terminal(stderr=as_json)
-    results = _run(play_all(plans, where, parallel, console))
-    if as_json:
-        say_json(results)
-    else:
-        report_runs(results, plans[0].runs, console)
-    _exit(exit_code(ends_of(results)))
-
-
-def _trial_cluster(
-    connect: list[str] | None, file: Path | None, slots: int, state: Path | None, data: Path | None
-) -> Cluster:
-    if connect or file:
-        return Cluster(connect=tuple(connect or ()), file=file)
-    return Cluster(local_slots=slots, state=state, data=data)
-
-
-def _unjailed(plans: list[Plan]) -> bool:
-    """Whether an agent, or a policy that nothing locks in, could read what this user can."""
-    return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
-
-
-def _run(work: Coroutine[Any, Any, T]) -> T:
-    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
-    try:
-        return asyncio.run(work)
-    except asyncio.CancelledError:
-        raise KeyboardInterrupt from None
-
-
-def _exit(code: int) -> None:
-    if code:
-        raise typer.Exit(code)
-
-
-def _add_commands_of_other_rooms(arguments: list[str]) -> None:
-    """Loads a subcommand when it is named, and all of them for the help: what they import may be large, or missing."""
-    if (
-        "_EVOPOLICY_COMPLETE" in os.environ
-    ):  # a shell asks how a line may go on; each passes the line in its own way
-        line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
-        arguments = line.split()[1:]
-    found: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=COMMANDS_GROUP)}
-    named = arguments[0] if arguments else ""
-    if named in {
-        command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
-    }:
-        return
-    for point in [found[named]] if named in found else found.values():
-        try:
-            _mount(point.load(), point.name)
-        except ModuleNotFoundError as error:
-            module = error.name or ""
-            if named == point.name:
-                fail(missing(EXTRAS.get(module.partition(".")[0], "coordinator"), module))
-
-
-def _mount(other: typer.Typer, name: str) -> None:
-    """Adds another room's commands under `name`; an app of one command is that command, not a group of one."""
-    if len(other.registered_commands) == 1 and not other.registered_groups and not other.registered_callback:
-        (command,) = other.registered_commands
-        command.name = name
-        app.registered_commands.append(command)
-    else:
-        app.add_typer(other, name=name)
-
-
 def main() -> None:
     """The console script."""
     processes.become_subreaper()
-    _add_commands_of_other_rooms(sys.argv[1:])
     run_app(app)

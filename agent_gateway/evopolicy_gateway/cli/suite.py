@@ -15,11 +15,12 @@ import msgspec
 import typer
 
 from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail, fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_common.terminal import Terminal, terminal
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code, next_step
@@ -29,6 +30,8 @@ from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
 from evopolicy_gateway.suite.sweep import Sweep, look
+
+app = App()
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,6 +46,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     as_json: bool
 
 
+@app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")
 def suite(
     file: Annotated[
         str,

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import msgspec
 
 from evopolicy_common.cli import end_on_sigterm
+from evopolicy_common.console import Terminal, table
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.processes.local_cluster import local_cluster, unless_failed
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.terminal import Terminal, say, say_lines, table
+from evopolicy_common.terminal import say, say_lines
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials

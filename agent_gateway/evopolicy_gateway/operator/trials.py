@@ -12,6 +12,7 @@ from statistics import pstdev
 import msgspec
 from rich.progress import Progress
 
+from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
@@ -21,7 +22,7 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records import bundles
 from evopolicy_common.records.checkpoints import bundle_of
-from evopolicy_common.terminal import Terminal, one_line, say_json, table, terminal
+from evopolicy_common.terminal import one_line, say_json
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.runs import Cluster, connected
 from evopolicy_gateway.submits.episode_files import trajectory_files

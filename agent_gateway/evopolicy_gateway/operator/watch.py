@@ -16,8 +16,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import RunProgress
-from evopolicy_common.terminal import Terminal, harmless
+from evopolicy_common.terminal import harmless
 from evopolicy_gateway.operator.control import AgentDoing, Progress
 
 PHASES = {

@@ -13,8 +13,9 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
-from evopolicy_common.terminal import Terminal, say_json, table
+from evopolicy_common.terminal import say_json
 from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.operator.control import AgentDoing
 from evopolicy_gateway.operator.watch import PHASES, Row, View

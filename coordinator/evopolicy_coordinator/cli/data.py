@@ -16,9 +16,10 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.commands import App
+from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.terminal import say, say_json, table, terminal
+from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import splits
 
 app = App(

@@ -17,9 +17,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from evopolicy_common.cli import code_of
 from evopolicy_common.commands import App
+from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
-from evopolicy_common.terminal import say, say_json, say_lines, terminal
+from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_coordinator.analysis.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, read_score_csv

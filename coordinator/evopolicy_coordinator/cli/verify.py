@@ -19,10 +19,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
 from evopolicy_common.commands import App
+from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster, unless_failed
-from evopolicy_common.terminal import Terminal, one_line, say_json, terminal
+from evopolicy_common.terminal import one_line, say_json
 from evopolicy_common.wire import credentials, transport
 from evopolicy_coordinator.verify.run import Report, Verifier
 from evopolicy_coordinator.verify.source import read_run, sample

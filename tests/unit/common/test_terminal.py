@@ -12,7 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli import fail, setup_logging
-from evopolicy_common.terminal import Terminal, harmless, one_line, say, say_json, say_lines, table
+from evopolicy_common.console import Terminal, table
+from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
 
 STEERING = [
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen

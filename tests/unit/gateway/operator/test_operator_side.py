@@ -14,13 +14,13 @@ from finished_run import SETTINGS, finished
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.operator import PUBLISHED, RunProgress, off_profile
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
-from evopolicy_common.terminal import Terminal
-from evopolicy_gateway.cli.main import _unjailed
 from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
+from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import control

@@ -7,9 +7,10 @@ import io
 import msgspec
 import pytest
 
+from evopolicy_common.console import Terminal
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
-from evopolicy_common.terminal import Terminal, harmless
+from evopolicy_common.terminal import harmless
 from evopolicy_gateway.operator.control import AgentDoing, Progress
 from evopolicy_gateway.operator.watch import RunView, first_line
 from evopolicy_gateway.suite.suite_view import SuiteView

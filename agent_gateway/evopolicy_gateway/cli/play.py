@@ -1,0 +1,300 @@
+"""`evopolicy run`, `local`, `try`, `random`, `diff` and `finish`: runs, single episodes, and what they came to."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+import typer
+
+from evopolicy_common import catalogue
+from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.console import terminal
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.run_difference import differences, left_out, shortened
+from evopolicy_common.terminal import say_json, say_lines
+from evopolicy_gateway import shipped
+from evopolicy_gateway.cli import options
+from evopolicy_gateway.cli.option_groups import spread
+from evopolicy_gateway.cli.run_options import DoorOptions, JailOptions, RunOptions
+from evopolicy_gateway.http import door
+from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.operator import trials
+from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
+from evopolicy_gateway.operator.runs import report as report_runs
+from evopolicy_gateway.run.layout import folder_of
+from evopolicy_gateway.run.plan import Plan
+
+T = TypeVar("T")
+
+app = App()
+
+
+@app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
+@spread
+def run(
+    *,
+    env: Annotated[
+        str,
+        typer.Option(help="Suite id, such as gym/acrobot.", show_default=False, rich_help_panel=options.RUN),
+    ],
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
+    local: Annotated[
+        bool,
+        typer.Option(
+            "--local",
+            help="Bring up a coordinator and a worker here, as `evopolicy local` does.",
+            rich_help_panel=options.CLUSTER,
+        ),
+    ] = False,
+    given: RunOptions,
+    jail: JailOptions,
+    served: DoorOptions,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    fresh: options.Fresh = False,
+    data: options.DataFolder = None,
+    hidden_isolation: options.Isolation = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json."""
+    with fail_on_our_errors():
+        if local and (connect or credentials_file):
+            raise ConfigError(
+                "--local brings up a cluster of its own; it does not go with --connect or --credentials"
+            )
+        if (data is not None or state is not None or fresh) and not local:
+            raise ConfigError(
+                "--data, --state and --fresh go with --local; elsewhere cases are the coordinator's: evopolicy-coordinator"
+                " --data, --state"
+            )
+        options.check_isolation(hidden_isolation, local=local)
+        held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
+        plans = _plans(given, [options.one_environment(env)], held, served)
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        if local:
+            where = Cluster(
+                local_slots=slots,
+                state=options.state_of(state, fresh=fresh),
+                unjailed=_unjailed(plans),
+                data=data,
+                hidden_isolation=hidden_isolation,
+            )
+        _play(plans, where, 1, as_json)
+
+
+@app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
+@spread
+def local(
+    env: Annotated[
+        list[str],
+        typer.Option(
+            help="Suite (core16), suite id or glob (gymnasium/MiniGrid-*); may be repeated.",
+            show_default=False,
+            rich_help_panel=options.RUN,
+        ),
+    ],
+    given: RunOptions,
+    jail: JailOptions,
+    parallel: Annotated[
+        int, typer.Option(min=1, max=64, help="Runs at once.", rich_help_panel=options.RUN)
+    ] = 1,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    fresh: options.Fresh = False,
+    data: options.DataFolder = None,
+    audit: options.Audit = 0.0,
+    hidden_isolation: options.Isolation = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
+    with fail_on_our_errors():
+        plans = _plans(given, catalogue.resolve(env), jail.settings())
+        where = Cluster(
+            local_slots=slots,
+            state=options.state_of(state, fresh=fresh),
+            unjailed=_unjailed(plans),
+            data=data,
+            audit=audit,
+            hidden_isolation=hidden_isolation,
+        )
+        _play(plans, where, parallel, as_json)
+
+
+@app.command(
+    "try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3"
+)
+def try_policy(
+    policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
+    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
+    cases: Annotated[
+        str,
+        typer.Option(
+            help="Train ids and ranges. The same ids are the same cases in each call, unless with --fresh."
+        ),
+    ] = "0-3",
+    out: Annotated[Path, typer.Option(help="Where trajectories go, in a new folder each time.")] = Path(
+        "tries"
+    ),
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
+    tier: options.TierName = "bwrap",
+    limit: options.Limits = None,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    fresh: options.Fresh = False,
+    data: options.DataFolder = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays a policy on train cases, without a run, an agent or a budget: a first look at what it does.
+
+    Brings up a local cluster unless --connect or --credentials name one. Exit code 1 when the policy failed.
+    """
+    with fail_on_our_errors():
+        trial = trials.Trial(
+            env=options.one_environment(env),
+            policy=shipped.found(policy_dir, Path.cwd()),
+            split="train",
+            cases=options.cases_of(cases),
+            out=out,
+            tier=tier,
+            limits=options.limits_of(limit or ()),
+        )
+        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
+        where = msgspec.structs.replace(where, unjailed=tier == "none")
+        _exit(_run(trials.try_policy(trial, where, as_json=as_json)))
+
+
+@app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
+def play_random(
+    env: Annotated[
+        list[str], typer.Option(help="Suite, suite id or glob; may be repeated.", show_default=False)
+    ],
+    split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
+    cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
+    slots: options.Slots = 2,
+    state: options.StateFolder = None,
+    fresh: options.Fresh = False,
+    data: options.DataFolder = None,
+    as_json: options.Json = False,
+) -> None:
+    """Plays uniform random actions on a split: the reference that scores are held against."""
+    with fail_on_our_errors():
+        chosen = None if cases is None else options.cases_of(cases)
+        where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
+        _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+
+
+def _tell_left_out(wanted: bool) -> None:
+    if wanted:
+        say_lines(left_out())
+        raise typer.Exit
+
+
+@app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
+def diff_runs(
+    left: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="A run directory.")],
+    right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--left-out", is_eager=True, callback=_tell_left_out, help="Print what is left out, and why."
+        ),
+    ] = False,
+) -> None:
+    """Says where two runs differ, leaving out times, logs and what else may differ between equal runs.
+
+    Exit code 0 when they are equal, 1 when they are not.
+    """
+    found = differences(left, right)
+    if as_json:
+        say_json(found, indent=False)
+    else:
+        say_lines(shortened(found, left, right) or ["no difference (times and logs aside)"])
+    raise typer.Exit(1 if found else 0)
+
+
+@app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")
+def finish(
+    run_directory: Annotated[
+        Path, typer.Argument(help="Folder of an open run with --agent remote.", show_default=False)
+    ],
+) -> None:
+    """Says that a remote agent is done: its run takes no more submits, is scored, and its `evopolicy run` ends."""
+    with fail_on_our_errors():
+        door.finish(folder_of(run_directory))
+
+
+def _plans(
+    given: RunOptions, env_ids: list[str], jail: JailSettings, served: DoorOptions | None = None
+) -> list[Plan]:
+    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
+    if given.resume and (given.overwrite or given.exp_id is None):
+        raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
+    started_in = Path.cwd()
+    exp_id = given.exp_id or options.default_exp_id()
+    served = served or DoorOptions()
+    where, agent_host = served.door(), served.host_of(given.agent)
+    plans = [
+        Plan(
+            settings=given.settings(env_id, exp_id, agent_host),
+            agent=given.agent,
+            runs=given.runs,
+            started_in=started_in,
+            wall_limit_s=given.agent_wall_s,
+            silence_s=given.agent_silence_s,
+            overwrite=given.overwrite,
+            resume=given.resume,
+            jail=jail,
+            door=where,
+        )
+        for env_id in env_ids
+    ]
+    for plan in plans:
+        plan.check()
+    return plans
+
+
+def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
+    console = terminal(stderr=as_json)
+    results = _run(play_all(plans, where, parallel, console))
+    if as_json:
+        say_json(results)
+    else:
+        report_runs(results, plans[0].runs, console)
+    _exit(exit_code(ends_of(results)))
+
+
+def _trial_cluster(
+    connect: list[str] | None, file: Path | None, slots: int, state: Path | None, data: Path | None
+) -> Cluster:
+    if connect or file:
+        return Cluster(connect=tuple(connect or ()), file=file)
+    return Cluster(local_slots=slots, state=state, data=data)
+
+
+def _unjailed(plans: list[Plan]) -> bool:
+    """Whether an agent, or a policy that nothing locks in, could read what this user can."""
+    return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
+
+
+def _run(work: Coroutine[Any, Any, T]) -> T:
+    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
+    try:
+        return asyncio.run(work)
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
+
+
+def _exit(code: int) -> None:
+    if code:
+        raise typer.Exit(code)

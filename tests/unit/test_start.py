@@ -1,0 +1,72 @@
+"""What starting a command imports: help and completion do without whatever a command needs for its work."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from evopolicy_gateway.cli.main import PLACES, app
+
+LARGE = {
+    *(
+        "asyncio",
+        "cryptography",
+        "jinja2",
+        "matplotlib",
+        "numpy",
+        "orjson",
+        "rich",
+        "ssl",
+        "starlette",
+        "structlog",
+    ),
+    *("tomllib", "uvicorn", "zenoh", "zstandard"),
+    *(
+        "evopolicy_coordinator",
+        "evopolicy_worker",
+        "evopolicy_gateway.cli.play",
+        "evopolicy_gateway.operator",
+    ),
+}
+"""What takes longer to import than typer, or leads to it."""
+LISTED = "import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); "
+FRONT = LISTED + "sys.argv[0] = 'evopolicy'; from evopolicy_gateway.cli.main import main; main()"
+
+
+def imported(program: str, *words: str, **environment: str) -> set[str]:
+    """Names of all modules that are there when the program ends."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | environment,
+        timeout=120,
+    )
+    assert done.stdout
+    return set(done.stderr.split())
+
+
+def test_the_help_imports_nothing_large() -> None:
+    found = imported(FRONT, "--help")
+    assert "typer" in found  # the list is one of modules
+    assert not found & LARGE
+
+
+def test_the_version_and_a_completed_name_import_nothing_large_either() -> None:
+    assert not imported(FRONT, "--version") & LARGE
+    asked = {"_EVOPOLICY_COMPLETE": "complete_bash", "COMP_WORDS": "evopolicy --ver", "COMP_CWORD": "1"}
+    # typer itself asks bash for its version with asyncio.
+    assert not imported(FRONT, **asked) & LARGE - {"asyncio", "ssl"}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_the_front_door_says_of_a_command_what_its_own_help_says(name: str) -> None:
+    front = typer.main.get_command(app)
+    command = front.commands[name]  # type: ignore[attr-defined]
+    assert command.name == name
+    assert PLACES[name].help == command.get_short_help_str(1000)
