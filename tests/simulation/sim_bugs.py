@@ -160,7 +160,7 @@ BUGS = (
         'state.out_of_service.get(worker.name, "active")',
         '"active"',
     ),
-    Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.key[2]", ""),
+    Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.classes[env]", ""),
     Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", ""),
     Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass"),
     Bug("leave a lost worker's leases with it", expiry, "lose", "list(worker.leases.values())", "[]"),

@@ -270,7 +270,7 @@ class Checkers:
         want(job.env in able.envs, "a worker gets what it can play", worker, job.env)
         run = group.split("/")[0]
         pin = disk.states[run].fingerprint_class
-        mine = None if core is None else core.state.workers[worker].profile.fingerprint_class
+        mine = None if core is None else core.state.workers[worker].profile.classes[job.env]
         want(
             mine in (None, pin),
             "a run's episodes are played by its fingerprint class",

@@ -57,10 +57,9 @@ BUNDLE = "a" * 64
 T = TypeVar("T")
 
 
-def describe(env: str = ENV) -> EnvironmentDescription:
-    return EnvironmentDescription(
-        env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=10, task_text=""
-    )
+def describe(env: str = ENV, **more: Any) -> EnvironmentDescription:
+    told = {"env_version": "1", "max_episode_steps": 10, "task_text": ""} | more
+    return EnvironmentDescription(env=env, obs_space={}, action_space={}, **told)
 
 
 def fingerprint(version: str = "1", packages: dict[str, str] | None = None) -> wire.Fingerprint:
@@ -243,7 +242,7 @@ class Rig:
                 session=session,
                 slots=slots,
                 tiers=more.get("tiers", ("bwrap",)),
-                environments=tuple(describe(env) for env in envs),
+                environments=more.get("described", tuple(describe(env) for env in envs)),
                 fingerprint=fingerprint(version, more.get("packages")),
                 boot_id=more.get("boot_id", f"kernel-of-{worker}"),
                 machine_id=more.get("machine_id", ""),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 import evopolicy_common
 import evopolicy_worker
 from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_worker.environments.adapters import versions
 
 PACKAGES = (
     "numpy",
@@ -24,21 +24,15 @@ PACKAGES = (
     "pygame-ce",
     "pandas",
 )
-"""Distributions that Core16's environments are made of: another version may play another episode."""
+"""Distributions that Core16's environments are made of; those that decide an environment's numbers its description names."""
 
 
 def fingerprint() -> Fingerprint:
     """This worker's fingerprint; a package that is not installed is left out."""
-    packages: dict[str, str] = {}
-    for name in PACKAGES:
-        try:
-            packages[name.lower()] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return Fingerprint(
         code_version=f"{evopolicy_common.__version__}+{_source_digest()[:12]}",
         python=platform.python_version(),
-        packages=packages,
+        packages=versions(PACKAGES),
         cpu=f"{platform.machine()} {_simd_features()}",
     )
 

@@ -5,6 +5,7 @@ In all messages unknown fields are skipped, and every field added later has a de
 
 from __future__ import annotations
 
+import hashlib
 from typing import Literal
 
 import msgspec
@@ -53,3 +54,32 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """False when even a fresh environment does not repeat an episode from its seed and actions."""
     renders: bool = False
     """True when a recorded episode can have a video."""
+    title: Word = ""
+    """Short name for tables; empty: the id."""
+    family: Word = ""
+    """Key of the family its scores are averaged in; empty: as the catalogue has it."""
+    adapter: Word = ""
+    """What plays it: the revision of its adapter, `+`, and a digest of the adapter's code. Empty from workers of older versions,
+    whose fingerprint is that of the whole worker."""
+    packages: Named[Text] = {}
+    """Name to exact version of the distributions that decide this environment's numbers."""
+
+    def digest(self) -> str:
+        """SHA-256 of the definition, 64 hex digits: of all that is told here but what plays it, in which versions.
+
+        A field at its default does not count, so that fields that are added later change no digest.
+        """
+        told = {
+            field.name: value
+            for field in msgspec.structs.fields(self)
+            if field.name not in _NOT_DEFINED and (value := getattr(self, field.name)) != _default(field)
+        }
+        return hashlib.sha256(msgspec.json.encode(told, order="deterministic")).hexdigest()
+
+
+def _default(field: msgspec.structs.FieldInfo) -> object:
+    factory = field.default_factory
+    return field.default if factory is msgspec.NODEFAULT else factory()
+
+
+_NOT_DEFINED = frozenset({"env_version", "adapter", "packages"})

@@ -312,7 +312,7 @@ class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
     token: Word
     run: Word
     fingerprint_class: Word
-    """As `WorkerStatus.fingerprint` shows it."""
+    """As `WorkerStatus.classes` shows it for the run's environment, or `WorkerStatus.fingerprint`."""
     reason: Text
 
 
@@ -378,7 +378,7 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     tiers: Many[Tier]
     environments: Many[Text]
     fingerprint: Text
-    """Short class of the worker's fingerprint: equal for workers that may share a run."""
+    """Short class of the whole worker's fingerprint: workers of which it is equal may share any run."""
     versions: Named[Text]
     """What the class is made of: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
     held: Int
@@ -390,6 +390,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     boot_id: Word = ""
     hidden_bar: Text = ""
     """Why it plays no hidden episodes now; empty when it may."""
+    classes: Named[Word] = {}
+    """Environment to its fingerprint class here: only workers of one class share a run of it."""
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):

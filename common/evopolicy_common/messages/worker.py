@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Text, Word
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.wire.refusals import Refusal
+
+DEFINITION_DIGITS = 16
+"""Of a definition's digest, as fingerprints and people name it."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
@@ -24,7 +29,7 @@ class Refused(Message, frozen=True, kw_only=True, tag="refused"):
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker's numbers depend on, beside the seed."""
+    """What a worker's numbers depend on, beside the seed; of the whole worker, or of one environment (`of`)."""
 
     code_version: Word
     """Version and source digest of the worker's own code."""
@@ -33,11 +38,41 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
     """Name to exact version of the packages that environments are made of."""
     cpu: Text
     """CPU model and the features that numerical libraries choose their code by."""
+    adapter: Word = ""
+    """`EnvironmentDescription.adapter`; empty: of the whole worker."""
+    definition: Word = ""
+    """The first digits of `EnvironmentDescription.digest()`."""
+
+    def of(self, description: EnvironmentDescription) -> Fingerprint:
+        """What the numbers of one environment depend on; the whole where the worker does not tell them apart."""
+        if not description.adapter:
+            return self
+        return replace(
+            self,
+            packages=description.packages,
+            adapter=description.adapter,
+            definition=description.digest()[:DEFINITION_DIGITS],
+        )
+
+    def class_name(self, *, cpu: bool) -> str:
+        """12 hex digits, equal for workers whose results may stand in one run; `cpu`: the CPU's features count too.
+
+        Another file of the worker's code makes another class only where it is one of the adapter's.
+        """
+        code = [self.adapter, self.definition] if self.adapter else [self.code_version]
+        parts = [*code, self.python, sorted(self.packages.items())]
+        if cpu:
+            parts.append(self.cpu)
+        return hashlib.sha256(msgspec.json.encode(parts)).hexdigest()[:12]
+
+    def versions(self) -> dict[str, str]:
+        """What the class is made of, by name."""
+        code = {"adapter": self.adapter, "definition": self.definition} if self.adapter else {}
+        return {"evopolicy-worker": self.code_version, **code, "python": self.python, **self.packages}
 
     def flat(self) -> dict[str, str]:
         """As `run.json` has it."""
-        own = {"python": self.python, "cpu": self.cpu, "evopolicy-worker": self.code_version}
-        return {**self.packages, **own}
+        return {**self.versions(), "cpu": self.cpu}
 
 
 class Register(Message, frozen=True, kw_only=True, tag="register"):

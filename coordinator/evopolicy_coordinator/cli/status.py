@@ -274,9 +274,17 @@ def _workers(reply: StatusReply) -> Table:
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:
-    """What the workers' classes stand for: only workers of one class share a run."""
+    """What the workers' classes stand for, and of which environments workers are of several: only one of them plays a run."""
     for name, versions in sorted({worker.fingerprint: worker.versions for worker in reply.workers}.items()):
         yield Text(f"class {name}: " + ", ".join(f"{what} {version}" for what, version in versions.items()))
+    played: dict[str, dict[str, list[str]]] = {}
+    for worker in reply.workers:
+        for env, name in worker.classes.items():
+            played.setdefault(env, {}).setdefault(name, []).append(worker.worker)
+    for env, classes in sorted(played.items()):
+        if len(classes) > 1:
+            told = "; ".join(f"class {name} on {', '.join(there)}" for name, there in sorted(classes.items()))
+            yield Text(f"{env} has {len(classes)} classes: {told}")
 
 
 def _runs(reply: StatusReply) -> Table:

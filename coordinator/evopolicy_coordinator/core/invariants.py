@@ -219,7 +219,7 @@ def _workers(state: State) -> None:
         workers = [state.workers[name] for name in profile.workers]
         want(
             state,
-            profile.fingerprint_class,
+            str(sorted(profile.classes.items())),
             sum(w.slots for w in workers) == profile.slots,
             "slots are counted",
         )
@@ -228,7 +228,7 @@ def _workers(state: State) -> None:
         for names in profile.warm.values():
             want(
                 state,
-                profile.fingerprint_class,
+                str(sorted(profile.classes.items())),
                 names.keys() <= profile.parked.keys(),
                 "warm workers are parked",
             )

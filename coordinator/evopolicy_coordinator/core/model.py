@@ -12,6 +12,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeVar
 
+import msgspec
+
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import (
     BlobRef,
@@ -208,7 +210,7 @@ class JobGroup:
         """Whether a worker must not play it."""
         if worker.name in self.not_on or worker.machine in self.not_of:
             return True
-        return self.numerics not in (None, worker.numerics)
+        return self.numerics is not None and self.numerics != worker.numerics(self.flow.env)
 
     @property
     def n(self) -> int:
@@ -282,8 +284,8 @@ class Lease:
 LaneKey = tuple[str, Tier, str]
 """Environment, sandbox tier, fingerprint class."""
 
-ProfileKey = tuple[frozenset[str], frozenset[Tier], str]
-"""Environments, sandbox tiers, fingerprint class."""
+ProfileKey = tuple[frozenset[tuple[str, str]], frozenset[Tier]]
+"""Environments, each with its fingerprint class; sandbox tiers."""
 
 
 @dataclass(slots=True, eq=False)
@@ -389,11 +391,16 @@ class Lane:
 
 @dataclass(slots=True, eq=False)
 class Profile:
-    """Workers that can do the same: environments, tiers and fingerprint class."""
+    """Workers that can do the same: environments of the same fingerprint classes, and tiers."""
 
     key: ProfileKey
     fingerprint: Fingerprint
+    """Of the whole workers."""
     descriptions: dict[str, EnvironmentDescription]
+    fingerprints: dict[str, Fingerprint]
+    """Of each environment by itself."""
+    classes: dict[str, str]
+    """Environment to what runs of it are pinned to; see `Fingerprint.class_name`."""
     lanes: dict[LaneKey, Lane] = field(default_factory=dict)
     busy: dict[Lane, None] = field(default_factory=dict)
     """Its lanes in which something waits."""
@@ -410,15 +417,14 @@ class Profile:
     )
     """Live leases of its workers that may be preempted, by priority, oldest first."""
 
-    @property
-    def fingerprint_class(self) -> str:
-        """What runs are pinned to; see `Fingerprint`."""
-        return self.key[2]
+    def offers(self, flow: Flow) -> bool:
+        """Whether these workers have a flow's environment and sandbox tier."""
+        return flow.env in self.classes and flow.tier in self.key[1]
 
     def serves(self, key: LaneKey) -> bool:
         """Whether these workers may play what waits in a lane of that key."""
         env, tier, fingerprint_class = key
-        return env in self.key[0] and tier in self.key[1] and fingerprint_class == self.key[2]
+        return env in self.classes and tier in self.key[1] and fingerprint_class == self.classes[env]
 
 
 def _of(there: dict[Family | None, int], family: Family | None) -> bool:
@@ -551,8 +557,8 @@ class Worker:
     """Number of the session's first poll."""
     machine: str = ""
     """Whose credentials it joined with; empty for those that the state folder hands out."""
-    numerics: str = ""
-    """What its numbers depend on: equal for workers that come to the same bits, the processor's features included."""
+    cpu: str = ""
+    """Its processor's features."""
     state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; given-up ones too, until the worker no longer names them."""
@@ -572,6 +578,11 @@ class Worker:
     failures: int = 0
     """Jobs in a row that failed through its own fault."""
     benched_until: float = 0.0
+
+    def numerics(self, env: str) -> str:
+        """What its numbers of an environment depend on: equal for workers that come to the same bits, the processor's features
+        included."""
+        return msgspec.structs.replace(self.profile.fingerprints[env], cpu=self.cpu).class_name(cpu=True)
 
     def running(self) -> list[Lease]:
         """Leases it plays now: as it said, or the oldest, one a slot, as long as it has not said."""

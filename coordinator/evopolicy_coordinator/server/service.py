@@ -220,7 +220,9 @@ class Service:
                 each for each in core.state.workers.values() if message.env in each.profile.descriptions
             ]
             fingerprints = tuple(
-                {repr(each.profile.fingerprint): each.profile.fingerprint for each in offering}.values()
+                {
+                    repr(each): each for each in (one.profile.fingerprints[message.env] for one in offering)
+                }.values()
             )
             self._spawn(self._serve_description(query, message, fingerprints))
         elif self._intake.reads_files(message):

@@ -28,6 +28,7 @@ from evopolicy_common.messages.operator import (
 )
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.checkpoints import bundle_of
+from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.trajectory import Trajectory, decode
 from evopolicy_common.wire.operator_client import PATIENCE_S, OperatorClient
 from evopolicy_common.wire.transport import Link
@@ -188,9 +189,9 @@ class Verifier:
         known = self._run.record.versions.fingerprint
         found: dict[str, None] = {}
         for fingerprint in (await self._describe()).fingerprints if known else ():
-            here = fingerprint.flat()
-            for name in sorted(known.keys() | here.keys()):
-                ours, theirs = known.get(name, "none"), here.get(name, "none")
+            then, here = comparable([known, fingerprint.flat()])
+            for name in sorted(then.keys() | here.keys()):
+                ours, theirs = then.get(name, "none"), here.get(name, "none")
                 if ours != theirs:
                     found[f"{name}: {ours} in the run, {theirs} on the workers"] = None
         self.report.fingerprint_differences = list(found)

@@ -24,6 +24,7 @@ from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker.environments import settings, spaces
 from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.actions import compile_actions
+from evopolicy_worker.environments.adapters import adapter, versions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.info import plain_info
 from evopolicy_worker.environments.observations import compile_observation
@@ -41,8 +42,12 @@ class GymnasiumFamily:
 
     distributions: tuple[str, ...] = ("gymnasium",)
     """Distributions whose versions decide what is played, the one that registers the environments first."""
+    also: tuple[str, ...] = ()
+    """Further distributions that decide what is played; numpy and gymnasium always do."""
     modules: tuple[str, ...] = ("gymnasium",)
     """Packages to import; a family is offered where all of them are installed."""
+    revision: int = 1
+    """Counts up when the hooks of this class change what an environment plays: scores of several are not compared."""
     components: Mapping[str, Mapping[str, str]] = {}
     """Parts of the reward, by Gymnasium id: their names in `info` (or in its `rewards`), and what each stands for."""
 
@@ -86,6 +91,10 @@ class GymnasiumFamily:
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture of the current state, without changing it."""
         return env.render()
+
+    def packages(self, entry: Entry) -> dict[str, str]:
+        """Versions of the distributions that decide this environment's numbers."""
+        return versions(("numpy", "gymnasium", *self.distributions, *self.also))
 
     def version(self, entry: Entry) -> str:
         """What is played, with the versions that decide it: `Ant-v5 (gymnasium 1.4.0, mujoco 3.10.0)`."""
@@ -132,6 +141,8 @@ class GymnasiumEnvironment(Environment):
             deterministic=family.deterministic(entry)
             and not (self._env.spec is not None and self._env.spec.nondeterministic),
             renders="rgb_array" in self._env.metadata.get("render_modes", ()),
+            adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),
+            packages=family.packages(entry),
         )
 
     def reset(self, case: Case) -> Observation:

@@ -13,6 +13,7 @@ class HighwayFamily(GymnasiumFamily):
     """Traffic, and a car to be parked."""
 
     distributions = ("highway-env",)
+    also = ("pandas", "pygame-ce")
     modules = ("gymnasium", "highway_env")
     components = {
         "roundabout-v0": {

@@ -16,6 +16,7 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments.actions import compile_actions
+from evopolicy_worker.environments.adapters import adapter, versions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.tasks import task_text
 
@@ -48,6 +49,8 @@ class _Toy(Environment):
             reward_texts=reward_components,
             task_text=task_text(entry.id),
             renders=True,
+            adapter=adapter(type(self), 1, ""),
+            packages=versions(("numpy",)),
         )
         self.action_codec = compile_actions(action_space)
         self._limit = entry.max_episode_steps

@@ -16,6 +16,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.fingerprints import comparable
 from evopolicy_coordinator.analysis.reading.records import Run
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, suites_of
 
@@ -129,12 +130,13 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
 
 def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
     """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words, and how an operator changed it."""
-    items = [set(run.record.versions.fingerprint.items()) for run in runs]
-    common = set.intersection(*items)
+    compared = comparable([run.record.versions.fingerprint for run in runs])
+    items = {id(run): set(parts.items()) for run, parts in zip(runs, compared, strict=True)}
+    common = set.intersection(*items.values())
 
     def beside(run: Run) -> str:
         versions = run.record.versions
-        words = [f"{k}={v}" for k, v in sorted(set(versions.fingerprint.items()) - common)]
+        words = [f"{k}={v}" for k, v in sorted(items[id(run)] - common)]
         return " ".join([*words, *(f"then {each}" for each in versions.fingerprint_overrides)])
 
     return beside

@@ -3,7 +3,7 @@
 Rules that this module owns:
 - A worker is named; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of the
   new one may claim them for a short while, then they are lost like a lost worker's.
-- Workers of one profile (environments, tiers, fingerprint class) are interchangeable but for what they have warm.
+- Workers of one profile (environments with their fingerprint classes, tiers) are interchangeable but for what they have warm.
 - A worker that is paused, draining, lost, quarantined, benched or taken by a suspect gets no more work. One that is
   draining is told to end once what it plays is done; one that is paused stays, and is as before when it is taken back.
 - A worker whose jobs keep failing through its own fault is benched for a growing time.
@@ -11,14 +11,10 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import hashlib
 from typing import Literal
-
-import msgspec
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_coordinator.core.events import WorkerRegistered
 from evopolicy_coordinator.core.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
 from evopolicy_coordinator.core.state import State
@@ -28,17 +24,6 @@ from . import queue
 
 BENCH_AFTER = 3
 """Failures in a row, with nothing played in between, after which a worker is benched."""
-
-
-def fingerprint_class(fingerprint: Fingerprint, *, cpu: bool) -> str:
-    """12 hex digits, equal for workers whose results may stand in one run.
-
-    Covers the code's version, Python's and every environment package's, and with `cpu` the CPU's features.
-    """
-    parts = [fingerprint.code_version, fingerprint.python, sorted(fingerprint.packages.items())]
-    if cpu:
-        parts.append(fingerprint.cpu)
-    return hashlib.sha256(msgspec.json.encode(parts)).hexdigest()[:12]
 
 
 def of_session(state: State, name: str, session: str, now: float) -> Worker | None:
@@ -68,7 +53,7 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         kernel=kernel,
         machine_id=message.machine_id,
         machine=event.machine,
-        numerics=fingerprint_class(message.fingerprint, cpu=True),
+        cpu=message.fingerprint.cpu,
         state="lost",
     )
     if old is not None:
@@ -90,16 +75,14 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
 
 def _profile(state: State, event: WorkerRegistered) -> Profile:
     message = event.message
-    name = fingerprint_class(message.fingerprint, cpu=state.settings.fingerprint_cpu)
-    key = (
-        frozenset(description.env for description in message.environments),
-        frozenset[Tier](message.tiers),
-        name,
-    )
+    descriptions = {description.env: description for description in message.environments}
+    fingerprints = {env: message.fingerprint.of(each) for env, each in descriptions.items()}
+    cpu = state.settings.fingerprint_cpu
+    classes = {env: each.class_name(cpu=cpu) for env, each in fingerprints.items()}
+    key = frozenset(classes.items()), frozenset[Tier](message.tiers)
     profile = state.profiles.get(key)
     if profile is None:
-        descriptions = {description.env: description for description in message.environments}
-        profile = Profile(key, message.fingerprint, descriptions)
+        profile = Profile(key, message.fingerprint, descriptions, fingerprints, classes)
         queue.add_profile(state, profile)
     return profile
 
@@ -254,12 +237,9 @@ def unreserve(state: State, job: JobState) -> None:
 
 def offer(state: State, flow: Flow) -> Profile | None:
     """Of the profiles that can serve an unpinned flow the one with most slots; None when there is none."""
-    able = [
-        profile
-        for profile in state.profiles.values()
-        if profile.workers and flow.env in profile.key[0] and flow.tier in profile.key[1]
-    ]
+    able = [profile for profile in state.profiles.values() if profile.workers and profile.offers(flow)]
     slots: dict[str, int] = {}
     for profile in able:
-        slots[profile.fingerprint_class] = slots.get(profile.fingerprint_class, 0) + profile.slots
-    return max(able, key=lambda profile: slots[profile.fingerprint_class], default=None)
+        name = profile.classes[flow.env]
+        slots[name] = slots.get(name, 0) + profile.slots
+    return max(able, key=lambda profile: slots[profile.classes[flow.env]], default=None)

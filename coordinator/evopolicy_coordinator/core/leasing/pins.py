@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from typing import Literal
 
+import msgspec
+
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_coordinator.core.model import Family, Flow, Profile, Run, Worker
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import FlowPinned, Step
@@ -48,7 +50,7 @@ def pin(state: State, flow: Flow, step: Step) -> None:
     profile = fleet.offer(state, flow) if flow.pin is None else None
     if profile is None:
         return
-    place(state, flow, profile.fingerprint_class, step)
+    place(state, flow, profile.classes[flow.env], step)
     flow.description = profile.descriptions[flow.env]
     step.tell(FlowPinned(flow, profile))
 
@@ -62,7 +64,7 @@ def place(state: State, flow: Flow, fingerprint_class: str, step: Step) -> None:
 def pin_waiting(state: State, worker: Worker, step: Step) -> None:
     """A worker may have work again: runs that nobody could serve when they were opened are pinned now."""
     for flow in list(state.unpinned.values()):
-        if flow.env in worker.profile.key[0] and flow.tier in worker.profile.key[1]:
+        if worker.profile.offers(flow):
             pin(state, flow, step)
 
 
@@ -75,7 +77,7 @@ def refused_runs(state: State, worker: Worker) -> dict[str, str]:
     refused = {
         run.id: _mismatch(run, profile)
         for run in state.runs.values()
-        if run.flow.env in profile.descriptions and run.flow.pin not in (None, profile.fingerprint_class)
+        if run.flow.env in profile.classes and run.flow.pin not in (None, profile.classes[run.flow.env])
     }
     return refused | {
         run.id: f"the run demands sandbox tier {run.flow.tier}; the worker has {', '.join(sorted(profile.key[1]))}"
@@ -85,23 +87,40 @@ def refused_runs(state: State, worker: Worker) -> dict[str, str]:
 
 
 def _mismatch(run: Run, profile: Profile) -> str:
-    text = (
-        f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class"
-        f" {profile.fingerprint_class}"
-    )
-    began, here = run.state.fingerprint, profile.fingerprint
+    env = run.flow.env
+    text = f"the run is pinned to fingerprint class {run.flow.pin}, the worker is of class {profile.classes[env]}"
+    began = run.state.fingerprint
     if began is None:
         return text
-    theirs, ours = versions(began), versions(here)
+    theirs, ours = began.versions(), profile.fingerprints[env].versions()
     differing = [
         f"{name} {theirs.get(name, 'none')} there, {ours.get(name, 'none')} here"
         for name in sorted(theirs.keys() | ours.keys())
-        if theirs.get(name) != ours.get(name)
+        if theirs.get(name) != ours.get(name) and name not in (_NO_PART if began.adapter else ())
     ]
+    if run.state.description is not None:
+        differing += differences(run.state.description, profile.descriptions[env])
     return f"{text} ({'; '.join(differing)})" if differing else text
 
 
-def versions(fingerprint: Fingerprint) -> dict[str, str]:
-    """What a fingerprint class is made of, by name."""
-    own = {"evopolicy-worker": fingerprint.code_version, "python": fingerprint.python}
-    return {**own, **fingerprint.packages}
+_NO_PART = ("evopolicy-worker",)
+"""Not a part of the class of a single environment."""
+
+
+def differences(there: EnvironmentDescription, here: EnvironmentDescription) -> list[str]:
+    """What two definitions of one environment do not agree in, a part a line, values cut to a few words."""
+    ours, theirs = msgspec.to_builtins(here), msgspec.to_builtins(there)
+    return [
+        f"{name} {_short(theirs[name])} there, {_short(ours[name])} here"
+        for name in ours
+        if name not in ("env_version", "adapter", "packages") and ours[name] != theirs[name]
+    ]
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+_SHOWN = 60
+"""Characters of a value that is named."""

@@ -94,7 +94,7 @@ def _auditors(state: State, run: Run, row: AuditRow) -> Iterator[tuple[Worker, s
             continue
         if worker.machine in row.machines:
             yield worker, ONE_MACHINE
-        elif worker.numerics != row.numerics:
+        elif worker.numerics(run.flow.env) != row.numerics:
             yield worker, OTHERS_DIFFER
         elif state.isolates and row.kind in HIDDEN_SPLITS and worker.kernel is state.everywhere:
             yield worker, UNKNOWN_KERNEL

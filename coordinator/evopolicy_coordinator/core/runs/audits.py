@@ -78,7 +78,7 @@ def sample(state: State, news: EpisodesDone, step: Step) -> None:
             submit_index=group.submit_index,
             player=worker.name,
             machines=(worker.machine,) if worker.machine else (),
-            numerics=worker.numerics,
+            numerics=worker.numerics(run.flow.env),
             state="not_audited" if reason else "open",
             reason=reason,
         )

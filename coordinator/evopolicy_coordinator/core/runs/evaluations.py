@@ -60,7 +60,9 @@ def play(state: State, evaluation: Evaluation, step: Step) -> None:
 def pinned(state: State, news: FlowPinned, step: Step) -> None:
     """Keep the class of workers that an evaluation is played by."""
     evaluation = state.evaluations[news.flow.id]
-    evaluation.row = msgspec.structs.replace(evaluation.row, fingerprint_class=news.profile.fingerprint_class)
+    evaluation.row = msgspec.structs.replace(
+        evaluation.row, fingerprint_class=news.profile.classes[news.flow.env]
+    )
     step.persist(evaluation.row)
 
 

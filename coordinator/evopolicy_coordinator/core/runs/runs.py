@@ -187,11 +187,11 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
     run, profile = state.runs[news.flow.id], news.profile
     step.change_run(
         run,
-        fingerprint_class=profile.fingerprint_class,
+        fingerprint_class=profile.classes[news.flow.env],
         description=profile.descriptions[news.flow.env],
-        fingerprint=profile.fingerprint,
+        fingerprint=profile.fingerprints[news.flow.env],
     )
-    step.log("info", "run_pinned", run=run.id, fingerprint_class=profile.fingerprint_class)
+    step.log("info", "run_pinned", run=run.id, fingerprint_class=profile.classes[news.flow.env])
 
 
 def retried(state: State, news: JobRetried, step: Step) -> None:

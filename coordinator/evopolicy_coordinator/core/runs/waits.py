@@ -32,12 +32,8 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
     """The workers that a run or an evaluation waits for; None when some are at work."""
     if flow.lane is not None and flow.lane.slots():
         return None
-    able = [
-        worker
-        for worker in state.workers.values()
-        if flow.env in worker.profile.descriptions and flow.tier in worker.profile.key[1]
-    ]
-    same = [worker for worker in able if flow.pin in (None, worker.profile.fingerprint_class)]
+    able = [worker for worker in state.workers.values() if worker.profile.offers(flow)]
+    same = [worker for worker in able if flow.pin in (None, worker.profile.classes[flow.env])]
     away = {worker.state for worker in same if worker.state != "active"}
     return because(
         "workers", env=flow.env, tier=flow.tier, same_versions=len(same) < len(able), away=tuple(sorted(away))

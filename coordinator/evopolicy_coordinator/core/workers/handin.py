@@ -169,7 +169,7 @@ def commit(state: State, worker: Worker, job: JobState, result: JobResult, step:
             job_id=job.job_id,
             attempt=result.attempt,
             worker=worker.name,
-            fingerprint_class=worker.profile.fingerprint_class,
+            fingerprint_class=worker.profile.classes[group.flow.env],
             at=step.now,
         )
         group.marks[outcome.index] = mark_of(outcome)

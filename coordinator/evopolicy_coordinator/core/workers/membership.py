@@ -19,7 +19,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.isolation import bars, kernels, stays
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
-from evopolicy_coordinator.core.model import Worker
+from evopolicy_coordinator.core.model import Profile, Worker
 from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import WorkerRow
 from evopolicy_coordinator.core.state import State
@@ -57,7 +57,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
         hidden_bar="" if message.boot_id or not state.isolates else bars.NO_BOOT_ID,
     )
     step.reply(event.request, reply)
-    name = worker.profile.fingerprint_class
+    name = _class_of_worker(state, worker.profile)
     step.log("info", "worker_registered", worker=worker.name, slots=worker.slots, fingerprint_class=name)
     pins.pin_waiting(state, worker, step)
 
@@ -157,30 +157,34 @@ def repinned(state: State, event: events.Asked[operator.RepinRun], step: Step) -
     """Pin an unfinished run to another class of workers, as an operator says."""
     message = event.message
     run = state.runs.get(message.run)
-    offered = {
-        profile.fingerprint_class: profile
-        for profile in state.profiles.values()
-        if run is not None and run.flow.env in profile.descriptions and run.flow.tier in profile.key[1]
-    }
+    able = [each for each in state.profiles.values() if run is not None and each.offers(run.flow)]
+    # By the environment's class, and by the whole worker's, as the list of workers shows it.
+    offered = {_class_of_worker(state, each): each for each in able}
+    offered |= {each.classes[run.flow.env]: each for each in able if run is not None}
     if run is None:
         step.refuse(event.request, Refusal.UNKNOWN_RUN, because("no_unfinished_run", run=message.run))
     elif message.fingerprint_class not in offered:
         reason = because("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
         step.refuse(event.request, Refusal.UNKNOWN_CLASS, reason)
     else:
-        text = f"{run.state.fingerprint_class} → {message.fingerprint_class}: {message.reason}"
         profile = offered[message.fingerprint_class]
+        name = profile.classes[run.flow.env]
+        text = f"{run.state.fingerprint_class} → {name}: {message.reason}"
         step.change_run(
             run,
-            fingerprint_class=message.fingerprint_class,
+            fingerprint_class=name,
             overrides=(*run.state.overrides, text),
             description=run.state.description or profile.descriptions[run.flow.env],
-            fingerprint=run.state.fingerprint or profile.fingerprint,
+            fingerprint=run.state.fingerprint or profile.fingerprints[run.flow.env],
         )
         run.flow.description = run.state.description
-        pins.place(state, run.flow, message.fingerprint_class, step)
+        pins.place(state, run.flow, name, step)
         step.log("warning", "run_repinned", run=run.id, override=text)
         step.reply(event.request, operator.Done())
+
+
+def _class_of_worker(state: State, profile: Profile) -> str:
+    return profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu)
 
 
 def forget(state: State, name: str, _step: Step) -> None:

@@ -364,6 +364,43 @@ def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path)
     assert mixtures(load_runs([tmp_path]).runs) == []
 
 
+OF_THE_WORKER = {
+    "python": "3.11",
+    "numpy": "2.4.6",
+    "mujoco": "3.10.0",
+    "evopolicy-worker": "0.1+aa",
+    "cpu": "x",
+}
+OF_THE_ENVIRONMENT = {
+    "python": "3.11",
+    "numpy": "2.4.6",
+    "adapter": "1.1+bb",
+    "definition": "dd",
+    "evopolicy-worker": "0.2+cc",
+    "cpu": "x",
+}
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "mixed"),
+    [
+        (OF_THE_WORKER, OF_THE_ENVIRONMENT, False),
+        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"evopolicy-worker": "0.3", "adapter": "1.1+ee"}, False),
+        (OF_THE_WORKER | {"numpy": "1.26"}, OF_THE_ENVIRONMENT, True),
+        (OF_THE_WORKER, OF_THE_ENVIRONMENT | {"adapter": "1.2+bb"}, True),
+        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"definition": "ff"}, True),
+        (OF_THE_WORKER, OF_THE_WORKER | {"evopolicy-worker": "0.1+bb"}, True),
+    ],
+)
+def test_runs_of_before_fingerprints_of_single_environments_stay_comparable(
+    tmp_path: Path, there: dict[str, str], here: dict[str, str], mixed: bool
+) -> None:
+    write_run(tmp_path, VERSIONS, fingerprint=there)
+    write_run(tmp_path, VERSIONS, entry="Agent B", fingerprint=here)
+    found = [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)]
+    assert found == (["fingerprint"] if mixed else [])
+
+
 def test_step_limits_are_compared_where_an_environment_has_two(tmp_path: Path) -> None:
     for env, found in (("gym/acrobot", []), ("gymnasium/MiniGrid-DoorKey-16x16-v0", ["step limit"])):
         runs = tmp_path / env

@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 from asking import asked
-from core_rig import BUNDLE, Rig, result, split_of
+from core_rig import BUNDLE, Rig, describe, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_coordinator.core.workers import scheduler
 from evopolicy_worker.fingerprint import PACKAGES
 
@@ -295,6 +296,67 @@ def test_a_worker_with_the_papers_versions_is_a_class_of_its_own_and_named_so() 
     for name, version in paper.items():
         assert workers["w2"].versions[name] == version
         assert f"{name} {usual[name]} there, {version} here" in workers["w2"].refused["r1"]
+
+
+def told_apart(env: str = "toy/line", **more: Any) -> EnvironmentDescription:
+    return describe(env, **({"adapter": "1.1+aa", "packages": {"numpy": "2.4"}} | more))
+
+
+@pytest.mark.parametrize(
+    ("more", "described"),
+    [
+        ({"version": "2", "packages": {"numpy": "2.4", "mujoco": "4"}}, (told_apart(),)),
+        ({}, (told_apart(), told_apart("toy/maze", adapter="1.1+bb", packages={"ale-py": "0.12"}))),
+    ],
+)
+def test_what_plays_other_environments_makes_no_other_class_of_this_one(
+    more: dict[str, Any], described: tuple[EnvironmentDescription, ...]
+) -> None:
+    rig = Rig()
+    rig.register("w1", described=(told_apart(),))
+    rig.create()
+    rig.submit(0)
+    other = rig.register("w2", described=described, **more)
+    assert len(rig.poll(other)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"adapter": "1.1+cc"}, "adapter 1.1+aa there, 1.1+cc here"),
+        ({"packages": {"numpy": "2.5"}}, "numpy 2.4 there, 2.5 here"),
+        ({"max_episode_steps": 3}, "max_episode_steps 10 there, 3 here"),
+        ({"task_text": "easier"}, "task_text  there, easier here"),
+    ],
+)
+def test_two_definitions_of_one_environment_are_two_classes_and_the_difference_is_named(
+    changed: dict[str, Any], named: str
+) -> None:
+    rig = Rig()
+    rig.register("w1", described=(told_apart(),))
+    rig.create()
+    rig.submit(0)
+    other = rig.register("w2", described=(told_apart(**changed),))
+    assert rig.poll(other) == []
+    (worker,) = (each for each in rig.status().workers if each.worker == "w2")
+    assert named in worker.refused["r1"]
+    reply = rig.tell(
+        asked(
+            operator.RepinRun,
+            request="b",
+            run="r1",
+            fingerprint_class=worker.classes["toy/line"],
+            reason="the old host is gone",
+        )
+    )
+    assert reply == operator.Done()
+    assert len(rig.poll(other)) == 1
+
+
+def test_a_definition_is_the_same_whoever_plays_it_and_whatever_its_defaults() -> None:
+    digest = told_apart().digest()
+    assert digest == told_apart(adapter="2.1+dd", packages={}, env_version="9", renders=False).digest()
+    assert digest != told_apart(title="Another").digest()
 
 
 @pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])

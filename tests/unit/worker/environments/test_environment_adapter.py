@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,7 +12,7 @@ import pytest
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker.environments import gymnasium_adapter, make, registry
+from evopolicy_worker.environments import adapters, box2d, describe, gymnasium_adapter, make, registry
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
 
 
@@ -159,3 +160,28 @@ def test_an_environment_that_does_not_repeat_itself_is_marked(monkeypatch: pytes
     monkeypatch.setattr(GymnasiumFamily, "deterministic", lambda self, entry: entry.id != "gym/acrobot")
     assert not make("gym/acrobot").description.deterministic
     assert make("gym/continuouscar").description.deterministic
+
+
+def test_the_fingerprint_of_an_environment_is_of_its_own_adapter_and_packages() -> None:
+    acrobot, walker, line = (describe(env) for env in ("gym/acrobot", "gym/bipedal", "toy/line"))
+    assert set(acrobot.packages) == {"numpy", "gymnasium"}
+    assert set(walker.packages) == {"numpy", "gymnasium", "box2d", "pygame-ce"}
+    assert set(line.packages) == {"numpy"}
+    assert len({each.adapter for each in (acrobot, walker, line)}) == 3
+    assert describe("gym/continuouscar").adapter == acrobot.adapter
+    assert all(each.adapter.startswith("1.1+") for each in (acrobot, walker, line))
+
+
+def test_only_what_plays_an_environment_is_in_its_adapters_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    original = Path.read_bytes
+
+    def noted(path: Path) -> bytes:
+        read.append(path.name)
+        return original(path)
+
+    monkeypatch.setattr(Path, "read_bytes", noted)
+    adapters._digest.cache_clear()
+    adapters.adapter(type(box2d.FAMILY), 1, "CarRacing-v3")
+    assert {"box2d.py", "loop.py", "player.py", "car_racing_road.py", "gymnasium_adapter.py"} <= set(read)
+    assert not {"mujoco.py", "registry.py", "highway_lanes.py", "table.py"} & set(read)
