@@ -4,6 +4,8 @@
 # make check  ruff and mypy
 # make docs   the documentation as a site in build/site
 # make bench  what an episode costs, beside a bare loop
+# make bench-start        what one waits for before anything is played
+# make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-throughput   episodes per second through the coordinator
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
 # make bench-report       a report over 1,024 runs
@@ -17,7 +19,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test check docs bench bench-throughput bench-channels bench-report bench-isolation faults sim clean
+.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-channels bench-report bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -62,6 +64,14 @@ docs: install
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 bench: install
 	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/runtime_bench.py $(ARGS)
+
+# Help, the first episode, a trial, a report: each beside a bare Python with the same imports.
+bench-start: install
+	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/start_bench.py $(ARGS)
+
+# Peers of another Python: make bench-peers ARGS="--python /path/to/python"
+bench-peers: install
+	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/peers_bench.py $(ARGS)
 
 # Episodes per second through coordinator and Zenoh, beside Dask's no-op tasks.
 bench-throughput: install

@@ -18,7 +18,7 @@ import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -66,6 +66,8 @@ CANCEL_PATIENCE_S = 2.0
 """What a slot gets to stop its job, before the worker goes without it."""
 WITHDRAW_PATIENCE_S = 1.0
 SILENCE_LOOK_S = 0.5
+MAX_PREPARED = 4
+"""A worker that offers so many environments has its slots import all of their simulators before there is work."""
 
 
 class SlotLike(Protocol):
@@ -75,6 +77,8 @@ class SlotLike(Protocol):
     def begun(self) -> HandedBack | None: ...
 
     async def start(self) -> None: ...
+
+    async def prepare(self, env_ids: Sequence[str]) -> None: ...
 
     async def play(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
@@ -306,8 +310,8 @@ class Supervisor:
     # Playing.
 
     async def _slot_loop(self, index: int) -> None:
-        slot: SlotLike | None = None
-        tier: Tier | None = None
+        slot = await self._prepared(index)
+        tier: Tier | None = self._options.tiers[0]
         pause = RESTART_PAUSE_S
         try:
             while (lease := await self._next_lease()) is not None:
@@ -327,6 +331,29 @@ class Supervisor:
         finally:
             if slot is not None:
                 await _close_slot(slot)
+
+    async def _prepared(self, index: int) -> SlotLike | None:
+        """A slot of the safest tier with its simulators imported, before there is work: the first submit waits for neither.
+
+        None where that fails, which the first lease meets again and reports, or when the worker is drained meanwhile.
+        """
+        offered = [each.env for each in self._options.environments]
+        slot = self._make_slot(index, self._options.tiers[0])
+        preparing = asyncio.create_task(slot.prepare(offered if len(offered) <= MAX_PREPARED else ()))
+        drained = asyncio.create_task(self._draining.wait())
+        try:
+            await asyncio.wait({preparing, drained}, return_when=asyncio.FIRST_COMPLETED)
+            if preparing.done():
+                preparing.result()
+                return slot
+        except (EvopolicyError, OSError) as error:
+            log.info("slot is not prepared", slot=index, error=str(error))
+        finally:
+            preparing.cancel()
+            drained.cancel()
+            await asyncio.gather(preparing, drained, return_exceptions=True)
+        await _close_slot(slot)
+        return None
 
     async def _next_lease(self) -> Lease | None:
         while True:

@@ -10,7 +10,7 @@ import contextlib
 import json
 import signal
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from coordinator_harness import (
     play,
 )
 
-from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError
+from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire.requests import Requester
@@ -48,11 +48,16 @@ class ScriptedSlot:
         self.script = script
         self.dress = dress
         self.started = 0
+        self.prepared: tuple[str, ...] | None = None
         self.stopped = asyncio.Event()
         self.begun: HandedBack | None = None
 
     async def start(self) -> None:
         self.started += 1
+
+    async def prepare(self, env_ids: Sequence[str]) -> None:
+        await self.start()
+        self.prepared = tuple(env_ids)
 
     async def play(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
@@ -110,6 +115,7 @@ async def supervising(
     slots: int = 2,
     grace_s: float = 5.0,
     dress: Callable[[EpisodeOutcome], EpisodeOutcome] = large,
+    kind: type[ScriptedSlot] = ScriptedSlot,
 ) -> AsyncIterator[Supervisor]:
     """A supervisor that works in the background and is drained at the end."""
     options = Options(
@@ -125,7 +131,7 @@ async def supervising(
     )
 
     def make_slot(index: int, tier: Tier) -> ScriptedSlot:
-        return ScriptedSlot(script, dress)
+        return kind(script, dress)
 
     async with connect(coordinator.credentials("worker")) as link:
         found = Supervisor(link, options, make_slot)
@@ -202,6 +208,38 @@ def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
         assert died
         assert failed
         assert results[0] == results[1]
+
+    run(scenario)
+
+
+def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_path: Path) -> None:
+    made: list[ScriptedSlot] = []
+
+    class Watched(ScriptedSlot):
+        async def prepare(self, env_ids: Sequence[str]) -> None:
+            made.append(self)
+            await super().prepare(env_ids)
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, kind=Watched):
+            while [slot.prepared for slot in made] != [("toy/line",)] * 2:
+                await asyncio.sleep(0.01)
+            await whole_run(coordinator)
+        assert [slot.started for slot in made] == [1, 1]
+
+    run(scenario)
+
+
+def test_a_slot_that_cannot_be_prepared_is_started_again_for_its_first_lease(
+    coordinator: Coordinator, tmp_path: Path
+) -> None:
+    class Unprepared(ScriptedSlot):
+        async def prepare(self, env_ids: Sequence[str]) -> None:
+            raise WorkerError("not yet")
+
+    async def scenario() -> None:
+        async with supervising(coordinator, tmp_path, kind=Unprepared):
+            assert (await whole_run(coordinator))["status"] == "completed"
 
     run(scenario)
 

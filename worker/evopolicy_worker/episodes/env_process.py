@@ -17,7 +17,6 @@ import time
 from pathlib import Path
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
-from evopolicy_worker import environments
 from evopolicy_worker.episodes.loop import CancelledJobError, Player, Progress, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles
@@ -98,7 +97,7 @@ class EnvProcess:
         while True:
             work = self._jobs.get()
             if isinstance(work, messages.Describe):
-                self._channel.send(_described(work.environments))
+                self._channel.send(_described(player, work.environments))
                 continue
             self._channel.send(self._play(player, *work))
             # A sandbox that has ended meanwhile is the next job's to find.
@@ -168,9 +167,9 @@ class EnvProcess:
             self._channel.send(messages.Told(episodes_done=progress.episodes_done, steps=progress.steps))
 
 
-def _described(env_ids: tuple[str, ...]) -> messages.Answer:
+def _described(player: Player, env_ids: tuple[str, ...]) -> messages.Answer:
     try:
-        return messages.Described(environments=tuple(environments.describe(env_id) for env_id in env_ids))
+        return messages.Described(environments=tuple(player.describe(env_id) for env_id in env_ids))
     except Exception as error:
         return messages.Fault(kind="worker", message=fault_of(error))
 

@@ -31,6 +31,7 @@ import msgspec
 import numpy as np
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
     LARGEST_LIMITS,
     NO_POLICY,
@@ -246,6 +247,10 @@ class Player:
         self._environments.clear()
         self._videos.close()
         self._zygote.close()
+
+    def describe(self, env_id: str) -> EnvironmentDescription:
+        """What an environment is; it is made for that, and kept for the jobs to come. Raises WorkerError as they do."""
+        return self._environment(env_id).description
 
     def _environment(self, env_id: str) -> Environment:
         environment = self._environments.get(env_id)

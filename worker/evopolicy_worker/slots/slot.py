@@ -109,6 +109,12 @@ class Slot:
             await self.close()
             raise _error(answer)
 
+    async def prepare(self, env_ids: Sequence[str]) -> None:
+        """Start the processes and make these environments, which the jobs to come find ready. Raises as `start`."""
+        await self.start()
+        if env_ids:
+            await self.describe(env_ids)
+
     async def play(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
     ) -> tuple[EpisodeOutcome, ...]:
@@ -180,7 +186,7 @@ class Slot:
         return begun.pack(self._begun)
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
-        """What these environments are: their simulators are imported in the slot's process. Raises as `play`."""
+        """What these environments are: they are made in the slot's process, and jobs find them there. Raises as `play`."""
         if self._process is None:
             raise WorkerError("the slot is not started")
         await self._send(messages.Describe(environments=tuple(env_ids)))

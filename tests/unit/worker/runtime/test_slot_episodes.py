@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 import math
 import platform
+from pathlib import Path
 
 import numpy as np
 import pytest
 from slots import HONEST, Slots, make_job, rows
 
 from evopolicy_common.messages.environment import Case
+from evopolicy_gateway.run.processes import descendants
 from evopolicy_worker import environments
 from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.loop import random_actions
@@ -66,6 +68,17 @@ def test_the_same_episode_gives_the_same_bytes_in_every_slot(slots: Slots) -> No
     assert first.stdout == other.stdout == later.stdout
     elsewhere = slots.play(policy, policy_seed=b"another case's..")
     assert rows(elsewhere)[0].action != rows(first)[0].action
+
+
+def test_a_prepared_slot_has_its_simulators_before_the_first_job(slots: Slots) -> None:
+    slot = slots.new()
+    slots.run(slot.prepare(["gym/reacher5"]))
+    assert slot._process is not None
+    maps = [Path("/proc", str(pid), "maps") for pid in descendants(slot._process.pid)]
+    assert any("libmujoco" in path.read_text() for path in maps)
+    prepared = slots.play(None, slot=slot, env="gym/reacher5")
+    assert prepared.trajectory == slots.play(None, env="gym/reacher5").trajectory
+    slots.run(slot.close())
 
 
 def test_unseeded_numpy_generators_of_all_kinds_are_seeded(slots: Slots) -> None:

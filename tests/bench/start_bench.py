@@ -1,0 +1,187 @@
+"""`make bench-start`: what a person waits for before anything is played, each beside a bare Python with the same imports.
+
+Rows: the help; `evopolicy local` from its call to the answer of a first one-episode submit, then that submit and the next
+one; `evopolicy try` on one case; a report of 48 runs. Wall time and processor time (of all processes), the best of
+`--times`; the floor is the same of bare Pythons, one for each process that the command starts, which import what it imports.
+Prints a table, asserts nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from bare_loop import POLICY
+from invented_study import AGENTS, write_suite
+from rich.console import Console
+from rich.table import Table
+
+HERE = Path(__file__).parent
+ENV, GYMNASIUM_ID = "gym/acrobot", "Acrobot-v1"
+AGENT = """
+import json, os, pathlib, sys, time, urllib.request
+
+times = [time.time()]
+pathlib.Path("system/policy.py").write_text(pathlib.Path(sys.argv[1]).read_text())
+for _ in range(2):
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+        data=json.dumps({"env_instances": [0]}).encode(),
+        headers={"Content-Type": "application/json"},
+    )
+    with urllib.request.urlopen(request) as answer:
+        assert json.load(answer)["status"] == "ok"
+    times.append(time.time())
+pathlib.Path(sys.argv[2]).write_text(json.dumps(times))
+"""
+FRONT = "import evopolicy_gateway.cli.main"
+COORDINATOR = "import evopolicy_coordinator.cli.main"
+WORKER = "import evopolicy_worker.cli"
+SIMULATOR = f"import evopolicy_worker.episodes.env_process, gymnasium; gymnasium.make({GYMNASIUM_ID!r})"
+TRIAL = (f"{FRONT}, evopolicy_gateway.cli.play", COORDINATOR, WORKER, SIMULATOR)
+LOCAL = (*TRIAL, "import evopolicy_gateway.cli.serve", "import evopolicy_gateway.agent_supervisor.keeper")
+REPORT = (
+    "import evopolicy_gateway.cli.main, evopolicy_coordinator.cli.report, evopolicy_coordinator.analysis.write",
+)
+
+
+class Cost(NamedTuple):
+    wall_s: float
+    cpu_s: float
+
+
+class Row(NamedTuple):
+    name: str
+    cost: Cost
+    floor: Cost | None = None
+
+
+def cost(work: Callable[[], None], times: int) -> Cost:
+    """The least of several times."""
+    found = []
+    for _ in range(times):
+        before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        work()
+        wall_s, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        found.append(Cost(wall_s, cpu_s))
+    return Cost(min(one.wall_s for one in found), min(one.cpu_s for one in found))
+
+
+def run(*words: str | Path) -> None:
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(map(str, words))} failed:\n{done.stderr[-2000:]}")
+
+
+def evopolicy(*words: str | Path) -> None:
+    run("-m", "evopolicy_gateway.cli", *words)
+
+
+def floor(programs: Sequence[str], times: int) -> Cost:
+    return cost(lambda: [run("-c", program) for program in programs] and None, times)
+
+
+def first_minute(folder: Path, state: Path) -> tuple[float, float, float]:
+    """Seconds from the call to the first submit's answer, and what the first and the second submit took."""
+    policy, agent, told = folder / "policy.py", folder / "agent.py", folder / "times.json"
+    policy.write_text(POLICY)
+    agent.write_text(AGENT)
+    called = time.time()
+    run(
+        *("-m", "evopolicy_gateway.cli", "local", "--env", ENV, "--budget", "2", "--state", state),
+        *("--agent", f"command:{sys.executable} {agent} {policy} {told}", "--jail", "none"),
+        *(
+            "--runs",
+            folder / "runs",
+            "--overwrite",
+            "--exp-id",
+            "bench",
+            "--validation",
+            "1",
+            "--heldout",
+            "1",
+        ),
+    )
+    begun, first, second = json.loads(told.read_text())
+    return first - called, first - begun, second - first
+
+
+def rows(folder: Path, times: int) -> list[Row]:
+    """Everything that is measured. The state is kept between commands, as a user's is."""
+    state = folder / "state"
+    found = [
+        Row("evopolicy --help", cost(lambda: evopolicy("--help"), times), floor(["import typer"], times))
+    ]
+    first_minute(folder, state)
+    minutes = [first_minute(folder, state) for _ in range(times)]
+    least = [min(column) for column in zip(*minutes, strict=True)]
+    names = ("evopolicy local, call to first episode", "its first submit", "its second submit")
+    for name, wall_s in zip(names, least, strict=True):
+        found.append(Row(name, Cost(wall_s, float("nan")), floor(LOCAL, times) if name == names[0] else None))
+    bundle = folder / "policy"
+    bundle.mkdir()
+    (bundle / "policy.py").write_text(POLICY)
+    trial = ["try", bundle, "--env", ENV, "--cases", "0", "--out", folder / "tries", "--state", state]
+    found.append(Row("evopolicy try, one case", cost(lambda: evopolicy(*trial), times), floor(TRIAL, times)))
+    three = dict(list(AGENTS.items())[:3])
+    n_runs = len(write_suite(folder / "study", agents=three))
+    report = ["report", folder / "study", "--out", folder / "report"]
+    found.append(
+        Row(f"evopolicy report, {n_runs} runs", cost(lambda: evopolicy(*report), times), floor(REPORT, times))
+    )
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--times", type=int, default=3, help="of each; the least counts (default: 3)")
+    parser.add_argument("--json", type=Path, help="also write all numbers to this file")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as name:
+        found = rows(Path(name), options.times)
+    console = Console()
+    console.print(
+        f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no other"
+    )
+    table = Table()
+    for heading in (
+        "",
+        "wall",
+        "CPU",
+        "floor, wall",
+        "floor, CPU",
+        "over floor",
+    ):
+        table.add_column(heading, justify="right" if heading else "left")
+    for row in found:
+        cells = [_text(row.cost.wall_s), _text(row.cost.cpu_s)]
+        if row.floor is not None:
+            known = row.cost.cpu_s == row.cost.cpu_s
+            ratio = row.cost.cpu_s / row.floor.cpu_s if known else row.cost.wall_s / row.floor.wall_s
+            cells += [_text(row.floor.wall_s), _text(row.floor.cpu_s), f"{ratio:.1f}"]
+        table.add_row(row.name, *cells)
+    console.print(table)
+    if options.json:
+        options.json.write_text(json.dumps([row._asdict() for row in found], indent=2))
+
+
+def _text(seconds: float) -> str:
+    return "" if seconds != seconds else f"{seconds:.2f}"
+
+
+if __name__ == "__main__":
+    main()
