@@ -26,6 +26,7 @@ import msgspec
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.records.blobs import fsync_directory
+from evopolicy_common.records.journal import epoch_of
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 FILE_STEMS: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}
@@ -55,6 +56,8 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
     heldout: tuple[Case, ...]
     secret: bool
     """Whether the hidden cases cannot be guessed from public facts."""
+    epoch: str = ""
+    """Public name of what the cases come from: the secret, or the files."""
     files: dict[str, str] = {}
     """SHA-256 (hex) of the bytes of the files that the cases come from, by file name."""
 
@@ -160,6 +163,16 @@ def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
         if is_new
         else ""
     )
+
+
+def renew_secrets(state: Path) -> str:
+    """Gives the runs to come a new secret, and removes the old ones for good; the new epoch's public name.
+
+    Runs keep their cases in the database, so unfinished ones go on, and finished ones can still be verified.
+    """
+    for name in (SECRET, UNJAILED_SECRET):
+        (state / name).unlink(missing_ok=True)
+    return epoch_of(load_or_create_secret(state / SECRET))
 
 
 def load_or_create_secret(path: Path) -> bytes:
@@ -297,7 +310,7 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
-            return _splits(env, cases, secret=True)
+            return _splits(env, cases, secret=True, epoch=epoch_of(self._secret))
         if own:
             raise ConfigError(
                 "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes them from"
@@ -313,11 +326,18 @@ class SplitSource:
         if splits.env != env:
             raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
         cut = {split: _cut(folder, split, splits.cases(split), counts.get(split)) for split in SPLITS}
-        return _splits(env, cut, secret=splits.secret, files=splits.files)
+        hidden = cases_hash((*splits.validation, *splits.heldout))
+        epoch = f"files-{hidden[:16]}"
+        return _splits(env, cut, secret=splits.secret, epoch=epoch, files=splits.files)
 
 
 def _splits(
-    env: str, cases: dict[Split, tuple[Case, ...]], *, secret: bool, files: dict[str, str] | None = None
+    env: str,
+    cases: dict[Split, tuple[Case, ...]],
+    *,
+    secret: bool,
+    epoch: str,
+    files: dict[str, str] | None = None,
 ) -> EnvironmentSplits:
     return EnvironmentSplits(
         env=env,
@@ -325,6 +345,7 @@ def _splits(
         validation=cases["validation"],
         heldout=cases["heldout"],
         secret=secret,
+        epoch=epoch,
         files=files or {},
     )
 

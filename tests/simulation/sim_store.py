@@ -9,6 +9,7 @@ from evopolicy_coordinator.core.records import (
     BegunRow,
     EvaluationRow,
     FinishedRow,
+    JournalRow,
     KernelRow,
     OutcomeHead,
     OutcomeRow,
@@ -40,6 +41,7 @@ class Disk:
         self.audits: dict[str, AuditRow] = {}
         self.permits: dict[tuple[str, str], PermitRow] = {}
         self.kernels: dict[str, KernelRow] = {}
+        self.journal: list[JournalRow] = []
 
     def write(self, rows: Iterable[Row]) -> None:
         for row in rows:
@@ -66,6 +68,9 @@ class Disk:
                     self.permits[row.run, row.boot_id] = row
                 case KernelRow():
                     self.kernels[row.worker] = row
+                case JournalRow():
+                    assert row.seq == len(self.journal), "the journal has no gaps and is never changed"
+                    self.journal.append(row)
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         return self.outcomes.get(group, {}).get(index)
@@ -99,4 +104,5 @@ class Disk:
             audits=tuple(row for row in self.audits.values() if row.run in live),
             permits=tuple(row for row in self.permits.values() if row.ended_at is None),
             kernels=tuple(self.kernels.values()),
+            journal=self.journal[-1] if self.journal else None,
         )

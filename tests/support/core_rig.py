@@ -35,8 +35,10 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import (
     AuditRow,
     BegunRow,
+    DocumentRow,
     EvaluationRow,
     FinishedRow,
+    JournalRow,
     KernelRow,
     OutcomeRow,
     PermitRow,
@@ -100,6 +102,10 @@ def key_of(row: Row) -> tuple[Any, ...]:
             return (PermitRow, row.run, row.boot_id)
         case KernelRow():
             return (KernelRow, row.worker)
+        case JournalRow():
+            return (JournalRow, row.seq)
+        case DocumentRow():
+            return (DocumentRow, row.run, row.kind)
         case _:
             return (type(row), row.run)
 
@@ -142,6 +148,8 @@ class Rig:
             audits=of(AuditRow),
             permits=tuple(row for row in of(PermitRow) if row.ended_at is None),
             kernels=of(KernelRow),
+            journal=max(of(JournalRow), key=lambda row: row.seq, default=None),
+            revealed=tuple(row.reveals for row in of(JournalRow) if row.reveals),
         )
 
     # ---- driving ----
@@ -189,7 +197,7 @@ class Rig:
 
     def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
                budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
-               hidden_from: int = 1000, max_steps: int = 0, **settings: Any) -> Any:  # fmt: skip
+               hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", split_secret: bool = True, **settings: Any) -> Any:  # fmt: skip
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
         reply = self.tell(
             asked(
@@ -208,7 +216,9 @@ class Rig:
                 validation=tuple(Case(seed=hidden_from + seed) for seed in range(n_valid)),
                 heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
                 split_hashes={},
-                split_secret=True,
+                split_secret=split_secret,
+                epoch=epoch,
+                salt=b"n" * 32,
                 max_steps=max_steps,
             )
         )

@@ -160,6 +160,7 @@ def run_record(
         replays=recorded,
         versions=_versions(finished, staged),
         audit=finished.audit,
+        committed=finished.committed,
     )
 
 

@@ -7,10 +7,11 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.messages.audit import AuditRecord
-from evopolicy_common.messages.bounds import Int, Many, Named, Number, Numbered, Plain, Text, Word
+from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Numbered, Plain, Text, Word
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, SubmitStatus, VideoOption
+from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.worker import (
     BlobAck,
     BlobChunk,
@@ -156,6 +157,8 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
     reference_by_case: bool = False
     """The random actions follow from split and case; False for runs that an earlier version created."""
+    committed: Committed | None = None
+    """None for runs that an earlier version opened: they were never committed to, and cannot be any more."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -362,6 +365,58 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
     """What it came to, once it is settled."""
 
 
+class Disclose(Message, frozen=True, kw_only=True, tag="disclose"):
+    """Declare the cases of finished runs public; answered with `Done` once the journal says so."""
+
+    token: Word
+    runs: Many[Word]
+
+
+class JournalRequest(Message, frozen=True, kw_only=True, tag="journal"):
+    """Entries of the journal from `cursor` on."""
+
+    token: Word
+    cursor: Int
+
+
+class JournalPage(Message, frozen=True, kw_only=True, tag="journal_page"):
+    """Entries in order, as they were hashed; `cursor` is where the next page begins."""
+
+    cursor: Int
+    entries: Many[Bytes]
+    finished: bool
+
+
+class OpeningRequest(Message, frozen=True, kw_only=True, tag="opening"):
+    """What the coordinator committed to for a run whose cases were disclosed."""
+
+    token: Word
+    run: Word
+
+
+class RunOpening(Message, frozen=True, kw_only=True, tag="run_opening"):
+    """The documents as they were hashed; see `records.journal`."""
+
+    salt: Bytes
+    opening: Bytes
+    result: Bytes
+
+
+class SignRequest(Message, frozen=True, kw_only=True, tag="sign"):
+    """Have the manifest of published results signed with the coordinator's key."""
+
+    token: Word
+    digest: Word
+    """SHA-256 of the manifest, 64 hex digits."""
+
+
+class Signed(Message, frozen=True, kw_only=True, tag="signed"):
+    """The signature (128 hex digits) and the public key (64) that it is checked with: Ed25519."""
+
+    key: Word
+    signature: Word
+
+
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
     """What the cluster is doing."""
 
@@ -460,6 +515,10 @@ OperatorRequest = (
     | RepinRun
     | SetWorker
     | Claim
+    | Disclose
+    | JournalRequest
+    | OpeningRequest
+    | SignRequest
     | StatusRequest
     | BlobPut
     | BlobGet
@@ -472,6 +531,9 @@ OperatorReply = (
     | EnvironmentState
     | Done
     | ClaimState
+    | JournalPage
+    | RunOpening
+    | Signed
     | StatusReply
     | BlobAck
     | BlobChunk

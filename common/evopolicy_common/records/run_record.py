@@ -18,6 +18,7 @@ from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, VideoOption
+from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
@@ -291,6 +292,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     versions: Versions
     audit: AuditRecord | None = None
     """What was played again on other workers; None where nothing was."""
+    committed: Committed | None = None
+    """What the coordinator fixed before the agent began; None for runs from before it kept a journal."""
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):

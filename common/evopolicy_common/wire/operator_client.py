@@ -15,15 +15,22 @@ from evopolicy_common.messages.operator import (
     AgentGone,
     CancelRun,
     DescribeEnvironment,
+    Disclose,
     Done,
     EnvironmentState,
     Evaluate,
     EvaluationPage,
     EvaluationPoll,
     EvaluationStarted,
+    JournalPage,
+    JournalRequest,
+    OpeningRequest,
     RecordedRequest,
     RepinRun,
+    RunOpening,
     SetWorker,
+    Signed,
+    SignRequest,
     StatusReply,
     StatusRequest,
 )
@@ -95,6 +102,32 @@ class OperatorClient:
             if page.finished:
                 return
 
+    # What is published.
+
+    async def disclose(self, runs: tuple[str, ...]) -> None:
+        """Makes the cases of finished runs public; RefusedError while any run with cases of the same secret is open."""
+        await self._done("disclose", Disclose(token=self._token, runs=runs))
+
+    async def journal(self) -> list[bytes]:
+        """All entries of the coordinator's journal."""
+        entries: list[bytes] = []
+        while True:
+            message = JournalRequest(token=self._token, cursor=len(entries))
+            page = await self._requests.until_answered("journal", message, JournalPage, patience_s=PATIENCE_S)
+            entries += page.entries
+            if page.finished:
+                return entries
+
+    async def opening(self, run: str) -> RunOpening:
+        """What the coordinator committed to for a run that is disclosed."""
+        message = OpeningRequest(token=self._token, run=run)
+        return await self._requests.until_answered("opening", message, RunOpening, patience_s=PATIENCE_S)
+
+    async def sign(self, digest: str) -> Signed:
+        """The coordinator's signature of a manifest, by its SHA-256."""
+        message = SignRequest(token=self._token, digest=digest)
+        return await self._requests.until_answered("sign", message, Signed, patience_s=PATIENCE_S)
+
     # Episodes outside any run.
 
     async def evaluate(
@@ -140,5 +173,7 @@ class OperatorClient:
         """The bytes that `ref` names, checked."""
         return await self._requests.fetch(_SENDER, self._token, ref)
 
-    async def _done(self, verb: str, message: AgentGone | CancelRun | RepinRun | SetWorker) -> None:
+    async def _done(
+        self, verb: str, message: AgentGone | CancelRun | Disclose | RepinRun | SetWorker
+    ) -> None:
         await self._requests.until_answered(verb, message, Done, patience_s=PATIENCE_S)

@@ -17,6 +17,7 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.cli import certs as certs_cli
+from evopolicy_coordinator.cli import epochs as epochs_cli
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server import process, router_config
 from evopolicy_coordinator.server.process import Options
@@ -24,6 +25,8 @@ from evopolicy_coordinator.storage.backup import back_up
 
 app = App(add_completion=True)
 app.add_typer(certs_cli.app, name="certs")
+app.add_typer(epochs_cli.app, name="epoch")
+app.command(epilog="Example: evopolicy-coordinator identity --state /var/lib/evopolicy")(epochs_cli.identity)
 app.command(
     "router-config",
     epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.operator import CreateRun, Evaluate
+from evopolicy_common.messages.operator import CreateRun, Disclose, Evaluate
 from evopolicy_common.messages.worker import Message, Register
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow
 
@@ -52,6 +52,13 @@ class EvaluationRequested(Asked[Evaluate], frozen=True, kw_only=True):
 
     row: EvaluationRow
     """All but when and in which event."""
+
+
+class DisclosureAsked(Asked[Disclose], frozen=True, kw_only=True):
+    """An operator wants the cases of finished runs declared public."""
+
+    epochs: tuple[str, ...]
+    """Of the runs, each once."""
 
 
 class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):

@@ -23,6 +23,8 @@ from .step import EpisodesDone, Step
 def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, Step], None]) -> None:
     """Fill an empty state; `drain` lets those above hear what a step told of."""
     loading = state.loading = Loading()
+    state.journal = snapshot.journal
+    state.revealed.update(snapshot.revealed)
     played: dict[str, dict[str, int]] = {}
     for head in snapshot.outcomes:
         loading.heads.setdefault(head.group, []).append(head)

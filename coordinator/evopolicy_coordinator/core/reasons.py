@@ -20,6 +20,8 @@ Code = Literal[
     "minimum_over_budget",
     "no_cases",
     "evaluation_without_cases",
+    "epoch_revealed",
+    "epoch_in_use",
     # Refused: submits.
     "busy",
     "key_used",

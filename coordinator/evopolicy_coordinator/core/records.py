@@ -24,6 +24,7 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
+from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import HiddenIsolation, PlayedAs, RunFinished, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
@@ -58,6 +59,12 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     """Of the run's episodes, played again on another worker."""
     reference_by_case: bool = False
     """The random reference's actions follow from split and case; False in rows of earlier versions: from `secret`."""
+    epoch: str = ""
+    """Of the cases; empty in rows of earlier versions."""
+    salt: bytes = b""
+    """32 random bytes; of the commitment."""
+    committed: Committed | None = None
+    """None in rows of earlier versions."""
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""
@@ -247,6 +254,26 @@ class KernelRow(msgspec.Struct, frozen=True, kw_only=True, tag="kernel"):
     machine_id: str
 
 
+class JournalRow(msgspec.Struct, frozen=True, kw_only=True, tag="journal"):
+    """An entry of the journal; never changed. Key: `seq`."""
+
+    seq: int
+    """From 0 without gaps."""
+    head: str
+    """Of the journal up to this entry; see `records.journal`."""
+    entry: bytes
+    reveals: str = ""
+    """The epoch that is no secret from here on; empty for none."""
+
+
+class DocumentRow(msgspec.Struct, frozen=True, kw_only=True, tag="document"):
+    """A document whose hash an entry of the journal holds, as it was hashed. Key: `run`, `kind`."""
+
+    run: str
+    kind: Literal["opening", "result"]
+    data: bytes
+
+
 Row = (
     RunRow
     | RunStateRow
@@ -259,6 +286,8 @@ Row = (
     | AuditRow
     | PermitRow
     | KernelRow
+    | JournalRow
+    | DocumentRow
 )
 
 
@@ -313,6 +342,10 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     permits: tuple[PermitRow, ...] = ()
     """Those that have not ended, of finished runs too."""
     kernels: tuple[KernelRow, ...] = ()
+    journal: JournalRow | None = None
+    """The last entry; None for an empty journal."""
+    revealed: tuple[str, ...] = ()
+    """Epochs that are no secret any more."""
 
 
 def latest_time(snapshot: Snapshot) -> float:

@@ -28,7 +28,7 @@ from .model import (
     Stay,
     Worker,
 )
-from .records import BegunRow, KernelRow, OutcomeHead, PermitRow
+from .records import BegunRow, JournalRow, KernelRow, OutcomeHead, PermitRow
 from .settings import CoreSettings
 from .structures.polls import Polls
 from .structures.rate import Rate
@@ -85,6 +85,12 @@ class State:
         self.ended_evaluations: dict[str, Ended] = {}
         self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
         """What workers disagree on, in words, the latest last; since the core was loaded."""
+
+        # The journal.
+        self.journal: JournalRow | None = None
+        """Its last entry; None as long as it has none."""
+        self.revealed: set[str] = set()
+        """Epochs that are no secret any more."""
 
         # Groups and jobs.
         self.groups: dict[str, JobGroup] = {}

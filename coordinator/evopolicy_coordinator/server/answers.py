@@ -21,7 +21,17 @@ import structlog
 from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
-from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunProgress
+from evopolicy_common.messages.operator import (
+    EvaluationPage,
+    JournalPage,
+    JournalRequest,
+    OpeningRequest,
+    RecordedRequest,
+    RunOpening,
+    RunProgress,
+    Signed,
+    SignRequest,
+)
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records.blobs import BlobStore, digest_of, is_digest
 from evopolicy_common.wire import codec
@@ -31,6 +41,7 @@ from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.events import AuditEvent
 from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.server.words import words
@@ -84,6 +95,27 @@ class Answers:
     def recorded(self, message: RecordedRequest, answer: Answer) -> None:
         """Sends stored outcomes of a finished run."""
         self._pages.submit(self._answer, lambda: self._recorded(message), answer)
+
+    def published(self, message: JournalRequest | OpeningRequest | SignRequest, answer: Answer) -> None:
+        """Sends what is published of runs whose cases are disclosed, or signs it."""
+        work = {JournalRequest: self._journal, OpeningRequest: self._opening, SignRequest: self._sign}
+        self._pages.submit(self._answer, lambda: work[type(message)](message), answer)  # type: ignore[operator]
+
+    def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:
+        """The epochs of finished runs that are to be published, each once. Reads the database; RefusedError otherwise."""
+        found: dict[str, None] = {}
+        for run in runs:
+            row = self.finished_run(run)
+            if row is None:
+                raise RefusedError(Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
+            if row.committed is None:
+                raise RefusedError(
+                    Refusal.BAD_REQUEST,
+                    f"run {run} was opened before this coordinator kept a journal: its cases were never committed to, which"
+                    " cannot be done afterwards, so it cannot be published",
+                )
+            found[row.epoch] = None
+        return tuple(found)
 
     def finished_run(self, run: str) -> RunRow | None:
         """A finished run as it was created; None for any other run. Reads the database.
@@ -188,6 +220,32 @@ class Answers:
             outcomes=tuple(found.outcome for found in page.rows),
             finished=not page.rows,
         )
+
+    def _journal(self, message: JournalRequest) -> Message:
+        cursor = min(max(0, message.cursor), MAX_SEQ)
+        rows = self._reader.journal(cursor, MAX_PAGE_BYTES)
+        after = rows[-1].seq + 1 if rows else cursor
+        return JournalPage(cursor=after, entries=tuple(row.entry for row in rows), finished=not rows)
+
+    def _opening(self, message: OpeningRequest) -> Message:
+        row = self.finished_run(message.run)
+        opening = self._reader.document(message.run, "opening")
+        result = self._reader.document(message.run, "result")
+        if row is None or opening is None or result is None:
+            text = f"there is no finished run {message.run[:64]!r} here that was committed to"
+            return Refused(status=Refusal.UNKNOWN_RUN, message=text)
+        if row.epoch not in self._reader.revealed():
+            text = f"the cases of run {row.run} are not disclosed; publish it first"
+            return Refused(status=Refusal.BAD_REQUEST, message=text)
+        return RunOpening(salt=row.salt, opening=opening, result=result)
+
+    def _sign(self, message: SignRequest) -> Message:
+        if not is_digest(message.digest):
+            return Refused(
+                status=Refusal.BAD_REQUEST, message=f"{message.digest[:80]!r} is no SHA-256 digest"
+            )
+        key, signature = identity.sign(self._database.parent, message.digest)
+        return Signed(key=key, signature=signature)
 
     def _put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int) -> Message:
         if not is_digest(message.digest):

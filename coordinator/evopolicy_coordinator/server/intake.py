@@ -23,6 +23,7 @@ from evopolicy_common.messages.environment import Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
+from evopolicy_common.records.journal import SALT_BYTES
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Role
 from evopolicy_common.wire.refusals import Refusal
@@ -164,7 +165,7 @@ class Intake:
         try:
             if room == "gw":
                 return isinstance(codec.decode(codec.gateway_requests, payload), gateway.Submit)
-            wanted = operator.CreateRun | operator.Evaluate
+            wanted = operator.CreateRun | operator.Evaluate | operator.Disclose
             return room == "ops" and isinstance(codec.decode(codec.operator_requests, payload), wanted)
         except ProtocolError:
             return False
@@ -174,7 +175,7 @@ class Intake:
         """Whether `event` reads splits or blobs for it."""
         if isinstance(message, worker.HandIn):
             return any(result.packed is not None for result in message.results)
-        return isinstance(message, operator.CreateRun | operator.Evaluate)
+        return isinstance(message, operator.CreateRun | operator.Evaluate | operator.Disclose)
 
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
         """The event that the request is for the core; RefusedError when it cannot be served as it is.
@@ -296,6 +297,8 @@ class Intake:
             heldout=cases.heldout,
             split_hashes=cases.hashes(),
             split_secret=cases.secret,
+            epoch=cases.epoch,
+            salt=secrets.token_bytes(SALT_BYTES),
             allowed_imports=self._allowed_imports,
             denied_imports=self._denied_imports,
             max_steps=_max_steps(wanted.env, wanted.step_limit),

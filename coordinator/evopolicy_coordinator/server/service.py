@@ -44,6 +44,7 @@ from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEff
 from evopolicy_coordinator.core.events import (
     AnyEvent,
     AuditEvent,
+    DisclosureAsked,
     LivenessLost,
 )
 from evopolicy_coordinator.core.machine import Core
@@ -215,6 +216,8 @@ class Service:
             query.reply(answer_bytes(self._status(core)), lane_of(parsed.asker))
         elif isinstance(message, operator.RecordedRequest):
             self._answers.recorded(message, answer_to(query, parsed.asker))
+        elif isinstance(message, operator.JournalRequest | operator.OpeningRequest | operator.SignRequest):
+            self._answers.published(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
             offering = [
                 each for each in core.state.workers.values() if message.env in each.profile.descriptions
@@ -273,6 +276,9 @@ class Service:
         if isinstance(message, operator.Evaluate) and message.as_in is not None:
             row = self._answers.finished_run(message.as_in.run)
             return self._intake.evaluation_requested(message, request, stimulus, row)
+        if isinstance(message, operator.Disclose):
+            epochs = self._answers.epochs(message.runs)
+            return DisclosureAsked(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
         return self._intake.event(parsed, request, stimulus)
 
     async def _serve_description(

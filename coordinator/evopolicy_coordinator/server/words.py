@@ -59,6 +59,10 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "minimum_over_budget": "a submit takes at least {least} episodes, the budget is {budget}",
     "no_cases": "the {split} split has no cases",
     "evaluation_without_cases": "an evaluation needs at least one case",
+    "epoch_revealed": "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, say"
+    " `evopolicy-coordinator epoch new` with its --state, and start it again (with --data: give it other cases)",
+    "epoch_in_use": "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
+    " its end, or cancel it",
     "busy": "submit {submit} is still running; one runs at a time",
     "key_used": "key {key!r} was used for submit {submit} with another request",
     "no_bundle": "a submit names a bundle, or says why there is none",

@@ -20,11 +20,13 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
+from evopolicy_coordinator.pki.identity import SIGNING_KEY
 
 KEPT_FILES = (
     "secret",
     "secret-unjailed",
     "identity.json",
+    SIGNING_KEY,
     *(
         f"certs/{name}"
         for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")

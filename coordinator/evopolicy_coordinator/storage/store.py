@@ -27,8 +27,10 @@ from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.records import (
     AuditRow,
     BegunRow,
+    DocumentRow,
     EvaluationRow,
     FinishedRow,
+    JournalRow,
     KernelRow,
     OutcomeHead,
     OutcomeRow,
@@ -88,6 +90,12 @@ _MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE begun (grp TEXT NOT NULL, first INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, first));
     """,
+    """
+    CREATE TABLE journal (seq INTEGER PRIMARY KEY, reveals TEXT NOT NULL, data BLOB NOT NULL);
+    CREATE TRIGGER journal_stays BEFORE UPDATE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never changed'); END;
+    CREATE TRIGGER journal_grows BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never cut'); END;
+    CREATE TABLE documents (run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind));
+    """,
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
 
@@ -106,6 +114,8 @@ _PLACES: dict[type[Any], tuple[str, str, str]] = {
     AuditRow: ("audits", "audit", "data"),
     PermitRow: ("permits", "run, boot_id", "data"),
     KernelRow: ("kernels", "worker", "data"),
+    JournalRow: ("journal", "seq", "data"),
+    DocumentRow: ("documents", "run, kind", "data"),
 }
 """Where the rows of a kind are: their table, its key, and the column of their bytes."""
 _DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
@@ -227,6 +237,8 @@ class Store:
             audits=tuple(rows(db, AuditRow, f"WHERE run IN ({live_runs})")),
             permits=tuple(rows(db, PermitRow, "WHERE NOT ended")),
             kernels=tuple(rows(db, KernelRow)),
+            journal=next(rows(db, JournalRow, "ORDER BY seq DESC LIMIT 1"), None),
+            revealed=tuple(revealed(db)),
         )
 
     def close(self) -> None:
@@ -286,6 +298,30 @@ class Reader:
     def run(self, run: str) -> RunRow | None:
         """The run as it was created; None for an unknown one."""
         return self._one(RunRow, "WHERE run = ?", (run,))
+
+    def journal(self, cursor: int, max_bytes: int) -> tuple[JournalRow, ...]:
+        """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty behind the last."""
+
+        def read() -> tuple[JournalRow, ...]:
+            page: list[JournalRow] = []
+            total = 0
+            for row, n_bytes in _sized_rows(self._db, JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,)):
+                total += n_bytes
+                if page and total > max_bytes:
+                    break
+                page.append(row)
+            return tuple(page)
+
+        return _guard(self._path, read)
+
+    def revealed(self) -> frozenset[str]:
+        """Epochs that are no secret any more."""
+        return _guard(self._path, lambda: frozenset(revealed(self._db)))
+
+    def document(self, run: str, kind: str) -> bytes | None:
+        """What an entry of the journal holds the hash of; None when there is none."""
+        row = self._one(DocumentRow, "WHERE run = ? AND kind = ?", (run, kind))
+        return None if row is None else row.data
 
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""
@@ -367,6 +403,11 @@ def _sized_rows(
         yield row, len(data)
 
 
+def revealed(db: sqlite3.Connection) -> Iterator[str]:
+    """Epochs that the journal says were revealed."""
+    return (epoch for (epoch,) in db.execute("SELECT reveals FROM journal WHERE reveals != ''"))
+
+
 def unreadable(error: Exception) -> str:
     """What is wrong with a row's bytes, and the remedy."""
     return (
@@ -394,6 +435,8 @@ _WORKER = _upsert("workers", "worker, data", "worker")
 _AUDIT = _upsert("audits", "audit, run, data", "audit")
 _PERMIT = _upsert("permits", "run, boot_id, ended, data", "run, boot_id")
 _KERNEL = _upsert("kernels", "worker, data", "worker")
+_JOURNAL = "INSERT INTO journal (seq, reveals, data) VALUES (?, ?, ?)"
+_DOCUMENT = "INSERT INTO documents (run, kind, data) VALUES (?, ?, ?)"
 _CLAIM = _upsert("claims", "suite, name, data", "suite, name")
 
 
@@ -445,6 +488,14 @@ def _write_kernel(db: sqlite3.Connection, row: KernelRow) -> None:
     db.execute(_KERNEL, (row.worker, _encode(row)))
 
 
+def _write_journal(db: sqlite3.Connection, row: JournalRow) -> None:
+    db.execute(_JOURNAL, (row.seq, row.reveals, _encode(row)))
+
+
+def _write_document(db: sqlite3.Connection, row: DocumentRow) -> None:
+    db.execute(_DOCUMENT, (row.run, row.kind, _encode(row)))
+
+
 _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     RunRow: _write_run,
     RunStateRow: _write_run_state,
@@ -457,6 +508,8 @@ _WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
     AuditRow: _write_audit,
     PermitRow: _write_permit,
     KernelRow: _write_kernel,
+    JournalRow: _write_journal,
+    DocumentRow: _write_document,
 }
 
 

@@ -67,6 +67,7 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
             "run": _short(run.name),
             "submits": len(run.submits),
             "score": run.score,
+            "journal": _journal(run),
         }
         for run in study.runs
     )
@@ -80,10 +81,21 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
             RUN,
             Column("submits", "Submits", "integer"),
             Column("score", "Held-out mean", "number"),
+            Column(
+                "journal",
+                "Journal",
+                note="Entry with the run's result, and the journal's head there: whoever noted heads sees a journal that was rewritten.",
+            ),
         ),
         rows=rows,
         links={i: link for i, run in enumerate(study.runs) if (link := link_of(run.name))},
     )
+
+
+def _journal(run: Run) -> str | None:
+    """Where the coordinator's journal has the run's result; None for runs from before there was one."""
+    place = run.record.committed
+    return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
 
 
 def _agents(study: Study) -> Table:

@@ -31,7 +31,7 @@ from evopolicy_coordinator.core.records import (
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step, SubmitEnded
 
-from . import audit_end, evaluations, finished, results, runs, templates
+from . import audit_end, evaluations, finished, journal, results, runs, templates
 
 # ---- hidden groups ----
 
@@ -169,6 +169,7 @@ def _finish(
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
         groups.close_group(state, group, step, "run cancelled" if cancelled else "budget not spent")
     result = finished.result(state, run, best, step.now, cancelled=cancelled)
+    result = journal.ended(state, result, step)
     step.persist(FinishedRow(run=run.id, result=result))
     step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     runs.forget(state, run)

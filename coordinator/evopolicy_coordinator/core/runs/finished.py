@@ -115,6 +115,7 @@ def result(
         audit=audit_end.record(state, run),
         hidden_isolation=stored.isolation,
         fingerprint_overrides=stored.overrides,
+        committed=row.committed,
     )
 
 

@@ -3,6 +3,7 @@
 Rules that this module owns:
 - One run per key, with its whole budget available.
 - Nothing that a gateway is answered with depends on hidden work.
+- A run is durable together with the journal's entry that commits to it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import FlowPinned, JobRetried, ResultsDiffered, Step
 from evopolicy_coordinator.core.structures.ledger import Ledger
 
-from . import waits
+from . import journal, waits
 
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:
@@ -33,7 +34,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
     if known is not None:
         step.reply(event.request, operator.RunCreated(run=known, capability=state.capabilities[known]))
         return
-    fault = _fault(row)
+    fault = _fault(row) or journal.fault(state, row)
     if fault is None and row.run in state.capabilities:
         fault = because("run_exists", run=row.run)
     if fault is not None:
@@ -46,6 +47,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
         created_at=step.now,
         stimulus_id=step.stimulus_id,
     )
+    row = journal.opened(state, row, step)
     stored = RunStateRow(run=row.run, isolation=requests.stamp(state, row))
     step.persist(row)
     run = enter(state, row, stored)

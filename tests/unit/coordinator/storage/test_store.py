@@ -14,7 +14,14 @@ from store_rows import blob, outcome_row, run_row, state_row, submit_row
 from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.records import EvaluationRow, KernelRow, WorkerRow, head_of
+from evopolicy_coordinator.core.records import (
+    DocumentRow,
+    EvaluationRow,
+    JournalRow,
+    KernelRow,
+    WorkerRow,
+    head_of,
+)
 from evopolicy_coordinator.storage import store as store_module
 from evopolicy_coordinator.storage import upkeep
 from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
@@ -85,6 +92,43 @@ def test_strikes_that_an_earlier_version_wrote_are_read_past(path: Path) -> None
     store = Store(path)
     assert store.load().submits == (submit_row(),)
     store.close()
+
+
+def test_the_journal_can_only_grow(path: Path) -> None:
+    store = Store(path)
+    first = JournalRow(seq=0, head="a", entry=b"one")
+    last = JournalRow(seq=1, head="b", entry=b"two", reveals="epoch")
+    store.write([first, last, DocumentRow(run="r-1", kind="opening", data=b"{}")])
+    with pytest.raises(StorageError, match="contradicts"):
+        store.write([JournalRow(seq=1, head="c", entry=b"another")])
+    snapshot = store.load()
+    store.close()
+    assert (snapshot.journal, snapshot.revealed) == (last, ("epoch",))
+    for statement in ("DELETE FROM journal", "UPDATE journal SET reveals = ''"):
+        with contextlib.closing(sqlite3.connect(path)) as db, pytest.raises(sqlite3.IntegrityError):
+            db.execute(statement)
+    with contextlib.closing(Reader(path)) as reader:
+        assert reader.journal(0, 1) == (first,)
+        assert reader.journal(0, 1000) == (first, last)
+        assert reader.journal(2, 1000) == ()
+        assert reader.document("r-1", "opening") == b"{}"
+        assert reader.document("r-1", "result") is None
+
+
+def test_a_store_from_before_the_journal_opens_with_an_empty_one(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as earlier:
+        earlier.setattr(store_module, "_MIGRATIONS", store_module._MIGRATIONS[:5])
+        earlier.setattr(store_module, "SCHEMA_VERSION", 5)
+        old = Store(path)
+        old.write([run_row(), state_row()])
+        old.close()
+    store = Store(path)
+    snapshot = store.load()
+    store.close()
+    assert (snapshot.journal, snapshot.revealed) == (None, ())
+    assert [row.committed for row in snapshot.runs] == [None]
 
 
 def test_incarnation_counts_every_load(path: Path) -> None:

@@ -1,0 +1,236 @@
+"""The coordinator's journal: what it commits to when a run is opened, and what became of each run. Pure.
+
+Rules that this module owns:
+- A journal is a list of entries, each the bytes of a JSON object. Entries are only ever added.
+- The hash of a journal, its *head*, is that of the empty one (`EMPTY_HEAD`) carried through every entry:
+  head(n) = SHA-256("evopolicy journal 1" NUL | head(n - 1) | SHA-256(entry n)).
+- A commitment is SHA-256("evopolicy commitment 1" NUL | salt | document). The salt is 32 random bytes, so that nobody can
+  try out documents; the document (`Opening`) holds all three splits and all settings of a run.
+- The entry that ends a run holds the SHA-256 of its result (`Result`).
+
+Documents and entries are kept and published as the bytes that were hashed, and never encoded again: fields that a later
+version adds change nothing of what is stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Word
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.gateway import SubmitStatus
+from evopolicy_common.messages.operator import RunFinished, RunSettings
+
+EMPTY_HEAD = hashlib.sha256(b"evopolicy journal 1").hexdigest()
+SALT_BYTES = 32
+_LINK = b"evopolicy journal 1\0"
+_COMMITMENT = b"evopolicy commitment 1\0"
+_EPOCH = b"evopolicy epoch 1\0"
+
+
+class Opened(msgspec.Struct, frozen=True, kw_only=True, tag="opened", tag_field="kind"):
+    """A run was opened, before its agent could start."""
+
+    run: Word
+    commitment: Word
+    """SHA-256 (hex)."""
+    epoch: Word
+    entry: Word
+    """Name of the agent; with `exp_id`, `env` and `repeat` it says which place in an experiment the run was opened for."""
+    model: Word
+    env: Word
+    exp_id: Word
+    repeat: Int
+    attempt: Int
+    at: Number
+    """Unix time, seconds."""
+
+
+class Ended(msgspec.Struct, frozen=True, kw_only=True, tag="ended", tag_field="kind"):
+    """A run is over."""
+
+    run: Word
+    status: Word
+    """As in `run.json`."""
+    result: Word
+    """SHA-256 (hex) of its `Result`."""
+    at: Number
+
+
+class Revealed(msgspec.Struct, frozen=True, kw_only=True, tag="revealed", tag_field="kind"):
+    """Runs of an epoch were published: its cases are no secret any more."""
+
+    epoch: Word
+    runs: Many[Word]
+    at: Number
+
+
+Entry = Opened | Ended | Revealed
+
+
+class Opening(msgspec.Struct, frozen=True, kw_only=True):
+    """What a commitment is of."""
+
+    run: Word
+    epoch: Word
+    settings: RunSettings
+    budget: Int
+    min_episodes_per_submit: Int
+    max_episodes_per_submit: Int
+    max_steps: Int
+    train: Many[Case]
+    validation: Many[Case]
+    heldout: Many[Case]
+    cases_secret: bool
+    """Whether nobody could guess the hidden cases."""
+    allowed_imports: Many[Word]
+    denied_imports: Many[Word]
+    audit_share: Number
+    policy_seeds: Word
+    """SHA-256 (hex) of the secret that the policies' random seeds derive from."""
+
+
+class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
+    """One accepted submit."""
+
+    submit_index: Int
+    status: SubmitStatus
+    bundle: Word | None
+    """SHA-256 (hex) of the policy's bundle."""
+    env_instances: Many[Int]
+    mean_return: Number | None
+    val_mean: Number | None
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run came to, as far as numbers go."""
+
+    run: Word
+    status: Word
+    best_submit_index: Int | None
+    final_score: Number | None
+    heldout_returns: Many[Number]
+    random_heldout_returns: Many[Number]
+    validation_ineligible: Many[Int]
+    policy_failures: Named[Int]
+    budget_used: Int
+    infrastructure_retries: Int
+    nondeterministic_results: Int
+    submits: Many[SubmitResult]
+
+
+def result_of(finished: RunFinished) -> Result:
+    """The part of a finished run that its last entry fixes."""
+    return Result(
+        run=finished.run,
+        status=finished.status,
+        best_submit_index=finished.best_submit_index,
+        final_score=finished.final_score,
+        heldout_returns=finished.heldout_returns,
+        random_heldout_returns=finished.random_heldout_returns,
+        validation_ineligible=tuple(sorted(finished.validation_ineligible)),
+        policy_failures=finished.policy_failures,
+        budget_used=finished.budget_used,
+        infrastructure_retries=finished.infrastructure_retries,
+        nondeterministic_results=finished.nondeterministic_results,
+        submits=tuple(
+            SubmitResult(
+                submit_index=submit.submit_index,
+                status=submit.status,
+                bundle=submit.bundle,
+                env_instances=submit.env_instances,
+                mean_return=submit.mean_return,
+                val_mean=submit.val_mean,
+            )
+            for submit in finished.submits
+        ),
+    )
+
+
+def document(content: Entry | Opening | Result) -> bytes:
+    """The bytes that are hashed and kept."""
+    return msgspec.json.encode(content, order="sorted")
+
+
+_entries: msgspec.json.Decoder[Entry] = msgspec.json.Decoder(Entry)
+
+
+def read_entry(data: bytes) -> Entry:
+    """ProtocolError for bytes that are no entry which this version knows."""
+    try:
+        return _entries.decode(data)
+    except (*DECODE_ERRORS, ValueError) as error:
+        raise ProtocolError(f"not an entry of a journal: {error}") from error
+
+
+def commitment(salt: bytes, opening: bytes) -> str:
+    """SHA-256 (hex) of a document with its salt."""
+    return hashlib.sha256(_COMMITMENT + salt + opening).hexdigest()
+
+
+def digest(data: bytes) -> str:
+    """SHA-256 (hex)."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def head_after(head: str, entry: bytes) -> str:
+    """The journal's head (hex) once `entry` is added to one whose head is `head`."""
+    return hashlib.sha256(_LINK + bytes.fromhex(head) + hashlib.sha256(entry).digest()).hexdigest()
+
+
+def heads(entries: Iterable[bytes]) -> list[str]:
+    """The head after each entry."""
+    found, head = [], EMPTY_HEAD
+    for entry in entries:
+        head = head_after(head, entry)
+        found.append(head)
+    return found
+
+
+def epoch_of(secret: bytes) -> str:
+    """The public name of the epoch whose cases derive from `secret` (256 random bits, which the name does not tell)."""
+    return hashlib.sha256(_EPOCH + secret).hexdigest()[:16]
+
+
+class Epoch(msgspec.Struct, frozen=True, kw_only=True):
+    """What a journal says of an epoch."""
+
+    epoch: str
+    opened: int
+    """Runs opened on its cases."""
+    ended: int
+    """Of those, how many are over."""
+    began_at: float
+    """When the first run was opened, Unix seconds."""
+    revealed_at: float | None
+    """When its cases became public; None while they are secret."""
+
+
+def epochs(entries: Iterable[Entry]) -> tuple[Epoch, ...]:
+    """The epochs that a journal tells of, in the order of their first runs."""
+    runs: dict[str, str] = {}
+    began: dict[str, float] = {}
+    revealed: dict[str, float] = {}
+    over: set[str] = set()
+    for entry in entries:
+        if isinstance(entry, Opened):
+            runs[entry.run] = entry.epoch
+            began.setdefault(entry.epoch, entry.at)
+        elif isinstance(entry, Ended):
+            over.add(entry.run)
+        else:
+            revealed.setdefault(entry.epoch, entry.at)
+    return tuple(
+        Epoch(
+            epoch=epoch,
+            opened=sum(of == epoch for of in runs.values()),
+            ended=sum(of == epoch and run in over for run, of in runs.items()),
+            began_at=at,
+            revealed_at=revealed.get(epoch),
+        )
+        for epoch, at in began.items()
+    )

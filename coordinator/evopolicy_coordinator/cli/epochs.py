@@ -1,0 +1,112 @@
+"""`evopolicy-coordinator epoch`, `evopolicy-coordinator identity`: which cases are still secret, and who signs."""
+
+from __future__ import annotations
+
+import contextlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records import journal
+from evopolicy_common.terminal import say, say_json, table, terminal
+from evopolicy_common.wire.credentials import default_state_dir
+from evopolicy_coordinator import splits
+from evopolicy_coordinator.pki.identity import public_key
+from evopolicy_coordinator.storage.state_folder import StateFolder
+from evopolicy_coordinator.storage.store import Reader
+
+_PAGE_BYTES = 1 << 20
+
+app = App(
+    help="Epochs: runs of one epoch have cases that derive from one secret. Publishing runs reveals it.",
+    no_args_is_help=True,
+)
+
+State = Annotated[
+    Path | None, typer.Option(help="The state folder [$EVOPOLICY_STATE or the user's state home].")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
+
+
+@app.command("list", epilog="Example: evopolicy-coordinator epoch list --state /var/lib/evopolicy")
+def list_(state: State = None, as_json: AsJson = False) -> None:
+    """The epochs that the journal knows, with the number of runs and whether their cases are public."""
+    root = state or default_state_dir()
+    with fail_on_our_errors():
+        entries = _journal(root)
+        found = journal.epochs(map(journal.read_entry, entries))
+        current = _current(root)
+    head = ([journal.EMPTY_HEAD, *journal.heads(entries)])[-1]
+    if as_json:
+        say_json({"current": current, "entries": len(entries), "head": head, "epochs": found})
+        return
+    shown = table("epoch", "runs", "finished", "first run", "cases")
+    for each in found:
+        cases = "secret" if each.revealed_at is None else f"public since {_when(each.revealed_at)}"
+        name = f"{each.epoch} (current)" if each.epoch == current else each.epoch
+        shown.add_row(name, str(each.opened), str(each.ended), _when(each.began_at), cases)
+    terminal().print(shown)
+    say(f"journal: {len(entries)} entries, head {head}")
+
+
+@app.command(epilog="Example: evopolicy-coordinator epoch new --state /var/lib/evopolicy")
+def new(state: State = None) -> None:
+    """Gives the runs to come a new secret, and with it new cases. The coordinator must not be running.
+
+    Unfinished runs go on with the cases that they have. Scores of different epochs are of different cases: do not compare them.
+    """
+    root = state or default_state_dir()
+    with fail_on_our_errors():
+        if not (root / "identity.json").is_file():
+            raise ConfigError(f"{root} is no coordinator's state folder: it holds no identity.json")
+        opened = StateFolder.open(root)
+        try:
+            before = _current(root)
+            after = splits.renew_secrets(root)
+        finally:
+            opened.close()
+    say(f"epoch {after} begins" + (f", after {before}" if before else ""))
+    say("next: start the coordinator; runs on files (--data) are not concerned")
+
+
+def identity(state: State = None, as_json: AsJson = False) -> None:
+    """The public key that this coordinator signs published results with; made on first use.
+
+    Tell it in a place that is known to be yours: whoever checks your results names it.
+    """
+    root = state or default_state_dir()
+    with fail_on_our_errors():
+        if not root.is_dir():
+            raise ConfigError(f"--state {root}: there is no such state folder")
+        key = public_key(root)
+    if as_json:
+        say_json({"identity": key})
+    else:
+        say(key)
+
+
+def _current(root: Path) -> str:
+    """The epoch that the next run with a jailed agent belongs to; empty while there is no secret."""
+    if not (root / splits.SECRET).exists():
+        return ""
+    return journal.epoch_of(splits.load_or_create_secret(root / splits.SECRET))
+
+
+def _journal(root: Path) -> list[bytes]:
+    database = root / "coordinator.sqlite"
+    if not database.is_file():
+        raise ConfigError(f"{root} is no coordinator's state folder: it holds no {database.name}")
+    entries: list[bytes] = []
+    with contextlib.closing(Reader(database)) as reader:
+        while page := reader.journal(len(entries), _PAGE_BYTES):
+            entries += [row.entry for row in page]
+    return entries
+
+
+def _when(at: float) -> str:
+    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")

@@ -1,0 +1,119 @@
+"""What the coordinator writes into its journal, and what follows from it (`evopolicy_common.records.journal`).
+
+Rules that this module owns:
+- Every run has an entry from its opening on, whatever becomes of it, and another when it is over.
+- What an entry commits to is stored with it, as the bytes that were hashed.
+- An epoch is revealed when one of its runs is published, and not while any run of it is unfinished. A revealed epoch's secret
+  cases are given to no new run; cases that are public anyway may be played on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import msgspec
+
+from evopolicy_common.messages.journal import Committed
+from evopolicy_common.messages.operator import Done, RunFinished
+from evopolicy_common.records import journal
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.reasons import Reason, because
+from evopolicy_coordinator.core.records import DocumentRow, JournalRow, RunRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+
+
+def fault(state: State, row: RunRow) -> Reason | None:
+    """Why no run may be opened on these cases; None when it may."""
+    if row.split_secret and row.epoch in state.revealed:
+        return because("epoch_revealed", epoch=row.epoch)
+    return None
+
+
+def opened(state: State, row: RunRow, step: Step) -> RunRow:
+    """Commit to a run that is about to be made; the row says where."""
+    settings = row.settings
+    document = journal.document(
+        journal.Opening(
+            run=row.run,
+            epoch=row.epoch,
+            # Published as it is: the operator's labels and machines are nobody else's.
+            settings=msgspec.structs.replace(settings, notes={}, agent_host=""),
+            budget=row.budget,
+            min_episodes_per_submit=row.min_episodes_per_submit,
+            max_episodes_per_submit=row.max_episodes_per_submit,
+            max_steps=row.max_steps,
+            train=row.train,
+            validation=row.validation,
+            heldout=row.heldout,
+            cases_secret=row.split_secret,
+            allowed_imports=row.allowed_imports,
+            denied_imports=row.denied_imports,
+            audit_share=row.audit_share,
+            policy_seeds=hashlib.sha256(row.secret).hexdigest(),
+        )
+    )
+    commitment = journal.commitment(row.salt, document)
+    step.persist(DocumentRow(run=row.run, kind="opening", data=document))
+    last = _append(
+        state,
+        journal.Opened(
+            run=row.run,
+            commitment=commitment,
+            epoch=row.epoch,
+            entry=settings.entry,
+            model=settings.model,
+            env=settings.env,
+            exp_id=settings.exp_id,
+            repeat=settings.repeat,
+            attempt=settings.attempt,
+            at=step.now,
+        ),
+        step,
+    )
+    place = Committed(commitment=commitment, epoch=row.epoch, opened=last.seq, opened_head=last.head)
+    return msgspec.structs.replace(row, committed=place)
+
+
+def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
+    """Fix what a run came to. Of a run without a commitment nothing is written: its entry would say nothing of its start."""
+    if finished.committed is None:
+        return finished
+    document = journal.document(journal.result_of(finished))
+    step.persist(DocumentRow(run=finished.run, kind="result", data=document))
+    entry = journal.Ended(
+        run=finished.run, status=finished.status, result=journal.digest(document), at=step.now
+    )
+    last = _append(state, entry, step)
+    place = msgspec.structs.replace(finished.committed, ended=last.seq, ended_head=last.head)
+    return msgspec.structs.replace(finished, committed=place)
+
+
+def disclose(state: State, event: events.DisclosureAsked, step: Step) -> None:
+    """Reveal the epochs of runs that are to be published; those that are revealed stay so."""
+    for run in state.runs.values():
+        if run.row.epoch in event.epochs:
+            step.refuse(event.request, Refusal.BUSY, because("epoch_in_use", run=run.id))
+            return
+    for epoch in event.epochs:
+        if epoch not in state.revealed:
+            state.revealed.add(epoch)
+            _append(state, journal.Revealed(epoch=epoch, runs=event.message.runs, at=step.now), step, epoch)
+            step.log("info", "epoch_revealed", epoch=epoch)
+    step.reply(event.request, Done())
+
+
+def _append(state: State, entry: journal.Entry, step: Step, reveals: str = "") -> JournalRow:
+    last = state.journal
+    data = journal.document(entry)
+    head = journal.EMPTY_HEAD if last is None else last.head
+    row = JournalRow(
+        seq=0 if last is None else last.seq + 1,
+        head=journal.head_after(head, data),
+        entry=data,
+        reveals=reveals,
+    )
+    step.persist(row)
+    state.journal = row
+    return row

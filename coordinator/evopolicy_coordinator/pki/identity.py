@@ -1,0 +1,47 @@
+"""The coordinator's identity towards the world: an Ed25519 key that signs what is published.
+
+It has nothing to do with the certificates of `certs`, which machines of one cluster show each other.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from evopolicy_coordinator.splits import load_or_create_secret
+
+SIGNING_KEY = "signing-key"
+"""File of the state folder: 32 random bytes, mode 0600."""
+_DOMAIN = b"evopolicy manifest 1\0"
+
+
+def public_key(state: Path) -> str:
+    """64 hex digits. The key is made on first use; ConfigError when its file is damaged, or others may read it."""
+    return _public(_private(state))
+
+
+def sign(state: Path, digest: str) -> tuple[str, str]:
+    """The public key (64 hex digits) and the signature (128) of a manifest's SHA-256 (hex)."""
+    key = _private(state)
+    return _public(key), key.sign(_DOMAIN + bytes.fromhex(digest)).hex()
+
+
+def signed_by(key: str, signature: str, digest: str) -> bool:
+    """Whether the owner of the public `key` signed the manifest's `digest`; False for anything malformed."""
+    try:
+        public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
+        public.verify(bytes.fromhex(signature), _DOMAIN + bytes.fromhex(digest))
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+def _private(state: Path) -> Ed25519PrivateKey:
+    return Ed25519PrivateKey.from_private_bytes(load_or_create_secret(state / SIGNING_KEY))
+
+
+def _public(key: Ed25519PrivateKey) -> str:
+    return key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()

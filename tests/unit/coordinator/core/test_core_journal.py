@@ -1,0 +1,172 @@
+"""The journal: every run that is opened, what was fixed of it, what became of it, and when its cases became public."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from asking import asked
+from core_rig import Rig
+
+from evopolicy_common.messages import operator
+from evopolicy_common.messages.operator import Done
+from evopolicy_common.messages.worker import Refused
+from evopolicy_common.records import journal
+from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.records import DocumentRow, JournalRow, RunRow
+
+
+def entries(rig: Rig) -> list[bytes]:
+    rows = sorted((row for row in rig.rows.values() if isinstance(row, JournalRow)), key=lambda row: row.seq)
+    assert [row.seq for row in rows] == list(range(len(rows)))
+    assert [row.head for row in rows] == journal.heads(row.entry for row in rows)
+    return [row.entry for row in rows]
+
+
+def told(rig: Rig) -> list[journal.Entry]:
+    return [journal.read_entry(entry) for entry in entries(rig)]
+
+
+def disclose(rig: Rig, *runs: str, epochs: tuple[str, ...] = ("e1",)) -> object:
+    request = rig.request()
+    message = operator.Disclose(token="", runs=runs)
+    return rig.tell(events.DisclosureAsked(request=request, message=message, epochs=epochs))
+
+
+def finish(rig: Rig, session: str, run: str = "r1") -> None:
+    rig.submit(0, run=run)
+    rig.work_off(session)
+    rig.close(run)
+    rig.work_off(session)
+
+
+def test_a_run_is_committed_to_in_the_transaction_that_makes_it() -> None:
+    rig = Rig()
+    rig.create(agent=None)
+    row = rig.row(RunRow, "r1")
+    document = rig.row(DocumentRow, "r1", "opening").data
+    (entry,) = told(rig)
+    assert isinstance(entry, Opened)
+    assert row.committed is not None
+    assert entry.commitment == row.committed.commitment == journal.commitment(row.salt, document)
+    assert (row.committed.opened, row.committed.opened_head) == (0, journal.heads(entries(rig))[0])
+    opening = msgspec.json.decode(document, type=Opening)
+    assert (opening.train, opening.validation, opening.heldout) == (row.train, row.validation, row.heldout)
+
+
+def test_what_is_committed_to_tells_nothing_of_the_operators_own() -> None:
+    rig = Rig()
+    rig.create(agent=None, notes={"invoice": "4711"}, agent_host="boot-of-mine")
+    document = rig.row(DocumentRow, "r1", "opening").data
+    assert b"4711" not in document
+    assert b"boot-of-mine" not in document
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_whatever_becomes_of_a_run_its_result_is_fixed(cancelled: bool) -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    if cancelled:
+        rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
+    else:
+        finish(rig, session)
+    opened, ended = told(rig)
+    assert isinstance(opened, Opened)
+    assert isinstance(ended, Ended)
+    finished = rig.finished()
+    document = rig.row(DocumentRow, "r1", "result").data
+    assert ended.result == journal.digest(document)
+    assert msgspec.json.decode(document, type=Result) == journal.result_of(finished)
+    assert ended.status == finished.status == ("cancelled" if cancelled else "completed")
+    assert finished.committed is not None
+    assert (finished.committed.ended, finished.committed.ended_head) == (1, journal.heads(entries(rig))[1])
+
+
+def test_a_run_that_is_asked_for_twice_is_entered_once() -> None:
+    rig = Rig()
+    rig.create(key="k", agent=None)
+    rig.create("r2", key="k", agent=None)
+    assert len(entries(rig)) == 1
+
+
+def test_the_journal_goes_on_after_a_restart_where_it_was() -> None:
+    rig = Rig()
+    rig.create(agent=None)
+    rig.load()
+    rig.create("r2", agent=None)
+    assert [entry.run for entry in told(rig) if isinstance(entry, Opened)] == ["r1", "r2"]
+
+
+def test_runs_of_an_earlier_version_end_without_an_entry() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    row = rig.row(RunRow, "r1")
+    rig.rows = {key: each for key, each in rig.rows.items() if not isinstance(each, JournalRow | DocumentRow)}
+    rig.rows[RunRow, "r1"] = msgspec.structs.replace(row, committed=None, salt=b"", epoch="")
+    rig.load()
+    session = rig.register()
+    finish(rig, session)
+    assert rig.finished().committed is None
+    assert entries(rig) == []
+
+
+def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(hidden_from=0)
+    rig.create("r2", hidden_from=5000)
+    finish(rig, session)
+    answer = disclose(rig, "r1")
+    assert isinstance(answer, Refused)
+    assert "run 'r2' is not finished" in answer.message
+    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r2"))
+    assert disclose(rig, "r1") == Done()
+    assert isinstance(told(rig)[-1], Revealed)
+
+
+def test_a_revealed_epoch_is_given_to_no_new_run_even_after_a_restart() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    finish(rig, session)
+    disclose(rig, "r1")
+    for _ in range(2):
+        answer = rig.create("r2", agent=None)
+        assert isinstance(answer, Refused)
+        assert "epoch new" in answer.message
+        rig.load()
+    assert isinstance(rig.create("r3", agent=None, epoch="next"), operator.RunCreated)
+
+
+def test_cases_that_are_public_anyway_may_be_played_on() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(split_secret=False)
+    finish(rig, session)
+    disclose(rig, "r1")
+    assert isinstance(rig.create("r2", agent=None, split_secret=False), operator.RunCreated)
+
+
+def test_what_is_revealed_already_gets_no_second_entry() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create()
+    finish(rig, session)
+    disclose(rig, "r1")
+    before = entries(rig)
+    assert disclose(rig, "r1") == Done()
+    assert entries(rig) == before
+
+
+def test_epochs_are_told_with_their_runs() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(epoch="a")
+    finish(rig, session)
+    disclose(rig, "r1", epochs=("a",))
+    rig.create("r2", epoch="b", agent=None)
+    first, second = journal.epochs(told(rig))
+    assert (first.epoch, first.opened, first.ended, first.revealed_at is not None) == ("a", 1, 1, True)
+    assert (second.epoch, second.opened, second.ended, second.revealed_at) == ("b", 1, 0, None)
