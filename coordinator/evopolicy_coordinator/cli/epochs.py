@@ -11,9 +11,10 @@ import typer
 
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.commands import App
+from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import journal
-from evopolicy_common.terminal import say, say_json, table, terminal
+from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_coordinator import splits
 from evopolicy_coordinator.pki.identity import public_key

@@ -62,6 +62,7 @@ submit([3])
 _TIMES = re.compile(r"(^|_)(at|time|timestamp|start_time|end_time|wall_time_seconds)$")
 _MACHINE = {
     "run",
+    "committed",
     "fingerprint",
     "harness_version",
     "program",
