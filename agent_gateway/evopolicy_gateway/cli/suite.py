@@ -21,6 +21,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.suite_folder import INDEX
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.alone import alone
 from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code, next_step
@@ -165,7 +166,7 @@ async def _suite(order: Order) -> int:
         console.print(results_table(entries))
         if (told := suite_index.told(index)) is not None:
             console.print(told)
-        console.print(f"index: {order.root / suite_index.FILE_NAME}", soft_wrap=True)
+        console.print(f"index: {order.root / INDEX}", soft_wrap=True)
         if any(entry.state == "completed" for entry in entries):
             console.print(next_step(order.root), soft_wrap=True)
     return exit_code([_end(order, index.runs.get(name), name) for name in names])

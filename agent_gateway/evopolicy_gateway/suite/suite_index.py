@@ -14,12 +14,12 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import INDEX
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.suite.suite_file import SuiteRun
 
 SCHEMA_VERSION = 1
-FILE_NAME = "suite.json"
 
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
 
@@ -70,7 +70,7 @@ class Index(msgspec.Struct, kw_only=True):
 
 def load(root: Path, suite: str) -> Index:
     """The index in a sweep's folder; a new one where there is none. ConfigError for one that is another sweep's."""
-    path = root / FILE_NAME
+    path = root / INDEX
     try:
         index = msgspec.json.decode(path.read_bytes(), type=Index)
     except FileNotFoundError:
@@ -88,7 +88,7 @@ def save(root: Path, index: Index) -> None:
     """Replaces `suite.json`; StorageError when the disk refuses."""
     index.updated_at = utc_text(time.time())
     root.mkdir(parents=True, exist_ok=True)
-    write_atomically(root / FILE_NAME, msgspec.json.format(msgspec.json.encode(index), indent=2) + b"\n")
+    write_atomically(root / INDEX, msgspec.json.format(msgspec.json.encode(index), indent=2) + b"\n")
 
 
 def state_of(record: RunRecord) -> State:

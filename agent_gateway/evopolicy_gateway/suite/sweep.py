@@ -28,6 +28,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses import session
@@ -89,6 +90,7 @@ class Sweep:
         self._moved = asyncio.Event()
         """An agent has gone."""
         self._unsaved = False
+        self._paused = False
         view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
@@ -144,7 +146,12 @@ class Sweep:
         self._moved.clear()
 
     def _startable(self, todo: list[Decision], by_name: dict[str, Decision]) -> list[Decision]:
-        """Runs that the limits let begin now."""
+        """Runs that the limits let begin now; none while the sweep is paused."""
+        was_paused, self._paused = self._paused, (self._root / PAUSED).exists()
+        if self._paused:
+            if not was_paused:
+                self._view.say(f"paused: no further run begins while {self._root / PAUSED} is there")
+            return []
         limits = self._suite.parallel
         under_way = [by_name[name].run for name in self._active]
         placed = [by_name[name].run for name in self._active if name not in self._scored]

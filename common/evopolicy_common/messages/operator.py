@@ -447,6 +447,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Why it plays no hidden episodes now; empty when it may."""
     classes: Named[Word] = {}
     """Environment to its fingerprint class here: only workers of one class share a run of it."""
+    playing: Named[Int] = {}
+    """Episode jobs that it plays now, by run or evaluation."""
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -466,6 +468,12 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     waits_for: Text = ""
     agent_host: Word = ""
     """Where its agent may be alive: a host's name, a boot id, or `everywhere`; empty: nowhere."""
+    exp_id: Word = ""
+    repeat: Int = 0
+    best_mean: Number | None = None
+    """Highest visible mean return of its ok submits so far."""
+    created_at: Number = 0.0
+    """Unix time, seconds."""
 
 
 class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):

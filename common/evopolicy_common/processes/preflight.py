@@ -142,6 +142,7 @@ EXTRAS = {
     "cryptography": "coordinator",
     "jinja2": "coordinator",
     "matplotlib": "coordinator",
+    "prometheus_client": "coordinator",
     "starlette": "gateway",
     "uvicorn": "gateway",
     "h11": "gateway",

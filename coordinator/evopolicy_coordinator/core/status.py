@@ -13,7 +13,7 @@ from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 from .agents import permits
 from .isolation import bars
 from .leasing import pins
-from .model import AUDIT, Lane, Run, Worker
+from .model import AUDIT, Lane, Lease, Run, Worker
 from .reasons import Reason
 from .runs import audits, finished
 from .runs.waits import waits_for
@@ -79,7 +79,18 @@ def _worker(state: State, worker: Worker, now: float) -> WorkerStatus:
         refused=pins.refused_runs(state, worker),
         boot_id=worker.kernel.boot_id,
         hidden_bar=bars.bar_of_worker(state, worker),
+        playing=_playing(live),
     )
+
+
+def _playing(live: list[Lease]) -> dict[str, int]:
+    """Jobs that are played now, by run or evaluation."""
+    found: dict[str, int] = {}
+    for lease in live:
+        if lease.running:
+            run = lease.job.group.run
+            found[run] = found.get(run, 0) + 1
+    return found
 
 
 def _run(state: State, run: Run, words: Words) -> RunStatus:
@@ -99,6 +110,13 @@ def _run(state: State, run: Run, words: Words) -> RunStatus:
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=words(waiting[0] if waiting else waits),
         agent_host=permits.agents(state, run.id),
+        exp_id=run.row.settings.exp_id,
+        repeat=run.row.settings.repeat,
+        best_mean=max(
+            (row.mean_return for row in run.submits if row.status == "ok" and row.mean_return is not None),
+            default=None,
+        ),
+        created_at=run.row.created_at,
     )
 
 

@@ -1,0 +1,195 @@
+"""Who may read and act: tokens, cookies, and the checks of every request.
+
+Rules that this module owns:
+- A token is needed on loopback too, since an agent without a jail reaches loopback. It travels in the body of a sign-in, in
+  a cookie or in an `Authorization` header, never in a path or a query, which logs and histories keep. The printed URL has it
+  in its fragment, which browsers send to nobody.
+- The reading token and the acting token are different. Without `--act` there is no acting token at all.
+- `Host` must be an address or a name of this server, else a page elsewhere could be made to resolve to it (DNS rebinding).
+- A request that another site's page caused is refused, whatever cookies come with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import secrets
+import socket
+from collections.abc import Iterable
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from typing import Literal
+from urllib.parse import urlsplit
+
+import msgspec
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.records.blobs import write_atomically
+
+Role = Literal["read", "act"]
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Content security policy of every page: no inline script or style, nothing from elsewhere."""
+_HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+_OPEN = ("/login", "/static/", "/healthz")
+"""Paths that need no token: they tell nothing."""
+_LOOPBACK_NAMES = ("localhost",)
+
+
+class Tokens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The secrets of one view."""
+
+    read: str
+    act: str
+
+    @classmethod
+    def drawn(cls) -> Tokens:
+        """New ones."""
+        return cls(read=secrets.token_urlsafe(32), act=secrets.token_urlsafe(32))
+
+
+def kept_tokens(path: Path) -> Tokens:
+    """The tokens in a file of mode 0600, which is made where it is not there. ConfigError for a file that is no such file."""
+    try:
+        if path.stat().st_mode & 0o077:
+            raise ConfigError(f"--token-file {path} may be read by others: chmod 600 it")
+        found = msgspec.json.decode(path.read_bytes(), type=Tokens)
+    except FileNotFoundError:
+        found = Tokens.drawn()
+        write_atomically(path, msgspec.json.encode(found), mode=0o600)
+    except OSError as error:
+        raise ConfigError(f"--token-file {path} cannot be read: {error.strerror or error}") from error
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"--token-file {path}: {error}; remove it to have it made anew") from error
+    if min(len(found.read), len(found.act)) < 32 or found.read == found.act:
+        raise ConfigError(f"--token-file {path}: two different tokens of 32 characters or more are needed")
+    return found
+
+
+class Access:
+    """Decides about requests."""
+
+    def __init__(self, tokens: Tokens, *, acting: bool, names: Iterable[str] = (), cookie: str) -> None:
+        """`names`: host names, beside addresses and localhost, under which browsers find this server."""
+        self.cookie = cookie
+        own = {socket.gethostname().lower(), *(name.lower() for name in names), *_LOOPBACK_NAMES}
+        self._names = frozenset(name.rstrip(".") for name in own if name)
+        self._tokens: dict[Role, str] = {"read": tokens.read}
+        if acting:
+            self._tokens["act"] = tokens.act
+
+    def role_of_token(self, token: str) -> Role | None:
+        """What a token allows; None for a wrong one."""
+        told = token.encode()
+        found: Role | None = None
+        for role, right in self._tokens.items():
+            if hmac.compare_digest(told, right.encode()):
+                found = role
+        return found
+
+    def cookie_of(self, role: Role) -> str:
+        """What the cookie holds: it follows from the token, so it outlives a restart where the token does."""
+        return hmac.new(self._tokens[role].encode(), b"evopolicy web cookie", hashlib.sha256).hexdigest()
+
+    def role_of(self, headers: Headers) -> Role | None:
+        """What a request may do, by its cookie or its `Authorization`."""
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer":
+            return self.role_of_token(token.strip())
+        try:
+            morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
+        except CookieError:
+            return None
+        told = "" if morsel is None else morsel.value
+        found: Role | None = None
+        for role in self._tokens:
+            if hmac.compare_digest(told.encode(), self.cookie_of(role).encode()):
+                found = role
+        return found
+
+    def is_own_host(self, host: str) -> bool:
+        """Whether `Host` names this server: an address, which nobody can rebind, or one of its names."""
+        name = _name_of(host)
+        try:
+            ipaddress.ip_address(name.strip("[]"))
+        except ValueError:
+            return name in self._names
+        return True
+
+    def objection(self, method: str, headers: Headers) -> tuple[int, str] | None:
+        """Why a request is refused before anything else is looked at; None for a good one."""
+        host = headers.get("host", "")
+        if not self.is_own_host(host):
+            return 421, (
+                f"This server is not called {_name_of(host)[:100]!r}. Use its address, or start it with --name for that name."
+            )
+        origin = headers.get("origin")
+        same = origin is not None and urlsplit(origin).netloc.lower() == host.lower()
+        if origin is not None and not same:
+            return 403, "The request comes from another site's page."
+        site = headers.get("sec-fetch-site", "none")
+        if site not in ("same-origin", "none") and headers.get("sec-fetch-mode") != "navigate":
+            return 403, "The request comes from another site's page."
+        if method not in ("GET", "HEAD") and not same and headers.get("authorization") is None:
+            return 403, "The request does not tell its origin."
+        return None
+
+
+def _name_of(host: str) -> str:
+    """The name in a `Host` header, without its port."""
+    host = host.strip().lower()
+    if host.startswith("["):
+        return host.partition("]")[0] + "]"
+    return host.partition(":")[0].rstrip(".")
+
+
+class Guard:
+    """ASGI middleware: checks every request, and gives every answer its security headers. `scope["role"]` tells the rest."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            if scope["type"] == "lifespan":
+                await self._app(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        answer = self._refusal(scope)
+        await (answer or self._app)(scope, receive, with_headers)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers, path = Headers(scope=scope), str(scope["path"])
+        if (objection := self._access.objection(scope["method"], headers)) is not None:
+            return PlainTextResponse(objection[1] + "\n", objection[0])
+        role = scope["role"] = self._access.role_of(headers)
+        if role is not None or path in _OPEN or path.startswith("/static/"):
+            return None
+        if scope["method"] == "GET" and "text/html" in headers.get("accept", ""):
+            return RedirectResponse("/login", 303)
+        return PlainTextResponse(
+            "Sign in with the token that `evopolicy web` prints.\n", 401, {"www-authenticate": "Bearer"}
+        )

@@ -1,0 +1,140 @@
+"""What the coordinator tells of the cluster, asked for as often as somebody looks, and its history of a day.
+
+Rules: at most one question at a time, and after each a pause of `_SHARE` times what the answer took, so that any number of
+browsers costs the coordinator a small fixed share of a core. Without anybody who looks it is asked every `_IDLE_S` for the
+history.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.operator import StatusReply
+from evopolicy_common.wire import transport
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_common.wire.operator_client import OperatorClient
+
+_LEAST_PAUSE_S = 1.0
+_IDLE_S = 30.0
+_SHARE = 100.0
+_RETRY_S = 2.0
+_SAMPLE_S = 60.0
+_SAMPLES = 24 * 60
+"""A day."""
+STALE_S = 90.0
+"""After so long without an answer nothing of the last one is relied on."""
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class Sample(msgspec.Struct, frozen=True, kw_only=True):
+    """One minute of the history."""
+
+    at: float
+    episodes_per_s: float
+    running: int
+    queued: int
+    slots: int
+    workers: int
+
+
+class Cluster:
+    """The latest status of a cluster, and its history. `watched` says whether somebody looks."""
+
+    def __init__(
+        self, credentials: Credentials, watched: Callable[[], bool], changed: Callable[[], None]
+    ) -> None:
+        self.status: StatusReply | None = None
+        self.history: deque[Sample] = deque(maxlen=_SAMPLES)
+        self.trouble = ""
+        """Why there is no answer now; empty while there is."""
+        self.operator: OperatorClient | None = None
+        self.asked_s = 0.0
+        """How long the last answer took."""
+        self._at = float("-inf")
+        self._credentials = credentials
+        self._watched = watched
+        self._changed = changed
+        self._wake = asyncio.Event()
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the status is recent enough to decide by."""
+        return self.status is not None and time.monotonic() - self._at < STALE_S
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the last answer."""
+        return time.monotonic() - self._at
+
+    def look(self) -> None:
+        """Somebody looks: the next question need not wait for the idle pause."""
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Asks until it is cancelled; a coordinator that is away is asked again."""
+        while True:
+            try:
+                async with transport.connect(self._credentials) as link:
+                    self.operator = OperatorClient(link)
+                    await self._ask_on(self.operator)
+            except (EvopolicyError, TimeoutError) as error:
+                self._failed(str(error))
+            finally:
+                self.operator = None
+            await asyncio.sleep(_RETRY_S)
+
+    async def _ask_on(self, operator: OperatorClient) -> None:
+        while True:
+            began = time.monotonic()
+            try:
+                status = await operator.status()
+            except EvopolicyError as error:
+                # The link makes itself anew; what it needs is time.
+                self._failed(str(error))
+                await asyncio.sleep(_RETRY_S)
+                continue
+            self.asked_s = time.monotonic() - began
+            self.take(status)
+            pause = max(_LEAST_PAUSE_S, _SHARE * self.asked_s)
+            if self._watched():
+                await asyncio.sleep(min(pause, _IDLE_S))
+            else:
+                await asyncio.sleep(min(pause, _IDLE_S))
+                self._wake.clear()
+                try:
+                    async with asyncio.timeout(max(0.0, _IDLE_S - pause)):
+                        await self._wake.wait()
+                except TimeoutError:
+                    pass
+
+    def take(self, status: StatusReply) -> None:
+        """A new status."""
+        self.status, self._at, self.trouble = status, time.monotonic(), ""
+        now = time.time()
+        if not self.history or now - self.history[-1].at >= _SAMPLE_S:
+            active = [worker for worker in status.workers if worker.state == "active"]
+            self.history.append(
+                Sample(
+                    at=now,
+                    episodes_per_s=status.episodes_per_s,
+                    running=sum(run.running for run in status.runs),
+                    queued=sum(run.queued for run in status.runs),
+                    slots=sum(worker.slots for worker in active),
+                    workers=len(active),
+                )
+            )
+        self._changed()
+
+    def _failed(self, why: str) -> None:
+        if not self.trouble:
+            log.warning("the coordinator does not answer", why=why)
+        self.trouble = why
+        self._changed()

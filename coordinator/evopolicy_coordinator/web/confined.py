@@ -1,0 +1,112 @@
+"""Files below one folder, read without being led out of it.
+
+Agents write the names and the files in a run directory. No link is followed, in no component of a path; pipes and devices
+are not opened; every read has a limit.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import NamedTuple
+
+_MAX_DEPTH = 64
+_MAX_NAMES = 5000
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+class NotThereError(Exception):
+    """There is no such file or folder, or it is none that may be read."""
+
+
+class Name(NamedTuple):
+    """One entry of a folder."""
+
+    name: str
+    is_folder: bool
+    size: int
+    """Bytes; 0 for a folder."""
+
+
+class Confined:
+    """What lies below `root`, which is trusted itself. Paths are relative, with `/`; NotThereError for all that is refused."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def open(self, path: str) -> int:
+        """A descriptor of a regular file, which the caller closes."""
+        *folders, name = _parts(path)
+        folder = self._folder(folders)
+        try:
+            fd = os.open(name, _FILE, dir_fd=folder)
+        except (OSError, ValueError) as error:
+            raise NotThereError(path) from error
+        finally:
+            os.close(folder)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise NotThereError(path)
+        return fd
+
+    def read(self, path: str, limit: int, offset: int = 0) -> bytes:
+        """At most `limit` bytes of a regular file."""
+        fd = self.open(path)
+        with os.fdopen(fd, "rb") as file:
+            file.seek(offset)
+            return file.read(limit)
+
+    def size(self, path: str) -> int:
+        """Bytes of a regular file."""
+        fd = self.open(path)
+        try:
+            return os.fstat(fd).st_size
+        finally:
+            os.close(fd)
+
+    def names(self, path: str) -> list[Name]:
+        """Regular files and folders of a folder, by name, the first few thousand; links and all else are left out."""
+        folder = self._folder(_parts(path) if path else [])
+        found: list[Name] = []
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if len(found) == _MAX_NAMES:
+                        break
+                    try:
+                        info = entry.stat(follow_symlinks=False)
+                    except OSError:
+                        continue
+                    if stat.S_ISDIR(info.st_mode):
+                        found.append(Name(entry.name, True, 0))
+                    elif stat.S_ISREG(info.st_mode):
+                        found.append(Name(entry.name, False, info.st_size))
+        except OSError as error:
+            raise NotThereError(path) from error
+        finally:
+            os.close(folder)
+        return sorted(found)
+
+    def _folder(self, parts: list[str]) -> int:
+        try:
+            fd = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise NotThereError(str(self.root)) from error
+        for part in parts:
+            try:
+                below = os.open(part, _FOLDER, dir_fd=fd)
+            except (OSError, ValueError) as error:
+                raise NotThereError("/".join(parts)) from error
+            finally:
+                os.close(fd)
+            fd = below
+        return fd
+
+
+def _parts(path: str) -> list[str]:
+    parts = path.split("/")
+    if len(parts) > _MAX_DEPTH or any(part in ("", ".", "..") or "\0" in part for part in parts):
+        raise NotThereError(path)
+    return parts

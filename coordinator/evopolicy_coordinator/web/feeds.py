@@ -1,0 +1,132 @@
+"""What browsers are told as it changes: differences, for all who have the same page open.
+
+A page is made of parts, each an HTML element with an id, and of lists of parts in an order. A feed keeps the latest of each
+part and the version at which it changed. So a browser that slept, or whose network is slow, asks for what has changed since
+the version that it has: it loses nothing, and nothing is queued for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+LEAST_PAUSE_S = 0.5
+"""Between two updates of one browser."""
+KEEP_ALIVE_S = 15.0
+"""A comment is sent after so long without an update, so that dead connections are noticed."""
+MAX_FEEDS = 512
+"""Pages that are kept for browsers; those that nobody watches are let go of first."""
+
+
+class View(msgspec.Struct, frozen=True, kw_only=True):
+    """A page's content at one moment. Every part's HTML is one element whose id is the part's name."""
+
+    parts: Mapping[str, str]
+    lists: Mapping[str, Sequence[str]] = {}
+    """By id of the element that holds them: names of parts, in order."""
+
+
+class Feed:
+    """The latest of one page."""
+
+    def __init__(self) -> None:
+        self.epoch = secrets.token_hex(4)
+        """Versions of another feed, before a restart, mean nothing here."""
+        self.version = 0
+        self.watchers = 0
+        self._parts: dict[str, tuple[int, str]] = {}
+        self._lists: dict[str, tuple[int, tuple[str, ...]]] = {}
+        self._changed = asyncio.Event()
+
+    @property
+    def cursor(self) -> str:
+        """Where a browser stands that has all of it."""
+        return f"{self.epoch}.{self.version}"
+
+    def update(self, view: View) -> None:
+        """Takes what has changed."""
+        version = self.version + 1
+        changed = False
+        parts: dict[str, tuple[int, str]] = {}
+        for name, html in view.parts.items():
+            known = self._parts.get(name)
+            parts[name] = known if known is not None and known[1] == html else (version, html)
+            changed = changed or parts[name] is not known
+        lists: dict[str, tuple[int, tuple[str, ...]]] = {}
+        for name, order in view.lists.items():
+            listed = self._lists.get(name)
+            lists[name] = (
+                listed if listed is not None and listed[1] == tuple(order) else (version, tuple(order))
+            )
+            changed = changed or lists[name] is not listed
+        self._parts, self._lists = parts, lists
+        if changed:
+            self.version = version
+            event, self._changed = self._changed, asyncio.Event()
+            event.set()
+
+    def since(self, cursor: str) -> dict[str, Any] | None:
+        """What has changed since a cursor, all of it for a cursor that is not known; None where nothing has."""
+        epoch, _, told = cursor.partition(".")
+        known = int(told) if epoch == self.epoch and told.isdecimal() and len(told) < 16 else -1
+        if known >= self.version:
+            return None
+        return {
+            "parts": {name: html for name, (version, html) in self._parts.items() if version > known},
+            "lists": {name: order for name, (version, order) in self._lists.items() if version > known},
+        }
+
+    async def events(self, cursor: str) -> AsyncIterator[bytes]:
+        """Server-sent events from a cursor on, for as long as they are asked for."""
+        self.watchers += 1
+        try:
+            yield b"retry: 2000\n\n"
+            while True:
+                changed = self._changed
+                found = self.since(cursor)
+                if found is None:
+                    try:
+                        async with asyncio.timeout(KEEP_ALIVE_S):
+                            await changed.wait()
+                    except TimeoutError:
+                        yield b": still here\n\n"
+                    continue
+                cursor = self.cursor
+                yield b"id: %s\nevent: update\ndata: %s\n\n" % (cursor.encode(), msgspec.json.encode(found))
+                await asyncio.sleep(LEAST_PAUSE_S)
+        finally:
+            self.watchers -= 1
+
+
+class Feeds:
+    """The feeds of all pages that somebody has open, by what makes their view."""
+
+    def __init__(self) -> None:
+        self._feeds: dict[str, tuple[Feed, Callable[[], View]]] = {}
+
+    def of(self, name: str, view: Callable[[], View], current: View | None = None) -> Feed:
+        """The feed of a page; `view` makes its content, `current` is what it is now where that is known."""
+        found = self._feeds.pop(name, None)
+        feed = Feed() if found is None else found[0]
+        self._feeds[name] = feed, view
+        if current is not None:
+            feed.update(current)
+        for other in list(self._feeds):
+            if len(self._feeds) <= MAX_FEEDS:
+                break
+            if other != name and not self._feeds[other][0].watchers:
+                del self._feeds[other]
+        return feed
+
+    def watched(self) -> list[tuple[Feed, Callable[[], View]]]:
+        """Those that a browser follows now."""
+        return [each for each in self._feeds.values() if each[0].watchers]
+
+    @property
+    def watchers(self) -> int:
+        """Browsers that follow a page."""
+        return sum(feed.watchers for feed, _ in self._feeds.values())

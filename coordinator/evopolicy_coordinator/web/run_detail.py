@@ -1,0 +1,468 @@
+"""What one run's pages show: code at each submit, episodes, the agent's words, the run's events.
+
+All of it was written by an agent or a policy, or quotes one: it is text, bounded in length, and never markup. Code of an
+open run is in its gateway's folder, found by the gateway's journal; of a finished one in its checkpoints.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.errors import DECODE_ERRORS, BundleError
+from evopolicy_common.records import bundles
+from evopolicy_common.records.blobs import is_digest
+from evopolicy_common.records.checkpoints import METADATA
+from evopolicy_coordinator.web.confined import Confined, NotThereError
+
+MAX_TEXT = 256 << 10
+"""Characters of one file, or of one text, that are shown."""
+_MAX_FILES = 200
+_MAX_BUNDLE = 64 << 20
+_MAX_JOURNAL = 64 << 20
+_TAIL = 512 << 10
+"""Bytes of a log from its end that are read at once."""
+_MAX_LINE = 20_000
+MAX_WORDS = 150
+"""Entries of the agent's log, and of the run's events, on a page."""
+MAX_STEPS = 20_000
+"""Steps of an episode that are read for its plots."""
+_MAX_TRAJECTORY = 64 << 20
+_MAX_SERIES = 8
+"""Components of an observation or action that are drawn."""
+IMAGES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".gif": "image/gif",
+    ".webp": "image/webp",
+}
+"""Pictures that are shown in place; SVG is none of them, as it is a document with scripts."""
+
+
+class CodeFile(msgspec.Struct, frozen=True, kw_only=True):
+    """One file of `system/` at a submit."""
+
+    path: str
+    size: int
+    text: str | None
+    """None for one that is no text, or too large."""
+
+
+class Said(msgspec.Struct, frozen=True, kw_only=True):
+    """One entry of the agent's log."""
+
+    at: int
+    """Its place in the log, bytes."""
+    kind: str
+    """`prompt`, `message`, `tool`, `result`, `output`, `stderr`, `note`."""
+    title: str
+    text: str
+
+
+class Happened(msgspec.Struct, frozen=True, kw_only=True):
+    """One event of the run."""
+
+    at: str
+    level: str
+    text: str
+
+
+class Series(msgspec.Struct, frozen=True, kw_only=True):
+    """One line of a plot."""
+
+    name: str
+    values: tuple[float, ...]
+
+
+class Played(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode's trajectory, as far as it can be drawn."""
+
+    steps: int
+    rewards: tuple[Series, ...]
+    observations: tuple[Series, ...]
+    actions: tuple[Series, ...]
+    note: str = ""
+
+
+class Detail:
+    """Reads one run's folder. Cheap to make; what is costly is kept by the caller."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files = Confined(folder)
+
+    # ---- code ----
+
+    def code(self, index: int, *, checkpoints: bool) -> tuple[CodeFile, ...]:
+        """`system/` as it was at a submit; empty where it is not told. `checkpoints`: the run's own may be read."""
+        digest = self._bundle_of(index)
+        if digest is not None:
+            found = _unpacked(self.files, digest)
+            if found is not None:
+                return found
+        return self._checkpoint(index) if checkpoints else ()
+
+    def _bundle_of(self, index: int) -> str | None:
+        """The digest of a submit's snapshot, by the gateway's journal."""
+        try:
+            data = self.files.read(".gateway/journal.jsonl", _MAX_JOURNAL)
+        except NotThereError:
+            return None
+        bundles_by_key: dict[str, str | None] = {}
+        for entry in _objects(data.splitlines()):
+            if entry.get("what") == "requested":
+                bundles_by_key[str(entry.get("key"))] = entry.get("bundle") or entry.get("kept")
+            elif entry.get("what") == "accepted" and entry.get("submit_index") == index:
+                digest = bundles_by_key.get(str(entry.get("key")))
+                return digest if isinstance(digest, str) and is_digest(digest) else None
+        return None
+
+    def _checkpoint(self, index: int) -> tuple[CodeFile, ...]:
+        for width in range(3, 8):
+            folder = f"checkpoints/submit_{index:0{width}d}"
+            try:
+                self.files.names(folder)
+            except NotThereError:
+                continue
+            found = [
+                CodeFile(path=path, size=size, text=self._text(f"{folder}/{path}"))
+                for path, size in self._below(folder)
+                if path not in METADATA
+            ]
+            return tuple(_ordered(found))
+        return ()
+
+    def _below(self, folder: str) -> Iterator[tuple[str, int]]:
+        waiting, n = [""], 0
+        while waiting and n < _MAX_FILES:
+            inner = waiting.pop()
+            for name in self.files.names(f"{folder}/{inner}".rstrip("/")):
+                path = f"{inner}{name.name}"
+                if name.is_folder:
+                    waiting.append(f"{path}/")
+                elif n < _MAX_FILES:
+                    n += 1
+                    yield path, name.size
+
+    def _text(self, path: str) -> str | None:
+        try:
+            return _as_text(self.files.read(path, MAX_TEXT + 1))
+        except NotThereError:
+            return None
+
+    # ---- feedback ----
+
+    def folder_of(self, index: int) -> str | None:
+        """The feedback folder of a submit."""
+        for width in range(3, 8):
+            name = f"workspace/feedback/submit_{index:0{width}d}"
+            try:
+                self.files.names(name)
+            except NotThereError:
+                continue
+            return name
+        return None
+
+    def summary(self, index: int) -> Mapping[str, Any]:
+        """A submit's summary, as its agent has it; empty where there is none."""
+        folder = self.folder_of(index)
+        if folder is None:
+            return {}
+        try:
+            found = msgspec.json.decode(self.files.read(f"{folder}/summary.json", _MAX_TRAJECTORY))
+        except (NotThereError, *DECODE_ERRORS):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def episodes(self, index: int) -> list[int]:
+        """The numbers of a submit's episodes that have a folder, counted through the run."""
+        folder = self.folder_of(index)
+        try:
+            names = [] if folder is None else self.files.names(f"{folder}/episodes")
+        except NotThereError:
+            return []
+        numbers = [name.name.removeprefix("ep_") for name in names if name.is_folder]
+        return sorted(int(number) for number in numbers if number.isdecimal() and len(number) < 10)
+
+    def episode_files(self, index: int, episode: int) -> tuple[str, list[str]]:
+        """The folder of an episode, and the names of its files. NotThereError for none."""
+        folder = self.folder_of(index)
+        if folder is None:
+            raise NotThereError(f"submit {index}")
+        for width in range(3, 8):
+            inner = f"{folder}/episodes/ep_{episode:0{width}d}"
+            try:
+                return inner, [name.name for name in self.files.names(inner) if not name.is_folder]
+            except NotThereError:
+                continue
+        raise NotThereError(f"episode {episode}")
+
+    def text(self, path: str) -> str:
+        """The beginning of a file as text; empty where there is none."""
+        try:
+            data = self.files.read(path, MAX_TEXT)
+        except NotThereError:
+            return ""
+        return data.decode("utf-8", "replace")
+
+    def played(self, folder: str) -> Played:
+        """An episode's columns, for plots."""
+        rewards: list[float] = []
+        actions: list[Any] = []
+        inline: list[Any] = []
+        data = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY)
+        for row in _objects(data.splitlines()):
+            if len(rewards) == MAX_STEPS:
+                break
+            reward = row.get("reward")
+            rewards.append(float(reward) if isinstance(reward, int | float) else float("nan"))
+            actions.append(row.get("action"))
+            inline.append(row.get("obs"))
+        observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
+        observations, note = _series(observed, len(rewards), "obs")
+        acted, _ = _series(actions, len(rewards), "action")
+        return Played(
+            steps=len(rewards),
+            rewards=(Series(name="reward", values=tuple(rewards)),),
+            observations=observations,
+            actions=acted,
+            note=note,
+        )
+
+    def _arrays(self, folder: str) -> Any:
+        for name in ("observations.npy", "observations.npz"):
+            try:
+                data = self.files.read(f"{folder}/{name}", _MAX_TRAJECTORY)
+                found = np.load(io.BytesIO(data), allow_pickle=False)
+                return found if isinstance(found, np.ndarray) else {key: found[key] for key in found.files}
+            except (NotThereError, OSError, ValueError, KeyError, EOFError, MemoryError):
+                continue
+        return None
+
+    def replays(self) -> list[str]:
+        """Names of the recorded hidden episodes. They are hidden results: only for whom those may be shown."""
+        try:
+            names = [name.name for name in self.files.names("replays") if name.is_folder]
+        except NotThereError:
+            return []
+        return [name for name in names if self._is_file(f"replays/{name}/video.mp4")]
+
+    def _is_file(self, path: str) -> bool:
+        try:
+            return self.files.size(path) > 0
+        except NotThereError:
+            return False
+
+    # ---- words and events ----
+
+    def said(self, before: int | None = None) -> list[Said]:
+        """The last entries of the agent's log, or the last that begin before a place in it; oldest first."""
+        found: list[Said] = []
+        for at, line in self._last_lines("logs/agent.jsonl", before):
+            found += _said(at, line)
+        return found[-MAX_WORDS:]
+
+    def happened(self) -> list[Happened]:
+        """The last events of the run; newest first."""
+        found = []
+        for _, line in self._last_lines("logs/harness.log", None):
+            for entry in _objects([line]):
+                found.append(_event(entry))
+        return found[-MAX_WORDS:][::-1]
+
+    def _last_lines(self, path: str, before: int | None) -> list[tuple[int, bytes]]:
+        """Whole lines near the end of a file, or before a place in it, with their places."""
+        try:
+            fd = self.files.open(path)
+        except NotThereError:
+            return []
+        with os.fdopen(fd, "rb") as file:
+            end = os.fstat(fd).st_size if before is None else max(0, before)
+            start = max(0, end - _TAIL)
+            file.seek(start)
+            data = file.read(end - start)
+        whole = data.rfind(b"\n") + 1
+        found: list[tuple[int, bytes]] = []
+        place = 0
+        for line in data[:whole].splitlines(keepends=True):
+            if place or start == 0:
+                found.append((start + place, line))
+            place += len(line)
+        return found
+
+
+_unpacked_bundles: OrderedDict[str, tuple[CodeFile, ...]] = OrderedDict()
+
+
+def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
+    """The files of a stored bundle; bundles are immutable, so the last few are kept."""
+    if digest in _unpacked_bundles:
+        return _unpacked_bundles[digest]
+    try:
+        packed = files.read(f".gateway/bundles/{digest[:2]}/{digest}", _MAX_BUNDLE)
+        bundle = bundles.load(packed, digest)
+    except (NotThereError, BundleError, *DECODE_ERRORS):
+        return None
+    found = tuple(
+        _ordered(
+            CodeFile(path=file.path, size=len(file.data), text=_as_text(file.data))
+            for file in bundle.files[:_MAX_FILES]
+        )
+    )
+    _unpacked_bundles[digest] = found
+    if len(_unpacked_bundles) > 16:
+        _unpacked_bundles.popitem(last=False)
+    return found
+
+
+def _ordered(files: Any) -> list[CodeFile]:
+    return sorted(files, key=lambda file: (file.path != "policy.py", file.path))
+
+
+def _as_text(data: bytes) -> str | None:
+    if len(data) > MAX_TEXT or b"\0" in data:
+        return None
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def _objects(lines: list[bytes]) -> Iterator[dict[str, Any]]:
+    for line in lines:
+        try:
+            value = msgspec.json.decode(line)
+        except DECODE_ERRORS:
+            continue
+        if isinstance(value, dict):
+            yield value
+
+
+def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
+    """Lines of what is numbers of one length; and a note where something is left out."""
+    if columns is None:
+        return (), ""
+    if isinstance(columns, dict):
+        parts = [_series(value, n, key) for key, value in sorted(columns.items())]
+        found = tuple(each for one, _ in parts for each in one)
+        return found[:_MAX_SERIES], next((note for _, note in parts if note), "")
+    if isinstance(columns, list) and columns and isinstance(columns[0], dict):
+        names = sorted(columns[0])
+        rows = [row if isinstance(row, dict) else {} for row in columns]
+        return _series({key: [row.get(key) for row in rows] for key in names}, n, name)
+    try:
+        array = np.asarray(columns, dtype=np.float64)
+    except (TypeError, ValueError):
+        return (), f"{name} is not made of numbers of one shape, so it is not drawn."
+    if array.ndim == 0 or not len(array):
+        return (), ""
+    array = array[:n].reshape(len(array[:n]), -1)
+    width = array.shape[1]
+    if width > 64:
+        return (), f"{name} has {width:,} numbers a step, so it is not drawn."
+    kept = range(min(width, _MAX_SERIES))
+    found = tuple(
+        Series(name=name if width == 1 else f"{name}[{i}]", values=tuple(map(float, array[:, i])))
+        for i in kept
+    )
+    return found, f"The first {_MAX_SERIES} of {width} components are drawn." if width > _MAX_SERIES else ""
+
+
+# ---- the agent's log ----
+
+
+def _said(at: int, line: bytes) -> Iterator[Said]:
+    for value in _objects([line]):
+        for number, (kind, title, text) in enumerate(_entries(value)):
+            if text.strip() or title:
+                yield Said(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
+
+
+def _entries(value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Kind, title and text of what a line tells, in the forms that harnesses write."""
+    kind = value.get("type")
+    if kind == "prompt":
+        yield "prompt", "Prompt", str(value.get("message", ""))
+    elif kind in ("stdout", "stderr"):
+        yield ("output" if kind == "stdout" else "stderr"), "", str(value.get("text", ""))
+    elif kind in ("assistant", "user") and isinstance(value.get("message"), dict):
+        content = value["message"].get("content")
+        for block in [{"type": "text", "text": content}] if isinstance(content, str) else content or ():
+            if isinstance(block, dict):
+                yield from _block(block)
+    elif kind == "item.completed" and isinstance(value.get("item"), dict):
+        yield from _item(value["item"])
+    elif isinstance(value.get("turn"), int) and "text" in value:
+        yield "message", "", str(value["text"])
+    elif kind == "result":
+        yield "note", "Turn ended", str(value.get("subtype", ""))
+    elif kind in ("log_full", "error"):
+        yield "note", str(kind), str(value.get("text") or value.get("message") or "")
+
+
+def _block(block: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    kind = block.get("type")
+    if kind == "text":
+        yield "message", "", str(block.get("text", ""))
+    elif kind == "thinking":
+        yield "message", "Thinking", str(block.get("thinking", ""))
+    elif kind == "tool_use":
+        yield "tool", str(block.get("name", "tool")), _plain(block.get("input"))
+    elif kind == "tool_result":
+        yield "result", "Result", _plain(block.get("content"))
+
+
+def _item(item: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    kind = item.get("type") or item.get("item_type")
+    if kind in ("agent_message", "assistant_message"):
+        yield "message", "", str(item.get("text", ""))
+    elif kind == "reasoning":
+        yield "message", "Thinking", str(item.get("text", ""))
+    elif kind == "command_execution":
+        yield "tool", "shell", _plain(item.get("command"))
+        yield "result", "Result", _plain(item.get("aggregated_output"))
+    elif kind in ("mcp_tool_call", "file_change"):
+        yield "tool", str(kind), _plain(item.get("arguments") or item.get("changes"))
+
+
+def _plain(value: Any) -> str:
+    """A tool's input or output as text: strings as they are, one name a line."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, dict):
+        if value.get("type") == "text":
+            return str(value.get("text", ""))
+        return "\n".join(f"{name}: {_plain(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return "\n".join(_plain(inner) for inner in value)
+    return "" if value is None else str(value)
+
+
+def _cut(text: str) -> str:
+    return (
+        text
+        if len(text) <= _MAX_LINE
+        else f"{text[:_MAX_LINE]} … ({len(text) - _MAX_LINE:,} more characters)"
+    )
+
+
+_NOT_TOLD = frozenset({"event", "level", "timestamp", "exception", "exc_info", "run", "stimulus"})
+
+
+def _event(entry: dict[str, Any]) -> Happened:
+    more = ", ".join(
+        f"{name} {_cut(_plain(value))[:500]}" for name, value in entry.items() if name not in _NOT_TOLD
+    )
+    text = str(entry.get("event", ""))[:1000]
+    return Happened(
+        at=str(entry.get("timestamp", ""))[:19].replace("T", " "),
+        level=str(entry.get("level", ""))[:20],
+        text=f"{text} ({more})" if more else text,
+    )

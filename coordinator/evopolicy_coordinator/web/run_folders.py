@@ -1,0 +1,538 @@
+"""The runs in some folders, finished and open, as far as their files tell, and which of their results are hidden still.
+
+Rule: hidden results of a run are shown only when no agent of a related run is alive. Related are the runs of one environment
+whose hidden cases are shared. An agent counts as alive where the cluster says so, or where its supervisor holds its lock here.
+A cluster that does not answer might have such agents: then nothing hidden is shown.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.operator import RunSettings, RunStatus
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.suite_folder import INDEX, PAUSED
+from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_coordinator.analysis.reading.reader import find_run_dirs
+from evopolicy_coordinator.web.confined import Confined, NotThereError
+
+_MAX_RECORD_BYTES = 64 << 20
+_MAX_SUMMARY_BYTES = 8 << 20
+_MAX_INDEX_BYTES = 64 << 20
+
+
+class SuiteEntry(msgspec.Struct, frozen=True, kw_only=True):
+    """What is read of one run in a sweep's `suite.json`; other fields are skipped."""
+
+    name: str
+    agent: str
+    env: str
+    repeat: int = 0
+    state: str = "pending"
+    attempt: int = 1
+    directory: str = ""
+    run: str = ""
+    host: str = ""
+    score: float | None = None
+    random: float | None = None
+    n_submits: int = 0
+    budget_used: int = 0
+    tokens: dict[str, Any] | None = None
+    earlier: dict[str, Any] | None = None
+    closed_reason: str = ""
+    error: str | None = None
+    wall_s: float = 0.0
+
+
+class SuiteIndex(msgspec.Struct, frozen=True, kw_only=True):
+    """What is read of `suite.json`."""
+
+    suite: str
+    runs: dict[str, SuiteEntry] = {}
+
+
+class _Intended(msgspec.Struct, frozen=True, kw_only=True):
+    settings: RunSettings
+
+
+class _Opened(msgspec.Struct, frozen=True, kw_only=True):
+    run: str
+
+
+class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """One submit as its agent was told of it."""
+
+    index: int
+    status: str
+    n_episodes: int
+    consumed: int
+    """Episodes charged up to its end."""
+    remaining: int
+    mean: float | None
+    std: float | None
+    least: float | None
+    most: float | None
+    length: float | None
+    """Mean steps of an episode."""
+    failed: int
+    """Episodes in which the policy failed."""
+    started_at: str
+    completed_at: str
+    wall_s: float
+    warning: str
+
+
+class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """One run: from its folder, from its sweep's index, from the cluster, or from several of them."""
+
+    key: str
+    """In URLs; it has no path in it."""
+    path: Path | None
+    """None for a run without a folder on this host."""
+    run: str = ""
+    """The cluster's id."""
+    sweep: str = ""
+    entry: str
+    env: str
+    exp_id: str = ""
+    repeat: int = 0
+    attempt: int = 1
+    state: str
+    """`pending`, `open`, `interrupted`, `validation`, `heldout`, `random`, or how it ended."""
+    budget: int | None = None
+    used: int = 0
+    n_submits: int = 0
+    last_status: str = ""
+    best: float | None = None
+    """Highest mean train return of an ok submit."""
+    tokens: int = 0
+    cost: float = 0.0
+    error: str = ""
+    host: str = ""
+    waits_for: str = ""
+    running: int = 0
+    queued: int = 0
+    agent_alive: bool = False
+    started_at: float | None = None
+    wall_s: float = 0.0
+    closed_reason: str = ""
+    hidden_cases: str = "shared"
+    score: float | None = None
+    """Hidden: for whom `Runs.may_show` says so."""
+    random: float | None = None
+    """Uniform random actions on the same hidden cases."""
+    finished: bool = False
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the budget is spent, if it goes on as so far."""
+        if self.finished or self.started_at is None or not self.budget or not self.used:
+            return None
+        return max(0.0, (time.time() - self.started_at) * (self.budget - self.used) / self.used)
+
+
+class Sweep(msgspec.Struct, frozen=True, kw_only=True):
+    """One folder that was named, or one sweep below it."""
+
+    name: str
+    root: Path | None
+    runs: tuple[RunFacts, ...]
+    is_suite: bool
+    paused: bool = False
+
+
+class Runs(msgspec.Struct, frozen=True, kw_only=True):
+    """All that was found at one time."""
+
+    sweeps: tuple[Sweep, ...] = ()
+    by_key: Mapping[str, RunFacts] = {}
+    shut: frozenset[str] | None = frozenset()
+    """Environments of which a related agent may be alive; None: of all."""
+
+    def may_show(self, run: RunFacts) -> bool:
+        """Whether hidden results of a finished run may be shown now."""
+        if not run.finished:
+            return False
+        if self.shut is None:
+            return False
+        return run.hidden_cases == "per_run" or run.env not in self.shut
+
+
+def key_of(text: str) -> str:
+    """The name of a run in URLs."""
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]
+
+
+class Reader:
+    """Reads the folders again and again, and only what has changed."""
+
+    def __init__(self, roots: Sequence[Path]) -> None:
+        self.roots = tuple(root.resolve() for root in roots)
+        self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
+        self._submits: dict[Path, dict[str, SubmitFacts]] = {}
+        self._known: frozenset[Path] = frozenset()
+
+    def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
+        """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and does not
+        answer."""
+        by_run = {status.run: status for status in cluster or ()}
+        sweeps: list[Sweep] = []
+        alive: set[str] = set()
+        seen: set[str] = set()
+        sweep_folders = _sweep_folders(self.roots)
+        for root, index in sweep_folders:
+            inner = [other for other, _ in sweep_folders if root in other.parents]
+            folders, _ = find_run_dirs([root])
+            folders = [folder for folder in folders if not any(each in folder.parents for each in inner)]
+            if index is None and not folders and inner:
+                continue
+            entries = {} if index is None else index.runs
+            by_folder = {(root / each.directory): each for each in entries.values() if each.directory}
+            found: list[RunFacts] = []
+            for folder in folders:
+                facts = self.run(folder, by_folder.pop(folder, None), by_run)
+                found.append(facts)
+                seen.add(facts.run)
+                if facts.agent_alive and not facts.finished:
+                    alive.add(facts.env)
+            listed = {each.name for each in by_folder.values()} | {
+                each.name for each in entries.values() if not each.directory
+            }
+            for entry in entries.values():
+                if entry.name in listed:
+                    found.append(_without_folder(root, entry, by_run.get(entry.run)))
+                    seen.add(entry.run)
+            name = root.name if index is None else index.suite
+            paused = (root / PAUSED).exists()
+            sweeps.append(
+                Sweep(name=name, root=root, runs=tuple(found), is_suite=index is not None, paused=paused)
+            )
+        elsewhere = tuple(_of_cluster(status) for status in by_run.values() if status.run not in seen)
+        if elsewhere:
+            sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere, is_suite=False))
+        alive |= {status.env for status in by_run.values() if _may_be_alive(status)}
+        by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
+        self._forget(by_key.values())
+        return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=frozenset(alive) if cluster_is_known else None)
+
+    def run(self, folder: Path, entry: SuiteEntry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+        """One run with a folder."""
+        record = folder / "run.json"
+        try:
+            info = record.stat()
+        except OSError:
+            return self._open(folder, entry, by_run)
+        stamp = (info.st_mtime_ns, info.st_size)
+        known = self._records.get(folder)
+        if known is None or known[0] != stamp:
+            known = self._records[folder] = stamp, _finished(folder, record)
+        return known[1] if entry is None else msgspec.structs.replace(known[1], repeat=entry.repeat)
+
+    def submits(self, folder: Path) -> list[SubmitFacts]:
+        """The submits of a run, in order; each summary is read once."""
+        confined = Confined(folder)
+        try:
+            names = confined.names("workspace/feedback")
+        except NotThereError:
+            return []
+        known = self._submits.setdefault(folder, {})
+        for name in names:
+            index = name.name.removeprefix("submit_")
+            if name.name in known or index == name.name or not index.isdecimal():
+                continue
+            try:
+                summary = decode_summary(
+                    confined.read(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
+                )
+            except (NotThereError, ProtocolError):
+                continue
+            known[name.name] = _submit(summary)
+        consumed, found = 0, []
+        for submit in sorted(known.values(), key=lambda each: each.index):
+            consumed += submit.n_episodes
+            found.append(msgspec.structs.replace(submit, consumed=consumed))
+        return found
+
+    def _open(self, folder: Path, entry: SuiteEntry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+        settings, run = _settings(folder), _opened(folder)
+        status = by_run.get(run)
+        submits = self.submits(folder)
+        means = [submit.mean for submit in submits if submit.status == "ok" and submit.mean is not None]
+        entry_name, env, exp_id = folder.parts[-3], folder.parts[-2].replace("_", "/", 1), folder.name
+        budget, repeat, hidden_cases = None, 0, "shared"
+        if settings is not None:
+            entry_name, env, exp_id = settings.entry, settings.env, settings.exp_id
+            budget, repeat, hidden_cases = settings.budget, settings.repeat, settings.hidden_cases
+        elif entry is not None:
+            entry_name, env, repeat = entry.agent, entry.env, entry.repeat
+        if submits and budget is None:
+            budget = submits[-1].consumed + submits[-1].remaining
+        alive = _agent_alive(folder) if status is None else _may_be_alive(status)
+        state = "open" if alive else "interrupted"
+        if status is not None:
+            state, budget = status.phase, status.budget
+        elif entry is not None and entry.state not in ("running", "pending"):
+            state = entry.state
+        elif entry is not None and entry.state == "running" and not alive:
+            state = "open"
+        return RunFacts(
+            key=key_of(str(folder)),
+            path=folder,
+            run=run,
+            entry=entry_name,
+            env=env,
+            exp_id=exp_id,
+            repeat=repeat,
+            attempt=1 if entry is None else entry.attempt,
+            state=state,
+            budget=budget,
+            used=submits[-1].consumed if submits else 0,
+            n_submits=len(submits),
+            last_status=submits[-1].status if submits else "",
+            best=max(means, default=None),
+            tokens=0 if entry is None else _n_tokens(entry.tokens) + _n_tokens(entry.earlier),
+            cost=0.0 if entry is None else _cost(entry.tokens) + _cost(entry.earlier),
+            error="" if entry is None else entry.error or "",
+            host="" if entry is None else entry.host,
+            waits_for="" if status is None else status.waits_for,
+            running=0 if status is None else status.running,
+            queued=0 if status is None else status.queued,
+            agent_alive=alive,
+            started_at=_began(folder),
+            hidden_cases=hidden_cases,
+        )
+
+    def _forget(self, runs: Iterable[RunFacts]) -> None:
+        kept = {run.path for run in runs}
+        for known in (self._records, self._submits):
+            for path in [path for path in known if path not in kept]:
+                del known[path]
+
+
+def _submit(summary: Summary) -> SubmitFacts:
+    return SubmitFacts(
+        index=summary.submit_index,
+        status=summary.status,
+        n_episodes=summary.n_episodes,
+        consumed=0,
+        remaining=summary.remaining_budget,
+        mean=summary.mean_return,
+        std=summary.std_return,
+        least=summary.min_return,
+        most=summary.max_return,
+        length=summary.mean_episode_length,
+        failed=len(summary.errors or ()),
+        started_at=summary.submit_started_at,
+        completed_at=summary.submit_completed_at,
+        wall_s=summary.wall_time_seconds,
+        warning=summary.warning or "",
+    )
+
+
+def _finished(folder: Path, path: Path) -> RunFacts:
+    """From `run.json`; a record that cannot be read is a run with that error."""
+    try:
+        with path.open("rb") as file:
+            record = decode_run_record(file.read(_MAX_RECORD_BYTES))
+    except (OSError, ProtocolError) as error:
+        return RunFacts(
+            key=key_of(str(folder)),
+            path=folder,
+            entry=folder.parts[-3],
+            env=folder.parts[-2].replace("_", "/", 1),
+            exp_id=folder.name,
+            state="unreadable",
+            error=str(error),
+            finished=True,
+        )
+    return _of_record(folder, record)
+
+
+def _of_record(folder: Path, record: RunRecord) -> RunFacts:
+    outcome, dimensions = record.outcome, record.experiment_dimensions
+    tokens = None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens)
+    submits = Reader([]).submits(folder)
+    means = [submit.mean for submit in submits if submit.status == "ok" and submit.mean is not None]
+    return RunFacts(
+        key=key_of(str(folder)),
+        path=folder,
+        run=record.run,
+        entry=record.agent.entry or record.model,
+        env=record.env,
+        exp_id=record.exp_id,
+        repeat=record.repeat,
+        attempt=record.attempt,
+        state=outcome.status,
+        budget=dimensions.episode_budget,
+        used=outcome.budget_used,
+        n_submits=len(submits),
+        best=max(means, default=None),
+        tokens=_n_tokens(tokens),
+        cost=_cost(tokens),
+        error=outcome.error or "",
+        started_at=_unix(record.timing.start_time),
+        wall_s=record.timing.wall_time_seconds,
+        closed_reason=outcome.closed_reason,
+        hidden_cases=dimensions.hidden_cases,
+        score=outcome.score,
+        random=None if outcome.random_reference is None else outcome.random_reference.mean_return,
+        finished=True,
+    )
+
+
+def _without_folder(root: Path, entry: SuiteEntry, status: RunStatus | None) -> RunFacts:
+    """A run of a sweep that has no folder here: it has not begun, or another host has it."""
+    ended = entry.state not in ("pending", "running")
+    return RunFacts(
+        key=key_of(f"{root}\n{entry.name}"),
+        path=None,
+        run=entry.run,
+        entry=entry.agent,
+        env=entry.env,
+        exp_id=entry.name,
+        repeat=entry.repeat,
+        attempt=entry.attempt,
+        state=entry.state if status is None else status.phase,
+        budget=None if status is None else status.budget,
+        used=entry.budget_used if status is None else status.budget - status.remaining_budget,
+        n_submits=entry.n_submits if status is None else status.n_submits,
+        tokens=_n_tokens(entry.tokens) + _n_tokens(entry.earlier),
+        cost=_cost(entry.tokens) + _cost(entry.earlier),
+        error=entry.error or "",
+        host=entry.host,
+        waits_for="" if status is None else status.waits_for,
+        wall_s=entry.wall_s,
+        closed_reason=entry.closed_reason,
+        score=entry.score,
+        random=entry.random,
+        finished=ended,
+    )
+
+
+def _of_cluster(status: RunStatus) -> RunFacts:
+    """A run that only the cluster tells of: its folder is on another host."""
+    return RunFacts(
+        key=key_of(status.run),
+        path=None,
+        run=status.run,
+        entry=status.entry,
+        env=status.env,
+        exp_id=status.exp_id or status.run,
+        repeat=status.repeat,
+        state=status.phase,
+        budget=status.budget,
+        used=status.budget - status.remaining_budget,
+        n_submits=status.n_submits,
+        best=status.best_mean,
+        waits_for=status.waits_for,
+        running=status.running,
+        queued=status.queued,
+        agent_alive=_may_be_alive(status),
+        started_at=status.created_at or None,
+        host=status.agent_host,
+    )
+
+
+def _may_be_alive(status: RunStatus) -> bool:
+    return bool(status.agent_host) or status.phase == "open"
+
+
+def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, SuiteIndex | None]]:
+    """The sweeps at and directly below the roots, with their indexes; and a root that is none, for what else is in it."""
+    found: dict[Path, SuiteIndex | None] = {}
+    for root in roots:
+        if (root / INDEX).exists():
+            found[root] = _index(root)
+            continue
+        with contextlib.suppress(OSError):
+            for child in sorted(root.iterdir()):
+                if (child / INDEX).exists():
+                    found[child] = _index(child)
+        found[root] = None
+    return list(found.items())
+
+
+def _index(root: Path) -> SuiteIndex | None:
+    try:
+        with (root / INDEX).open("rb") as file:
+            return msgspec.json.decode(file.read(_MAX_INDEX_BYTES), type=SuiteIndex)
+    except (OSError, *DECODE_ERRORS):
+        return None
+
+
+def _settings(folder: Path) -> RunSettings | None:
+    try:
+        data = Confined(folder).read(".gateway/intended.json", _MAX_SUMMARY_BYTES)
+        return msgspec.json.decode(data, type=_Intended).settings
+    except (NotThereError, *DECODE_ERRORS):
+        return None
+
+
+def _opened(folder: Path) -> str:
+    try:
+        data = Confined(folder).read(".gateway/run.json", _MAX_SUMMARY_BYTES)
+        return msgspec.json.decode(data, type=_Opened).run
+    except (NotThereError, *DECODE_ERRORS):
+        return ""
+
+
+def _began(folder: Path) -> float | None:
+    try:
+        return (folder / ".gateway" / "intended.json").stat().st_mtime
+    except OSError:
+        return None
+
+
+def _agent_alive(folder: Path) -> bool:
+    """Whether an agent of an open run may be alive: a lock of its folder is held, or nobody here watches it."""
+    state = folder / ".gateway"
+    if any((state / name).exists() for name in ("door.json", "unwatched")):
+        return True
+    try:
+        locks = [path for path in state.iterdir() if path.suffix == ".lock"]
+    except OSError:
+        return False
+    return any(_is_held(lock) for lock in locks)
+
+
+def _is_held(lock: Path) -> bool:
+    try:
+        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
+def _n_tokens(tokens: dict[str, Any] | None) -> int:
+    names = ("input_noncached", "cache_read", "cache_creation", "output")
+    return sum(int((tokens or {}).get(name) or 0) for name in names)
+
+
+def _cost(tokens: dict[str, Any] | None) -> float:
+    return float((tokens or {}).get("cost") or 0.0)
+
+
+def _unix(text: str) -> float | None:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        return None

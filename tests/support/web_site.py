@@ -1,0 +1,129 @@
+"""A live view over invented run folders, and a client that has signed in or has not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from invented_policies import Version
+from run_dirs import write_run
+from starlette.testclient import TestClient
+
+from evopolicy_common.messages.operator import RunSettings, RunStatus, StatusReply, WorkerStatus
+from evopolicy_common.records.bundles import BundleFile, pack
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_coordinator.web.access import Access, Tokens
+from evopolicy_coordinator.web.app import Site
+
+HOST = "127.0.0.1:8765"
+ORIGIN = f"http://{HOST}"
+TOKENS = Tokens(read="r" * 43, act="a" * 43)
+NOBODY = Credentials(
+    cluster="c", role="operator", endpoints=("tcp/127.0.0.1:1",), user="u", password="p", token="t"
+)
+"""A cluster that is never connected to: its status is told to `Site.cluster.take`."""
+
+
+def site_of(*roots: Path, acting: bool = False, cluster: StatusReply | None = None, **more: Any) -> Site:
+    """A view of these folders; `cluster` is what its coordinator has just answered."""
+    site = Site(
+        list(roots),
+        Access(TOKENS, acting=acting, cookie="evopolicy_8765"),
+        credentials=None if cluster is None else NOBODY,
+        action_log=roots[0] / "actions.jsonl" if acting else None,
+        **more,
+    )
+    if cluster is not None:
+        assert site.cluster is not None
+        site.cluster.take(cluster)
+    return site
+
+
+def client(site: Site, role: str | None = "read") -> TestClient:
+    """A browser that has signed in with the token of `role`; None: with none."""
+    made = TestClient(site.app(), base_url=ORIGIN, follow_redirects=False)
+    if role is not None:
+        answer = made.post("/login", content=f"token={getattr(TOKENS, role)}", headers={"origin": ORIGIN})
+        assert answer.status_code == 303, answer.text
+    return made
+
+
+def status(*runs: RunStatus, workers: tuple[WorkerStatus, ...] = (), **more: Any) -> StatusReply:
+    """What a coordinator might answer."""
+    return StatusReply(
+        cluster="c",
+        version="1",
+        uptime_s=60.0,
+        episodes_done=1,
+        episodes_per_s=0.5,
+        workers=workers,
+        runs=runs,
+        **more,
+    )
+
+
+def open_status(run: str, env: str = "gym/acrobot", **more: Any) -> RunStatus:
+    """An open run whose agent is alive."""
+    usual: dict[str, Any] = {
+        "entry": "Agent B", "phase": "open", "budget": 128, "remaining_budget": 100, "n_submits": 1,
+        "queued": 2, "running": 1, "done": 28, "agent_host": "lab",
+    }  # fmt: skip
+    return RunStatus(run=run, env=env, **{**usual, **more})
+
+
+def open_run(
+    runs: Path,
+    *,
+    entry: str = "Agent B",
+    env: str = "gym/acrobot",
+    exp_id: str = "open",
+    run: str = "r-open",
+    files: dict[str, bytes] | None = None,
+    log: list[dict[str, Any]] | None = None,
+) -> Path:
+    """The folder of a run that is going on, with one committed submit whose code the gateway keeps."""
+    folder = runs / entry / env.replace("/", "_") / exp_id
+    settings = RunSettings(env=env, entry=entry, model="m", exp_id=exp_id, budget=128)
+    bundle = pack(
+        [BundleFile(path, False, data) for path, data in sorted((files or {"policy.py": b"x = 1\n"}).items())]
+    )
+    state = folder / ".gateway"
+    (state / "bundles" / bundle.digest[:2]).mkdir(parents=True)
+    (state / "bundles" / bundle.digest[:2] / bundle.digest).write_bytes(bundle.packed)
+    (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": settings}))
+    (state / "run.json").write_text(json.dumps({"run": run}))
+    lines = [
+        {"what": "requested", "key": "one", "bundle": bundle.digest},
+        {"what": "accepted", "key": "one", "submit_index": 0},
+    ]
+    (state / "journal.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "logs").mkdir()
+    (folder / "logs" / "agent.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log or []))
+    episode = folder / "workspace" / "feedback" / "submit_000" / "episodes" / "ep_000"
+    episode.mkdir(parents=True)
+    row = {
+        "t": 0,
+        "obs": [0.5, 1.0],
+        "action": [1.0],
+        "reward": -1.0,
+        "terminated": False,
+        "truncated": False,
+    }
+    (episode / "trajectory.jsonl").write_text(json.dumps(row) + "\n" + json.dumps({**row, "t": 1}) + "\n")
+    summary = {
+        "schema_version": 1, "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1, "first_global_episode": 0,
+        "env_instances": [7], "remaining_budget": 127, "submit_started_at": "2026-01-01T00:00:00.000000Z",
+        "submit_completed_at": "2026-01-01T00:00:01.000000Z", "wall_time_seconds": 1.0, "returns": [-2.0],
+        "mean_return": -2.0, "std_return": 0.0, "min_return": -2.0, "max_return": -2.0, "episode_lengths": [2],
+        "mean_episode_length": 2.0, "timeouts": [], "errors": [],
+    }  # fmt: skip
+    (episode.parents[1] / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+def finished_run(runs: Path, *, score: float = 4242.5, **more: Any) -> Path:
+    """A finished run whose held-out score is a number that stands nowhere else."""
+    version = Version(files={"policy.py": "x = 1\n"}, returns=(-100.0,) * 4, val=-111.25)
+    return write_run(runs, [version], heldout=[score], random_mean=-4322.5, **more)

@@ -1,0 +1,406 @@
+"""Attacks on the live view: each would show, change or read what it must not, were its defence not there."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+import pytest
+from web_site import HOST, ORIGIN, TOKENS, client, finished_run, open_run, open_status, site_of, status
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import WorkerStatus
+from evopolicy_coordinator.web.access import POLICY, kept_tokens
+from evopolicy_coordinator.web.run_folders import key_of
+
+SCORE, RANDOM = "4242", "-4322"
+MARKUP = '<script>alert(1)</script><img src=x onerror="alert(2)">'
+PAGES = ("/", "/run/{key}", "/run/{key}/submit/0", "/run/{key}/submit/0/episode/0")
+
+
+def key(folder: Path) -> str:
+    return key_of(str(folder.resolve()))
+
+
+# ---- who may read ----
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/",
+        "/cluster",
+        "/events/runs",
+        "/run/x",
+        "/run/x/file?path=a",
+        "/act/run/r/cancel",
+        "/log",
+        "/report/index.html",
+        "/metrics",
+    ],
+)
+def test_nothing_is_told_without_a_token_on_loopback_either(tmp_path: Path, path: str) -> None:
+    with client(site_of(tmp_path, acting=True), None) as stranger:
+        assert stranger.get(path).status_code == 401
+        assert stranger.get(path, headers={"accept": "text/html"}).headers["location"] == "/login"
+        assert stranger.get(path, headers={"authorization": "Bearer " + "x" * 43}).status_code == 401
+        if not path.startswith("/events"):  # which would not end
+            assert stranger.get(path, headers={"authorization": f"Bearer {TOKENS.read}"}).status_code != 401
+
+
+def test_a_token_in_an_address_opens_nothing(tmp_path: Path) -> None:
+    with client(site_of(tmp_path), None) as stranger:
+        assert stranger.get(f"/?token={TOKENS.read}").status_code == 401
+        assert stranger.get(f"/login?token={TOKENS.read}").headers.get("set-cookie") is None
+
+
+def test_a_wrong_token_gets_no_cookie_and_the_right_one_a_strict_one(tmp_path: Path) -> None:
+    with client(site_of(tmp_path), None) as stranger:
+        wrong = stranger.post("/login", content="token=no", headers={"origin": ORIGIN})
+        assert (wrong.status_code, wrong.headers.get("set-cookie")) == (401, None)
+        cookie = stranger.post("/login", content=f"token={TOKENS.read}", headers={"origin": ORIGIN}).headers[
+            "set-cookie"
+        ]
+        assert "httponly" in cookie.lower()
+        assert "samesite=strict" in cookie.lower()
+        assert TOKENS.read not in cookie
+
+
+def test_no_answer_holds_a_token(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    with client(site_of(tmp_path, acting=True), "act") as operator:
+        for path in (*PAGES, "/log"):
+            text = operator.get(path.format(key=key(folder))).text
+            assert TOKENS.read not in text
+            assert TOKENS.act not in text
+
+
+def test_a_token_file_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    first = kept_tokens(path)
+    assert kept_tokens(path) == first
+    assert path.stat().st_mode & 0o777 == 0o600
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        kept_tokens(path)
+
+
+# ---- from where ----
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "evil.example:8765", "localhost.evil.example", ""]
+)
+def test_a_name_that_was_rebound_to_this_server_is_refused(tmp_path: Path, host: str) -> None:
+    with client(site_of(tmp_path)) as browser:
+        assert browser.get("/", headers={"host": host}).status_code == 421
+
+
+@pytest.mark.parametrize("host", ["localhost:8765", "127.0.0.1:1", "[::1]:8765", "10.1.2.3"])
+def test_the_servers_own_addresses_are_not_refused(tmp_path: Path, host: str) -> None:
+    with client(site_of(tmp_path)) as browser:
+        assert browser.get("/healthz", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "https://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:9999"},
+        {"sec-fetch-site": "cross-site"},
+        {"sec-fetch-site": "same-site"},
+        {},
+    ],
+)
+def test_a_post_that_another_sites_page_caused_does_nothing(tmp_path: Path, headers: dict[str, str]) -> None:
+    (tmp_path / "suite.json").write_text('{"suite": "s", "runs": {}}')
+    with client(site_of(tmp_path, acting=True), "act") as operator:
+        assert operator.get("/").status_code == 200
+        target = "/act/sweep/x" + key_of(f"sweep\n{tmp_path.resolve()}") + "/pause"
+        assert operator.post(target, headers=headers).status_code == 403
+        assert not (tmp_path / "paused").exists()
+        assert operator.post(target, headers={"origin": ORIGIN}).status_code == 303
+        assert (tmp_path / "paused").exists()
+
+
+def test_another_sites_page_cannot_load_our_files_or_events(tmp_path: Path) -> None:
+    headers = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}
+    with client(site_of(tmp_path)) as browser:
+        for path in ("/", "/events/runs", "/static/web.js"):
+            assert browser.get(path, headers=headers).status_code == 403
+
+
+# ---- reading and acting ----
+
+
+@pytest.mark.parametrize("path", ["/act/run/r-1/cancel", "/act/worker/w/drain", "/log"])
+def test_the_reading_token_cannot_act(tmp_path: Path, path: str) -> None:
+    with client(site_of(tmp_path, acting=True), "read") as reader:
+        assert reader.get(path).status_code == 403
+        if path != "/log":
+            assert reader.post(path, headers={"origin": ORIGIN}).status_code == 403
+    assert not (tmp_path / "actions.jsonl").exists()
+
+
+def test_without_act_the_acting_token_is_none(tmp_path: Path) -> None:
+    with client(site_of(tmp_path), None) as stranger:
+        assert stranger.get("/", headers={"authorization": f"Bearer {TOKENS.act}"}).status_code == 401
+
+
+def test_an_act_is_confirmed_first_and_written_down(tmp_path: Path) -> None:
+    (tmp_path / "suite.json").write_text('{"suite": "s", "runs": {}}')
+    with client(site_of(tmp_path, acting=True), "act") as operator:
+        operator.get("/")
+        target = "/act/sweep/x" + key_of(f"sweep\n{tmp_path.resolve()}") + "/pause"
+        asked = operator.get(target)
+        assert "What happens" in asked.text
+        assert not (tmp_path / "paused").exists()
+        operator.post(target, headers={"origin": ORIGIN})
+        lines = (tmp_path / "actions.jsonl").read_text().splitlines()
+        assert ['"outcome":"asked"' in lines[0], '"outcome":"done"' in lines[1]] == [True, True]
+        assert "sweep pause" in operator.get("/log").text
+
+
+# ---- markup ----
+
+
+def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
+    said = [
+        {"type": "prompt", "message": MARKUP},
+        {"type": "assistant", "message": {"content": [{"type": "text", "text": MARKUP}, {"type": "tool_use", "name": MARKUP, "input": {MARKUP: MARKUP}}]}},
+        {"type": "stderr", "text": MARKUP},
+    ]  # fmt: skip
+    folder = open_run(
+        tmp_path,
+        entry="Agent <script>",
+        files={"policy.py": MARKUP.encode(), "<img src=x>.svg": b"<svg onload=alert(3)>"},
+        log=said,
+    )
+    (folder / "logs" / "harness.log").write_text(
+        '{"event": "<script>alert(4)</script>", "why": "<b>x</b>"}\n'
+    )
+    episode = folder / "workspace/feedback/submit_000/episodes/ep_000"
+    (episode / "stdout.txt").write_text(MARKUP)
+    (episode / "error.txt").write_text(MARKUP)
+    worker = WorkerStatus(
+        worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,
+        versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, playing={MARKUP: 1},
+    )  # fmt: skip
+    told = status(
+        open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),
+        workers=(worker,),
+        stalls=(MARKUP,),
+        quarantined={MARKUP: MARKUP},
+    )
+    with client(site_of(tmp_path, cluster=told, acting=True), "act") as operator:
+        for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E", "/act/run/%3Cscript%3E/cancel"):
+            answer = operator.get(path.format(key=key(folder)))
+            assert answer.status_code == 200, path
+            for piece in (
+                "<script>alert",
+                "<img src=x",
+                "<svg onload",
+                "<b>x</b>",
+                "Agent <script>",
+                "<code><script>",
+            ):
+                assert piece not in answer.text, path
+            assert "&lt;" in answer.text, path
+
+
+def test_no_page_has_inline_script_or_style_and_the_policy_forbids_them(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path)
+    assert "unsafe" not in POLICY
+    with client(site_of(tmp_path, cluster=status())) as reader:
+        for path in (*PAGES[:3], "/cluster", "/login"):
+            answer = reader.get(path.format(key=key(folder)))
+            assert answer.headers["content-security-policy"] == POLICY
+            assert answer.headers["x-content-type-options"] == "nosniff"
+            assert "<style" not in answer.text
+            assert ' style="' not in answer.text
+            assert " onclick" not in answer.text
+            assert all("src=" in tag for tag in answer.text.split("<script")[1:])
+            assert "http://" not in answer.text.replace("http://www.w3.org/2000/svg", "")
+            assert "https://" not in answer.text
+
+
+def test_an_svg_or_html_of_an_agent_is_served_as_sandboxed_text(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    episode = folder / "workspace/feedback/submit_000/episodes/ep_000"
+    with client(site_of(tmp_path)) as reader:
+        reader.get("/")
+        for name in ("a.svg", "a.html", "a.xml", "a.js"):
+            (episode / name).write_text(
+                "<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>"
+            )
+            answer = reader.get(
+                f"/run/{key(folder)}/file",
+                params={"path": f"workspace/feedback/submit_000/episodes/ep_000/{name}"},
+            )
+            assert answer.headers["content-type"].startswith("text/plain")
+            assert "sandbox" in answer.headers["content-security-policy"]
+            assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+# ---- paths ----
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../../../../etc/passwd",
+        "workspace/feedback/../../run.json",
+        "workspace/feedback/../../../secret",
+        "workspace/feedback/link/secret",
+        "workspace/feedback/linked",
+        "workspace/feedback//etc/passwd",
+        "/etc/passwd",
+        "workspace/feedback/\0",
+        "workspace/feedback/pipe",
+        "workspace/feedback/" + "a/" * 200 + "b",
+        ".gateway/credentials.json",
+        ".gateway/service.json",
+        "workspace/AGENTS.md",
+        "run.json",
+        "logs/env.log",
+        "checkpoints/submit_000/_meta.json",
+        "replays/heldout_000/video.mp4",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out_of_what_may_be_read(tmp_path: Path, path: str) -> None:
+    folder = open_run(tmp_path)
+    (tmp_path / "secret").write_text("TOP SECRET")
+    feedback = folder / "workspace" / "feedback"
+    (feedback / "link").symlink_to(tmp_path)
+    (feedback / "linked").symlink_to(tmp_path / "secret")
+    os.mkfifo(feedback / "pipe")
+    for name in (
+        ".gateway/credentials.json",
+        ".gateway/service.json",
+        "workspace/AGENTS.md",
+        "run.json.not",
+        "logs/env.log",
+    ):
+        (folder / name).write_text("TOP SECRET")
+    for name in ("checkpoints/submit_000/_meta.json", "replays/heldout_000/video.mp4"):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_text("TOP SECRET")
+    with client(site_of(tmp_path)) as reader:
+        reader.get("/")
+        answer = reader.get(f"/run/{key(folder)}/file", params={"path": path})
+        assert answer.status_code == 404
+        assert "SECRET" not in answer.text
+
+
+@pytest.mark.parametrize("name", ["workspace", "workspace/feedback", "logs", "logs/agent.jsonl", ".gateway"])
+def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path, name: str) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    folder = open_run(tmp_path / "runs", log=[{"type": "stdout", "text": "TOP SECRET"}])
+    place = folder / name
+    place.rename(outside / "moved")
+    place.symlink_to(outside / "moved")
+    with client(site_of(tmp_path / "runs")) as reader:
+        reader.get("/")
+        for path in PAGES[1:]:
+            text = reader.get(path.format(key=key(folder))).text
+            if name.startswith("logs"):
+                assert "TOP SECRET" not in text
+            if name.startswith("workspace"):
+                assert "workspace/feedback/submit_000" not in text
+                assert 'id="submit-0"' not in text
+
+
+def test_a_pipe_in_place_of_a_log_holds_nobody_up(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    (folder / "logs" / "agent.jsonl").unlink()
+    os.mkfifo(folder / "logs" / "agent.jsonl")
+    with client(site_of(tmp_path)) as reader:
+        reader.get("/")
+        assert reader.get(f"/run/{key(folder)}").status_code == 200
+
+
+# ---- hidden results before their time ----
+
+
+def shown(site_pages: list[str]) -> bool:
+    return any(SCORE in text or RANDOM in text for text in site_pages)
+
+
+def pages_of(site: object, folder: Path) -> list[str]:
+    with client(site) as reader:  # type: ignore[arg-type]
+        return [
+            reader.get(path.format(key=key(folder))).text
+            for path in ("/", "/run/{key}", "/run/{key}/submit/0", "/cluster")
+        ]
+
+
+def test_hidden_scores_are_not_shown_while_a_related_agent_is_alive(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path)
+    assert shown(pages_of(site_of(tmp_path, cluster=status()), folder))
+    assert not shown(pages_of(site_of(tmp_path, cluster=status(open_status("r-2"))), folder))
+    closed = open_status("r-2", phase="validation", agent_host="lab")
+    assert not shown(pages_of(site_of(tmp_path, cluster=status(closed)), folder))
+    gone = open_status("r-2", phase="validation", agent_host="")
+    assert shown(pages_of(site_of(tmp_path, cluster=status(gone)), folder))
+    unrelated = open_status("r-2", env="gym/racing")
+    assert shown(pages_of(site_of(tmp_path, cluster=status(unrelated)), folder))
+
+
+def test_cases_of_a_runs_own_are_related_to_nobody(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path, hidden_cases="per_run")
+    assert shown(pages_of(site_of(tmp_path, cluster=status(open_status("r-2"))), folder))
+
+
+def test_a_cluster_that_does_not_answer_shows_nothing_hidden(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path)
+    site = site_of(tmp_path, cluster=status())
+    assert site.cluster is not None
+    site.cluster.status = None
+    assert not shown(pages_of(site, folder))
+
+
+def test_without_a_cluster_the_lock_of_an_agent_keeps_scores_hidden(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path)
+    other = open_run(tmp_path)
+    assert shown(pages_of(site_of(tmp_path), folder))
+    with (other / ".gateway" / "agent.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert not shown(pages_of(site_of(tmp_path), folder))
+    assert shown(pages_of(site_of(tmp_path), folder))
+    (other / ".gateway" / "door.json").write_text("{}")
+    assert not shown(pages_of(site_of(tmp_path), folder)), "a remote agent may be alive anywhere"
+
+
+def test_scores_in_a_sweeps_index_are_hidden_as_well(tmp_path: Path) -> None:
+    entry = (
+        '{"name": "a", "agent": "Agent B", "env": "gym/acrobot", "state": "completed", "score": 4242.5, "random": -4322.5,'
+        ' "host": "lab2"}'
+    )
+    (tmp_path / "suite.json").write_text('{"suite": "s", "runs": {"a": ' + entry + "}}")
+    with client(site_of(tmp_path, cluster=status(open_status("r-2")))) as reader:
+        assert not shown([reader.get("/").text])
+    with client(site_of(tmp_path, cluster=status())) as reader:
+        assert shown([reader.get("/").text])
+
+
+def test_a_written_report_waits_for_every_agent_and_allows_only_its_own_script(tmp_path: Path) -> None:
+    report = tmp_path / "report"
+    report.mkdir()
+    (report / "index.html").write_text("<p>4242.5</p>")
+    with client(
+        site_of(tmp_path, cluster=status(open_status("r-2", env="gym/racing")), report=report)
+    ) as reader:
+        assert reader.get("/report/index.html").status_code == 403
+    with client(site_of(tmp_path, cluster=status(), report=report)) as reader:
+        answer = reader.get("/report/index.html")
+        assert answer.text == "<p>4242.5</p>"
+        assert "script-src 'sha256-" in answer.headers["content-security-policy"]
+        assert reader.get("/report/../actions.jsonl").status_code in (403, 404)
+
+
+def test_the_host_header_decides_nothing_that_is_answered(tmp_path: Path) -> None:
+    with client(site_of(tmp_path)) as reader:
+        assert HOST not in reader.get("/").text
