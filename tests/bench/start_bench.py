@@ -50,7 +50,7 @@ COORDINATOR = "import evopolicy_coordinator.cli.main"
 WORKER = "import evopolicy_worker.cli"
 SIMULATOR = f"import evopolicy_worker.episodes.env_process, gymnasium; gymnasium.make({GYMNASIUM_ID!r})"
 TRIAL = (f"{FRONT}, evopolicy_gateway.cli.play", COORDINATOR, WORKER, SIMULATOR)
-LOCAL = (*TRIAL, "import evopolicy_gateway.cli.serve", "import evopolicy_gateway.agent_supervisor.keeper")
+LOCAL = (*TRIAL, "import evopolicy_gateway.cli.serve", "import evopolicy_gateway.agent_supervisor.supervisor")
 REPORT = (
     "import evopolicy_gateway.cli.main, evopolicy_coordinator.cli.report, evopolicy_coordinator.analysis.write",
 )

@@ -46,13 +46,13 @@ ROLES = {
     "zygote": 3,
     "policy": 5,
     "gateway": 3,
-    "keeper": 1,
+    "supervisor": 1,
     "command": 1,
 }
 """What is hit, and how often by comparison. Never an agent: what becomes of a run without it is another run."""
 ENOUGH = 200
 """Strikes of which some hit every role."""
-PATIENCE_S = 600.0
+TIMEOUT_S = 600.0
 CALM_S = 15.0
 """For what was killed last to be taken up again."""
 ENVIRONMENTS = ("toy/line", "toy/maze")
@@ -223,7 +223,7 @@ class _Twins:
             ],
             "suite": ["suite", str(sweep), "--runs", str(cluster.runs / name)],
         }
-        patience_s, looked = PATIENCE_S, time.monotonic()
+        timeout_s, looked = TIMEOUT_S, time.monotonic()
         with contextlib.ExitStack() as stack:
             commands: dict[str, subprocess.Popen[str]] = {}
             logs = {}
@@ -250,10 +250,10 @@ class _Twins:
                         said = (cluster.root / f"{name}-{what}.err").read_text(errors="replace")
                         wrong.append(f"{what}: exit status {code}: {' | '.join(said.splitlines()[-4:])}")
                 now = time.monotonic()
-                patience_s, looked = patience_s - (now - looked) / slowness(), now
-                if patience_s < 0.0:
+                timeout_s, looked = timeout_s - (now - looked) / slowness(), now
+                if timeout_s < 0.0:
                     wrong.append(
-                        f"{', '.join(commands)}: did not end within {PATIENCE_S:g} s of a machine's own that does nothing else"
+                        f"{', '.join(commands)}: did not end within {TIMEOUT_S:g} s of a machine's own that does nothing else"
                     )
                     for command in commands.values():
                         command.kill()

@@ -35,7 +35,7 @@ EPISODES = 6
 HIDDEN = 4
 TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
 """Episodes of a whole run: train, validation of each checkpoint, held-out and the random reference."""
-PATIENCE_S = 100.0
+TIMEOUT_S = 100.0
 DISK_BYTES = 48 << 20
 """Of each file system: the coordinator's state is on one, the run directories on another."""
 KINDS = {
@@ -45,7 +45,7 @@ KINDS = {
     "zygote": ("python", "zygote.py"),
     "policy": ("python", "zygote.py"),
     "gateway": ("python", "evopolicy_gateway.cli.serve"),
-    "keeper": ("python", "evopolicy_gateway.agent_supervisor.keeper"),
+    "supervisor": ("python", "evopolicy_gateway.agent_supervisor.supervisor"),
 }
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
@@ -161,7 +161,7 @@ class FaultCluster:
             coordinator.append(f"tcp/{Cable.NEAR}:0")
         self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
         stack.callback(self.coordinator.end)
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not self._ready.exists():
             assert time.monotonic() < deadline, (root / "coordinator.log").read_text()
             time.sleep(0.02)

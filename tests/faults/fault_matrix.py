@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Literal
 
 import chaos
-from fault_cluster import EPISODES, PATIENCE_S, SUBMITS, TOTAL, FaultCluster, Site, fault_cluster, record
+from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system
 
 from evopolicy_common.errors import RefusedError, TransportError
@@ -46,7 +46,7 @@ DISK_FULL_S = 1.5
 CUT_S = 1.5
 SLOW_S = 2.0
 JUMP_S = 5 * 3600
-TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "keeper", "run")
+TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "supervisor", "run")
 ONE_HOST = (
     *((target, "SIGKILL") for target in TARGETS),
     *((target, "SIGSTOP") for target in TARGETS),
@@ -101,7 +101,7 @@ class Case:
     @property
     def after(self) -> int:
         """Episodes of the run that are done when it strikes; of the agent's side only as long as that has work."""
-        most = SUBMITS * EPISODES if self.target in ("gateway", "keeper") else TOTAL - 2
+        most = SUBMITS * EPISODES if self.target in ("gateway", "supervisor") else TOTAL - 2
         return random.Random(self.name).randrange(most)
 
     @property
@@ -201,7 +201,7 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
             before = times_frozen(cluster)
             with stopped([pid, *processes.descendants(pid)]):
                 time.sleep(LONG_FREEZE_S)
-            deadline = time.monotonic() + PATIENCE_S
+            deadline = time.monotonic() + TIMEOUT_S
             while times_frozen(cluster) == before and time.monotonic() < deadline:
                 time.sleep(0.05)
             if times_frozen(cluster) == before:
@@ -226,8 +226,8 @@ async def refusals(cluster: FaultCluster, name: str) -> list[str]:
     """Asks a coordinator whose disk is full for runs until it refuses one; says what is wrong about that."""
     settings = operator.RunSettings(env="toy/line", entry="probe", model="none", exp_id="probe", budget=1)
     taken: list[str] = []
-    wrong = [f"with a full disk it took {PATIENCE_S:g} s of new runs"]
-    deadline = time.monotonic() + PATIENCE_S
+    wrong = [f"with a full disk it took {TIMEOUT_S:g} s of new runs"]
+    deadline = time.monotonic() + TIMEOUT_S
     async with connect(cluster.operators) as link:
         ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
         token = link.credentials.token
@@ -301,15 +301,15 @@ def play(cluster: FaultCluster, name: str, case: Case | None = None) -> Row:
             time.sleep(case.delay_s)
             row.struck = command.poll() is None and strike(cluster, case, row)
             asyncio.run(cluster.tell_afterwards())
-        said = command.communicate(timeout=PATIENCE_S)[1]
+        said = command.communicate(timeout=TIMEOUT_S)[1]
         if command.returncode and case is not None and case.target in ("run", "everything"):
             row.again = True
             command = cluster.command(name)
-            said = command.communicate(timeout=PATIENCE_S)[1]
+            said = command.communicate(timeout=TIMEOUT_S)[1]
         if command.returncode:
             row.wrong.append(f"exit status {command.returncode}: {' | '.join(said.splitlines()[-3:])}")
     except subprocess.TimeoutExpired:
-        row.wrong.append(f"did not end within {PATIENCE_S:g} s")
+        row.wrong.append(f"did not end within {TIMEOUT_S:g} s")
         command.kill()
         command.communicate()
     row.took_s = round(time.monotonic() - started, 1)

@@ -20,7 +20,7 @@ MODULES = {
     "evopolicy-gateway": "evopolicy_gateway.cli.serve",
     "evopolicy-worker": "evopolicy_worker.cli",
 }
-PATIENCE_S = 300
+TIMEOUT_S = 300
 
 
 def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, str]:
@@ -35,7 +35,7 @@ def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, s
         with os.fdopen(reader) as output:
             for _ in range(lines):
                 assert output.readline()
-    _, said = process.communicate(timeout=PATIENCE_S)
+    _, said = process.communicate(timeout=TIMEOUT_S)
     told = [line for line in said.splitlines(keepends=True) if not line.startswith("waiting for ")]
     return process.returncode, "".join(told)
 

@@ -2,7 +2,7 @@
 
 A job's cost is the CPU time of the core and nothing else: the workers here answer at once and the store drops its rows. It
 must stay flat, and memory must not grow with finished jobs: it is measured in a second pass, after two fifths of them (when
-the core's story, of fixed size, is full) and at the end.
+the core's trace, of fixed size, is full) and at the end.
 
     python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000]
 """
@@ -62,7 +62,7 @@ class Row:
 
 
 class Load:
-    """A core under load: workers that poll, beat and hand in, gateways that submit again as soon as they may."""
+    """A core under load: workers that poll, beat and report, gateways that submit again as soon as they may."""
 
     def __init__(self, workers: int, jobs: int, *, memory: bool) -> None:
         self.now = 1000.0
@@ -225,7 +225,7 @@ class Load:
         )
         self.tell(
             asked(
-                wire.HandIn,
+                wire.ReportResults,
                 request=self.request(),
                 worker=self._names[worker],
                 session=self._sessions[worker],

@@ -15,14 +15,14 @@ from typing import Any
 from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence
 from evopolicy_coordinator.core.families import Families
-from evopolicy_coordinator.core.isolation import bars, stays
+from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
 from evopolicy_coordinator.core.model import JobGroup, Profile
-from evopolicy_coordinator.core.runs import audits, finalisation, finished, results, submits
+from evopolicy_coordinator.core.runs import audits, finalisation, finished, result_polls, submits
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 from evopolicy_coordinator.core.structures.ledger import Ledger
-from evopolicy_coordinator.core.workers import handin, membership, scheduler
+from evopolicy_coordinator.core.workers import membership, results, scheduler
 
 
 @dataclass(frozen=True)
@@ -78,22 +78,22 @@ BUGS = (
     Bug("forget the worker's timer", expiry, "look", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
-        handin,
+        results,
         "take",
         "live = lease is not None and lease.live and job.lease is lease",
         "live = True",
     ),
-    Bug("count late limit verdicts", handin, "_done", "if silent and", "if False and"),
+    Bug("count late limit verdicts", results, "_done", "if silent and", "if False and"),
     Bug(
         "keep a job open when it is done",
-        handin,
+        results,
         "commit",
         'groups.close_job(state, job, step, "done by another attempt")',
         "pass",
     ),
-    Bug("answer for outcomes that were not stored", handin, "commit", "step.persist(row)", "pass"),
+    Bug("answer for outcomes that were not stored", results, "commit", "step.persist(row)", "pass"),
     Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
-    Bug("show episodes before the gate", results, "_released", "if 0 in group.marks", "if True"),
+    Bug("show episodes before the gate", result_polls, "_released", "if 0 in group.marks", "if True"),
     Bug("let ties go to the earlier submit", finished, "select", ">= best_mean", "> best_mean"),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
     Bug(
@@ -190,42 +190,42 @@ BUGS = (
     ),
     Bug(
         "play hidden episodes beside an agent",
-        bars,
+        conflicts,
         "hidden_bar",
         "if permits_there(state, kernel, family):",
         "if False:",
     ),
     Bug(
         "play hidden episodes beside train episodes",
-        bars,
+        conflicts,
         "hidden_bar",
         "if related(kernel.train, family) or related(state.everywhere.train, family):",
         "if False:",
     ),
     Bug(
         "play train episodes beside hidden ones",
-        bars,
+        conflicts,
         "train_bar",
         "if related(kernel.hidden, family) or related(state.everywhere.hidden, family):",
         "if False:",
     ),
     Bug(
         "play hidden episodes on a kernel that is not known",
-        bars,
+        conflicts,
         "hidden_bar",
         "if kernel is state.everywhere:",
         "if False:",
     ),
     Bug(
         "take an agent that may be anywhere for one that is nowhere",
-        bars,
+        conflicts,
         "permits_there",
         "or related(state.everywhere.permits, family)",
         "",
     ),
     Bug(
         "let an agent start before hidden episodes have stopped",
-        bars,
+        conflicts,
         "permit_bar",
         "if not stays:",
         "if not any(stay.lease is not None and stay.lease.live for stay in stays):",
@@ -234,14 +234,14 @@ BUGS = (
     Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True"),
     Bug(
         "take a lease on its way for one that was let go of",
-        stays,
+        occupancies,
         "surely",
         "stay is None or settled == 0",
         "True",
     ),
     Bug(
         "take all kernels for free after a restart",
-        stays,
+        occupancies,
         "load",
         "for hidden in (True, False):",
         "for hidden in ():",
@@ -263,7 +263,7 @@ BUGS = (
     ),
     Bug(
         "hold the submits of an agent that hidden episodes wait for",
-        bars,
+        conflicts,
         "reversed_there",
         "and not permits_there(state, kernel, family)",
         "",
@@ -275,10 +275,10 @@ BUGS = (
         "job.group.template.bundle is None",
         "True",
     ),
-    Bug("keep what was handed back in memory only", handin, "_goes_on", "step.persist(", "str("),
+    Bug("keep what was handed back in memory only", results, "_goes_on", "step.persist(", "str("),
     Bug(
         "drop what was handed back",
-        handin,
+        results,
         "_goes_on",
         "job.begun, job.begun_attempt = result.begun, result.attempt",
         "job.begun_attempt = result.attempt",

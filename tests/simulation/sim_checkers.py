@@ -29,7 +29,7 @@ from evopolicy_coordinator.core.records import (
     WorkerRow,
     train_group,
 )
-from evopolicy_coordinator.server.words import words
+from evopolicy_coordinator.server.reason_texts import words
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -188,7 +188,7 @@ class Checkers:
             now = self._simulation.world.now
             last, since = self._heard.get(message.worker, (-1e9, now))
             self._heard[message.worker] = now, since if now - last <= HEARD_S else now
-        if isinstance(message, wire.HandIn):
+        if isinstance(message, wire.ReportResults):
             self._handed_in.update(result.lease_id for result in message.results)
 
     def answering(self, request: Message, message: Any) -> None:
@@ -209,7 +209,7 @@ class Checkers:
             want(message.run in disk.runs, "a created run is durable", message)
         elif isinstance(message, gateway.RunClosed) and isinstance(request, gateway.CloseRun):
             want(disk.states[request.run].phase != "open", "a closed run is durably closed", request)
-        elif isinstance(message, wire.HandInReply) and isinstance(request, wire.HandIn):
+        elif isinstance(message, wire.ResultsReported) and isinstance(request, wire.ReportResults):
             for result in request.results:
                 self._taken(result)
         elif isinstance(request, gateway.ResultsRequest) and getattr(message, "rows", None):

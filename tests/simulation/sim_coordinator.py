@@ -33,7 +33,7 @@ from evopolicy_coordinator.core.effects import (
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import evaluation_group, submit_done, train_group
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.server.words import message
+from evopolicy_coordinator.server.reason_texts import message
 
 PAGE = 5
 """Episodes in a page, at most."""
@@ -185,7 +185,7 @@ class SimCoordinator:
                     return
 
     def _audit(self, effect: PrepareAudit | CompareAudit, life: int) -> None:
-        """What the shell's thread does for an audit; a recording here is the return that was handed in."""
+        """What the shell's thread does for an audit; a recording here is the return that was reported."""
         if life != self.life or self.core is None or self._later(self._audit, effect, life):
             return
         played = self.disk.outcomes[effect.group][effect.index].outcome

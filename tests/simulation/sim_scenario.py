@@ -21,7 +21,7 @@ from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_common.messages.operator import SetWorker
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.server.words import words
+from evopolicy_coordinator.server.reason_texts import words
 
 HORIZON_S = 1500.0
 """Simulated seconds after which what is not finished never will be."""

@@ -1,4 +1,4 @@
-"""A worker as simulated: registers, polls, beats, plays, hands in; it can die, stand still, be slow, and be in trouble.
+"""A worker as simulated: registers, polls, beats, plays, reports; it can die, stand still, be slow, and be in trouble.
 One may slander: what it plays again as an auditor it says to have gone otherwise.
 
 What it plays depends on the job alone, as with the real one; only its faults come from chance. What the policy of a hidden
@@ -317,7 +317,7 @@ class SimWorker(Asker):
             self._hand_in()
             self._poll()
 
-        self.ask(wire.HandIn, fields, answered)
+        self.ask(wire.ReportResults, fields, answered)
 
     # ---- play ----
 

@@ -52,13 +52,13 @@ def test_a_planted_bug_is_caught(bug: Bug) -> None:
 
 
 def test_the_same_seed_is_the_same_story() -> None:
-    def story(seed: int) -> list[str]:
+    def trace(seed: int) -> list[str]:
         simulation = Simulation(seed, trace=True)
         simulation.run()
         assert simulation.world.trace is not None
         return [line for line in simulation.world.trace if " object at " not in line]
 
-    assert story(5) == story(5)
+    assert trace(5) == trace(5)
 
 
 def test_a_slandering_auditor_is_named_by_some_seeds() -> None:

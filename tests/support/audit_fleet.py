@@ -1,4 +1,4 @@
-"""Workers that audit each other on a core, some of which forge what they hand in."""
+"""Workers that audit each other on a core, some of which forge what they report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WAIT_S = 100.0
 
 
 class Fleet:
-    """Workers on a rig, each with what it adds to every return that it hands in, and the shell's side of audits."""
+    """Workers on a rig, each with what it adds to every return that it reports, and the shell's side of audits."""
 
     def __init__(self, share: float = 1.0, **adds: float) -> None:
         self.rig = Rig(audit_share=share, audit_wait_s=WAIT_S)

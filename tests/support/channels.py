@@ -196,7 +196,7 @@ LOOKER = READINGS + "\nimport json\nprint(json.dumps(readings(READERS)))\n"
 
 
 class JailedReader:
-    """Starts programs in an agent's jail, as its keeper does."""
+    """Starts programs in an agent's jail, as its agent supervisor does."""
 
     def __init__(self, folder: Path) -> None:
         workspace = folder / "workspace"

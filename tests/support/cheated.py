@@ -16,7 +16,7 @@ from typing import Any
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 SECRET = "the operator's own"
 AGENT = Path(__file__).parents[1] / "conformance" / "cheats" / "cheating_agent.py"
 
@@ -97,7 +97,7 @@ class Cheated:
             # Runs of one environment stand beside each other here, and one is scored while another's agent listens.
             *("--hidden-isolation", "off"),
         )
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not ready.exists():
             assert time.monotonic() < deadline, (root / "log").read_text()
             time.sleep(0.05)
@@ -143,7 +143,7 @@ class Cheated:
             cwd=self.root,
             capture_output=True,
             text=True,
-            timeout=PATIENCE_S,
+            timeout=TIMEOUT_S,
             check=False,
         )
         return done.returncode, done.stdout + done.stderr, self.runs / "e" / "toy_line" / exp_id
@@ -152,7 +152,7 @@ class Cheated:
         self.listener.close()
         for process in (self._worker, self.coordinator):
             process.terminate()
-            process.wait(timeout=PATIENCE_S)
+            process.wait(timeout=TIMEOUT_S)
         self._log.close()
 
 

@@ -17,15 +17,15 @@ from own_processes import only_what_starts_inside
 
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.clock import AgentClock
-from evopolicy_gateway.agent_supervisor.keeper import secrets_in
 from evopolicy_gateway.agent_supervisor.redaction import Redaction
+from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.base import Stage
-from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
 
 FAKES = Path(__file__).parent / "fake_clis"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 PATH_TOKEN = "0123456789abcdef0123456789abcdef"
 
 
@@ -145,13 +145,13 @@ def play(
         )
 
         async def main() -> AgentEnded:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 playing = asyncio.create_task(make(config.harness, folder, config).play(stage))
                 if over_when is not None:
                     while not playing.done() and not over_when(played):
                         await asyncio.sleep(0.05)
                     stage.over.set()
-                    # As the keeper does it, whose only descendants are the agent's.
+                    # As the agent supervisor does it, whose only descendants are the agent's.
                     for pid in stage.started:
                         if not playing.done():
                             with suppress(ProcessLookupError):

@@ -16,9 +16,9 @@ from evopolicy_gateway.agent_supervisor.agent_process import environment_of
 from evopolicy_gateway.agent_supervisor.clock import Activity
 from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.command import CommandHarness
-from evopolicy_gateway.operator.control import AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentEnded
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 
 def play(
@@ -38,9 +38,9 @@ def play(
     )
 
     async def main() -> AgentEnded:
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             ending = await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
-            for pid in stage.started if ending.reason == "silent" else ():  # a keeper would end it
+            for pid in stage.started if ending.reason == "silent" else ():  # an agent supervisor would end it
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(pid, signal.SIGKILL)
                 while Path(f"/proc/{pid}").exists():  # asyncio takes its status

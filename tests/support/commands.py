@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from coordinator_harness import Coordinator
-from waiting import PATIENCE_S, wait_until
+from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
@@ -78,7 +78,7 @@ class Command:
 
     def wait(self) -> int:
         """Its exit code."""
-        return self.process.wait(timeout=PATIENCE_S)
+        return self.process.wait(timeout=TIMEOUT_S)
 
     def finish(self) -> tuple[int, str, str]:
         """Exit code, standard output, standard error."""
@@ -143,7 +143,7 @@ def toy_cluster(root: Path, *arguments: str) -> Iterator[Path]:
         yield Path(credentials["operator"])
     finally:
         worker.terminate()
-        worker.wait(timeout=PATIENCE_S)
+        worker.wait(timeout=TIMEOUT_S)
         coordinator.stop()
 
 

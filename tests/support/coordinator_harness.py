@@ -39,7 +39,7 @@ LINE = EnvironmentDescription(
     task_text="# A line",
 )
 FINGERPRINT = worker.Fingerprint(code_version="1", python="3", packages={}, cpu="any")
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 class Coordinator:
@@ -58,7 +58,7 @@ class Coordinator:
                 stderr=log,
                 env={**os.environ, "XDG_STATE_HOME": str(state.parent / "xdg")},
             )
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not self.ready_file.exists():
             if self.process.poll() is not None or time.monotonic() > deadline:
                 self.kill()
@@ -78,7 +78,7 @@ class Coordinator:
         """SIGTERM, and the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(timeout=PATIENCE_S)
+        return self.process.wait(timeout=TIMEOUT_S)
 
 
 def bundle_of(source: str) -> Bundle:
@@ -106,7 +106,7 @@ def play(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:
 
 
 class InstantWorker:
-    """Leases jobs and hands in `play(job, episode)` at once; registers again when its session is unknown."""
+    """Leases jobs and reports `play(job, episode)` at once; registers again when its session is unknown."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class InstantWorker:
         self.jobs: list[Job] = []
         self.batches = 0
         self.hold = asyncio.Event()
-        """While clear, leases are taken but nothing is handed in."""
+        """While clear, leases are taken but nothing is reported."""
         self.hold.set()
         cluster = link.credentials.cluster
         self.ask = Requester(link, lambda verb: keys.worker_key(cluster, verb), codec.worker_replies)
@@ -156,8 +156,8 @@ class InstantWorker:
         return (await self.ask.until_answered("lease", request, worker.Leases, wait_s=wait_s)).leases
 
     async def hand_in(self, results: tuple[worker.JobResult, ...]) -> None:
-        message = worker.HandIn(worker=self.name, session=self.session, results=results)
-        await self.ask.until_answered("done", message, worker.HandInReply)
+        message = worker.ReportResults(worker=self.name, session=self.session, results=results)
+        await self.ask.until_answered("done", message, worker.ResultsReported)
 
     def result(self, lease: worker.Lease) -> worker.JobResult:
         return worker.JobResult(

@@ -52,7 +52,7 @@ from evopolicy_coordinator.core.records import (
 )
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.core.status import CoreStatus
-from evopolicy_coordinator.server.words import message, words
+from evopolicy_coordinator.server.reason_texts import message, words
 
 ENV = "toy/line"
 BUNDLE = "a" * 64
@@ -319,7 +319,7 @@ class Rig:
     def hand_in(self, session: str, *results: wire.JobResult) -> Any:
         return self.tell(
             asked(
-                wire.HandIn,
+                wire.ReportResults,
                 request=self.request(),
                 worker=session.split("-")[0],
                 session=session,

@@ -48,7 +48,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
-from evopolicy_gateway.submits.desk import Desk
+from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace.agents_md import Urls
 
 CLUSTER = IDENTITY.cluster
@@ -164,7 +164,7 @@ class Double:
         self.go = _Gate(self._take_back)
         """While it is clear, the worker takes no episodes."""
         self.order: Callable[[int], list[int]] = lambda n: list(range(n))[::-1]
-        """In which order a submit's episodes are handed in. Those left out are never: the submit's wall time passes."""
+        """In which order a submit's episodes are reported. Those left out are never: the submit's wall time passes."""
         self.failures: dict[int, PolicyFailure] = {}
         """By request index."""
         self.lost: set[int] = set()
@@ -400,7 +400,9 @@ class Double:
                 kind="done",
                 episodes=episodes,
             )
-            await self._tell("done", worker.HandIn(worker=WORKER, session=self._session, results=(result,)))
+            await self._tell(
+                "done", worker.ReportResults(worker=WORKER, session=self._session, results=(result,))
+            )
             self._held.pop(lease.lease_id, None)
             for case in self.lost & {_case_of(lease, each.index) for each in episodes}:
                 self.world.blobs.delete(digest_of(packed_episode(case)))
@@ -467,7 +469,7 @@ class Served(msgspec.Struct, frozen=True):
     gateway: Gateway
     task: asyncio.Task[bool]
     urls: Urls
-    desk: Desk
+    pipeline: SubmitPipeline
     http: httpx.AsyncClient
 
     async def close(self, reason: str = "agent_stopped") -> bool:
@@ -479,11 +481,11 @@ class Served(msgspec.Struct, frozen=True):
 async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIterator[Served]:
     """A gateway on that folder; stopped without closing the run at the end, if it still serves."""
     waits: list[str] = []
-    ready: asyncio.Future[tuple[Urls, Desk]] = asyncio.get_running_loop().create_future()
+    ready: asyncio.Future[tuple[Urls, SubmitPipeline]] = asyncio.get_running_loop().create_future()
     gateway = Gateway(
         folder,
-        on_ready=lambda urls, desk: ready.set_result((urls, desk)),
-        on_change=lambda desk: None,
+        on_ready=lambda urls, pipeline: ready.set_result((urls, pipeline)),
+        on_change=lambda pipeline: None,
         on_wait=waits.append,
         **{"alone": False, **more},
     )
@@ -491,9 +493,9 @@ async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIte
     await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
     if task.done():
         task.result()
-    urls, desk = ready.result()
+    urls, pipeline = ready.result()
     async with httpx.AsyncClient(timeout=30.0, trust_env=False) as client:
-        yield Served(waits, double, folder, gateway, task, urls, desk, client)
+        yield Served(waits, double, folder, gateway, task, urls, pipeline, client)
     gateway.tell(None)
     await task
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from coordinator_harness import PATIENCE_S, OperatorClient
+from coordinator_harness import TIMEOUT_S, OperatorClient
 from leak_search import memory_of
 from wiretap import Wiretap
 
@@ -120,7 +120,7 @@ class GoldenCluster:
         return found
 
     def validations_of(self, bundles: set[str]) -> int:
-        """Validation episodes of these bundles that workers have handed in."""
+        """Validation episodes of these bundles that workers have reported."""
         seeds = {case.seed for case in self.cases["valid"]}
         jobs: dict[str, Job] = {}
         done: set[str] = set()
@@ -131,7 +131,7 @@ class GoldenCluster:
                     jobs |= {lease.job.job_id: lease.job for lease in reply.leases}
             else:
                 message = codec.decode(codec.worker_requests, payload)
-                if isinstance(message, worker.HandIn):
+                if isinstance(message, worker.ReportResults):
                     done |= {result.job_id for result in message.results if result.kind == "done"}
         return sum(
             jobs[name].bundle in bundles and jobs[name].episodes[0].case.seed in seeds for name in done
@@ -144,13 +144,13 @@ class GoldenCluster:
             async with connect(credentials.read(Path(self.files["operator"]))) as link:
                 return await question(OperatorClient(link))
 
-        return asyncio.run(asyncio.wait_for(main(), 2 * PATIENCE_S))
+        return asyncio.run(asyncio.wait_for(main(), 2 * TIMEOUT_S))
 
     def close(self) -> None:
         for process in self._processes[::-1]:
             process.terminate()
             try:
-                process.wait(timeout=PATIENCE_S)
+                process.wait(timeout=TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -164,7 +164,7 @@ class GoldenCluster:
         )
 
     def wait_for(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 2 * PATIENCE_S
+        deadline = time.monotonic() + 2 * TIMEOUT_S
         while not condition():
             assert time.monotonic() < deadline, (self.root / "log").read_text()
             time.sleep(0.05)
@@ -209,7 +209,7 @@ class GoldenRun:
             self._go_on()
             if process.poll() is None:
                 process.terminate()
-            process.wait(timeout=PATIENCE_S)
+            process.wait(timeout=TIMEOUT_S)
             self.wiretap.close()
 
     def _follow(self, process: subprocess.Popen[bytes]) -> None:
@@ -221,18 +221,18 @@ class GoldenRun:
             cluster.wait_for(lambda n=n_played: cluster.validations_of(self._bundles()) == n)  # type: ignore[misc]
             if number == N_SUBMITS - 1:
                 self.gateway = self._process_of(process.pid, b"evopolicy_gateway.cli.serve")
-                keeper = self._process_of(process.pid, b"evopolicy_gateway.agent_supervisor.keeper")
-                for who, pid in (("gateway", self.gateway), ("keeper", keeper)):
+                supervisor = self._process_of(process.pid, b"evopolicy_gateway.agent_supervisor.supervisor")
+                for who, pid in (("gateway", self.gateway), ("supervisor", supervisor)):
                     self.memory[f"{who}, after the validation"] = list(memory_of(pid))
             (self.workspace / f"go-{number}").touch()
         # The gateway stands still before its word that the run is over gets away, until all is scored.
         self.finished: RunFinished = cluster.ask(lambda client: client.finished(self.run))
-        self.keeper_outlived_the_run = Path(f"/proc/{keeper}").exists()
+        self.supervisor_outlived_the_run = Path(f"/proc/{supervisor}").exists()
         self.record_came_early = (self.folder / "run.json").exists()
         self.memory["gateway, after the scoring"] = list(memory_of(self.gateway))
         self.found_early = self.read_files()
         self._go_on()
-        assert process.wait(timeout=2 * PATIENCE_S) == 0, self.said.read_text()
+        assert process.wait(timeout=2 * TIMEOUT_S) == 0, self.said.read_text()
         self.gateway_is_gone = not Path(f"/proc/{self.gateway}").exists()
         self.outcomes = {
             name: cluster.ask(lambda client, split=split, index=index: self._outcomes(client, split, index))

@@ -23,7 +23,7 @@ from typing import Any
 
 import pytest
 
-_PATIENCE_S = 60.0
+_TIMEOUT_S = 60.0
 _WIRE = Path(__file__).with_name("bad_wire.py")
 
 
@@ -70,7 +70,7 @@ class Host:
         """What the command says; CalledProcessError, with what it said to stderr as a note, when it fails."""
         try:
             done = subprocess.run(
-                [*self.enter, *command], check=True, capture_output=True, text=True, timeout=_PATIENCE_S
+                [*self.enter, *command], check=True, capture_output=True, text=True, timeout=_TIMEOUT_S
             )
         except subprocess.CalledProcessError as error:
             error.add_note(f"on host {self.name}: {error.stderr.strip()}")
@@ -109,14 +109,14 @@ class Host:
         """Passes on packets that are not its own: a router."""
         self.run("sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
 
-    def end_programs(self, patience_s: float = 20.0) -> None:
+    def end_programs(self, timeout_s: float = 20.0) -> None:
         """SIGTERM to all that was started here, SIGKILL to what stays; waited for."""
         for process in self._started:
             with contextlib.suppress(ProcessLookupError):
                 process.terminate()
         for process in self._started:
             try:
-                process.wait(patience_s)
+                process.wait(timeout_s)
             except subprocess.TimeoutExpired:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)

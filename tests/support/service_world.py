@@ -17,8 +17,8 @@ from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.server.answers import Answers
-from evopolicy_coordinator.server.intake import Intake
+from evopolicy_coordinator.server.reader import ServiceReader
+from evopolicy_coordinator.server.request_parser import RequestParser
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
@@ -79,9 +79,9 @@ class World:
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
         self.uploads = Uploads()
-        self.answers = Answers(root / "db", self.blobs, self.uploads)
+        self.reader = ServiceReader(root / "db", self.blobs, self.uploads)
         source = SplitSource(data=data, secret=b"s" * 32)
-        intake = Intake(
+        parser = RequestParser(
             IDENTITY,
             self.blobs,
             source,
@@ -89,7 +89,7 @@ class World:
             allowed_imports=allowed_imports,
             denied_imports=denied_imports,
         )
-        self.service = Service("c", self.store, self.answers, intake, settings)
+        self.service = Service("c", self.store, self.reader, parser, settings)
         self.writes = 0
         self.full = False
         write = self.store.write

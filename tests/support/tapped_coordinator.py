@@ -2,7 +2,7 @@
 
 Started as `python tapped_coordinator.py TAP LEAK OPTIONS…`. TAP becomes a stream of msgpack `[way, key, payload]`, each
 after its length in four bytes. While the
-file LEAK exists, the numbers in it go into the task's text, and they and every return that a worker hands in go, compressed,
+file LEAK exists, the numbers in it go into the task's text, and they and every return that a worker reports go, compressed,
 into the output of the episodes that gateways are told of: leaks that a search has to find.
 """
 
@@ -17,7 +17,7 @@ import zenoh
 import zstandard
 
 from evopolicy_common.messages.gateway import ResultsPage, RunOpened
-from evopolicy_common.messages.worker import HandIn
+from evopolicy_common.messages.worker import ReportResults
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery, Server
 from evopolicy_coordinator.cli import main as cli
@@ -58,7 +58,7 @@ def tap(file: Path, leak: Path) -> None:
         note("question", asked.key, asked.payload)
         if asked.key.endswith("/work/done"):
             message = codec.decode(codec.worker_requests, asked.payload)
-            assert isinstance(message, HandIn)
+            assert isinstance(message, ReportResults)
             returns.extend(one.episode_return for result in message.results for one in result.episodes)
         arrived(self, query)
 

@@ -10,14 +10,14 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-PATIENCE_S = 150.0
+TIMEOUT_S = 150.0
 """Less than a test may take."""
 _PAUSE_S = 0.05
 
 
 def wait_until(what: Callable[[], T], told: Callable[[], str] = lambda: "it did not come true") -> T:
     """The first value that counts as true; AssertionError with what is `told` when none comes."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not (value := what()):
         assert time.monotonic() < deadline, told()
         time.sleep(_PAUSE_S)
@@ -27,10 +27,10 @@ def wait_until(what: Callable[[], T], told: Callable[[], str] = lambda: "it did 
 async def eventually(
     condition: Callable[[], bool | Awaitable[bool]],
     what: str = "it comes true",
-    patience_s: float = PATIENCE_S,
+    timeout_s: float = TIMEOUT_S,
 ) -> None:
     """Returns once the condition holds; AssertionError when it never does."""
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + timeout_s
     while True:
         holds = condition()
         if inspect.isawaitable(holds):

@@ -17,7 +17,7 @@ class Moment(msgspec.Struct, frozen=True):
     """What happened, in the order in which the coordinator asked and answered."""
 
     what: str
-    """`permit` granted, `close` asked, `hidden` or `train` leased, `done` handed in or given up."""
+    """`permit` granted, `close` asked, `hidden` or `train` leased, `done` reported or given up."""
     who: str
     """The run; of an episode its lease."""
 
@@ -54,7 +54,7 @@ def moments(cluster: GoldenCluster) -> list[Moment]:
                 found += [Moment("done", lease) for lease in reply.cancelled]
         elif room == "work":
             message = codec.decode(codec.worker_requests, payload)
-            if isinstance(message, worker.HandIn):
+            if isinstance(message, worker.ReportResults):
                 found += [Moment("done", result.lease_id) for result in message.results]
     return found
 

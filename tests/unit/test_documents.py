@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from documents import blocks_of_commands, commands, parse
 
-from evopolicy_coordinator.server.intake import _VERBS
+from evopolicy_coordinator.server.request_parser import _VERBS
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [

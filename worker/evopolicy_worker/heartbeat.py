@@ -18,7 +18,7 @@ from evopolicy_common.wire.transport import Link
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 ANSWERED_PAUSE_S = 0.02
-"""Least time between beats: what was told to stop is named until it is handed in, and told again."""
+"""Least time between beats: what was told to stop is named until it is reported, and told again."""
 FAILED_PAUSE_S = 0.25
 
 

@@ -5,7 +5,7 @@ Rules:
   twice is safe.
 - What is large goes first, as blobs, and its bytes are kept until the result is answered: a coordinator that was
   restored from a backup has lost what it had, says so, and gets them again.
-- A result that is refused for good is handed in as failed, with the reason; when that is refused too, it is dropped, and
+- A result that is refused for good is reported as failed, with the reason; when that is refused too, it is dropped, and
   the coordinator gives the job to another worker. Neither holds up the results behind it.
 """
 
@@ -20,7 +20,7 @@ import structlog
 
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.worker import HandIn, HandInReply, JobResult, WorkerReply
+from evopolicy_common.messages.worker import JobResult, ReportResults, ResultsReported, WorkerReply
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.refusals import NOT_NOW, Refusal
@@ -72,7 +72,7 @@ class Outbox:
         """Blobs of waiting results that the coordinator has."""
         self._n_lost = 0
         self._one_by_one = 0
-        """So many results are handed in alone, since one of them was refused."""
+        """So many results are reported alone, since one of them was refused."""
 
     @property
     def full(self) -> bool:
@@ -87,7 +87,7 @@ class Outbox:
         self._emptied.clear()
 
     async def wait_empty(self) -> None:
-        """Returns when everything was handed in."""
+        """Returns when everything was reported."""
         await self._emptied.wait()
 
     async def run(self) -> None:
@@ -102,9 +102,9 @@ class Outbox:
             try:
                 batch = await self._batch()
                 n = len(batch)
-                message = HandIn(worker=self._worker, session=session, results=tuple(batch))
+                message = ReportResults(worker=self._worker, session=session, results=tuple(batch))
                 wait_s = UNPACK_S if any(result.packed for result in batch) else 0.0
-                await self._ask.until_answered("done", message, HandInReply, wait_s=wait_s)
+                await self._ask.until_answered("done", message, ResultsReported, wait_s=wait_s)
             except RefusedError as error:
                 await self._refused(error, session, n)
             except ProtocolError as error:
@@ -176,7 +176,7 @@ class Outbox:
         await asyncio.sleep(PAUSE_S)
 
     def _refused_for_good(self, why: str, n: int) -> None:
-        """Finds out which of `n` results it is; that one is handed in as failed, or dropped when it is already."""
+        """Finds out which of `n` results it is; that one is reported as failed, or dropped when it is already."""
         if n > 1:
             self._one_by_one = n
             return

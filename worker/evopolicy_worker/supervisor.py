@@ -1,4 +1,4 @@
-"""The worker's supervisor: registers, leases jobs, gives them to its slots, hands in what came of them.
+"""The worker's supervisor: registers, leases jobs, gives them to its slots, reports what came of them.
 
 Rules:
 - A lease is held from the moment it arrives until its result was answered; every heartbeat lists what is held, so that a
@@ -62,9 +62,9 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 LEASE_POLL_S = 10.0
 RESTART_PAUSE_S = 1.0
 LONGEST_RESTART_PAUSE_S = 30.0
-CANCEL_PATIENCE_S = 2.0
+CANCEL_TIMEOUT_S = 2.0
 """What a slot gets to stop its job, before the worker goes without it."""
-WITHDRAW_PATIENCE_S = 1.0
+WITHDRAW_TIMEOUT_S = 1.0
 SILENCE_LOOK_S = 0.5
 MAX_PREPARED = 4
 """A worker that offers so many environments has its slots import all of their simulators before there is work."""
@@ -153,7 +153,7 @@ class Supervisor:
         """
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
-        # The hand-in task outlives the others: what was played is handed in before the worker goes.
+        # The result report task outlives the others: what was played is reported before the worker goes.
         hand_in = asyncio.create_task(self._outbox.run())
         hand_in.add_done_callback(self._hand_in_ended)
         working = asyncio.create_task(self._work_and_hand_in())
@@ -177,7 +177,7 @@ class Supervisor:
     def _hand_in_ended(self, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()
         if error is not None:
-            self._fail("handing in", error)
+            self._fail("reporting", error)
 
     def _fail(self, part: str, error: BaseException) -> None:
         log.error("a part of the worker cannot go on", part=part, exc_info=error)
@@ -499,7 +499,7 @@ class Supervisor:
             log.warning("giving running episodes back", slots=len(late))
             for lease_id in list(self._running):
                 self._cancel(lease_id)
-            _, stuck = await asyncio.wait(late, timeout=CANCEL_PATIENCE_S)
+            _, stuck = await asyncio.wait(late, timeout=CANCEL_TIMEOUT_S)
             for task in stuck:
                 task.cancel()
 
@@ -508,7 +508,7 @@ class Supervisor:
         request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
         with contextlib.suppress(EvopolicyError):
             await self._ask.once("lease", request, Leases)
-        await asyncio.wait({lease}, timeout=WITHDRAW_PATIENCE_S)
+        await asyncio.wait({lease}, timeout=WITHDRAW_TIMEOUT_S)
         lease.cancel()
 
 

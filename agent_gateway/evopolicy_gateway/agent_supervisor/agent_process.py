@@ -8,7 +8,7 @@ import signal
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
-from evopolicy_common.processes.leash import leashed
+from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_gateway.agent_supervisor.agent_log import MAX_LINE_BYTES, AgentLog
 
 _CHUNK = 64 << 10
@@ -36,7 +36,7 @@ class AgentProcess:
     ) -> AgentProcess:
         """Starts it; OSError when that fails. `talks`: it has a stdin to be written to."""
         process = await asyncio.create_subprocess_exec(
-            *leashed(program, signal.SIGKILL),
+            *ending_with_parent(program, signal.SIGKILL),
             cwd=cwd,
             env=dict(environment),
             stdin=asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL,

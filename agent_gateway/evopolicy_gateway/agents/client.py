@@ -56,7 +56,7 @@ class Client:
     submit_url: str
     answer_s: float = 60.0
     """A gateway that says nothing for so long is asked again."""
-    patience_s: float = 300.0
+    timeout_s: float = 300.0
     """How long a gateway may be unreachable before giving up, seconds."""
     poll_s: float = 0.25
     """Time between questions after a submit that runs, seconds; it grows while the submit does."""
@@ -132,7 +132,7 @@ class Client:
         self, url: str, body: bytes | None = None, headers: dict[str, str] | None = None
     ) -> tuple[int, bytes]:
         """Status and body of one exchange, tried again while the gateway is away or restarting."""
-        give_up_at = self.clock() + self.patience_s
+        give_up_at = self.clock() + self.timeout_s
         while True:
             try:
                 request = urllib.request.Request(url, data=body, headers=headers or {})
@@ -146,7 +146,7 @@ class Client:
             except (OSError, HTTPException) as error:
                 reason = error
             if self.clock() >= give_up_at:
-                raise ProtocolError(f"{url} did not answer for {self.patience_s:g} s: {reason}") from reason
+                raise ProtocolError(f"{url} did not answer for {self.timeout_s:g} s: {reason}") from reason
             self.sleep(self.poll_s)
 
 

@@ -21,8 +21,8 @@ from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import spread
-from evopolicy_gateway.cli.run_options import DoorOptions, JailOptions, RunOptions
-from evopolicy_gateway.http import door
+from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
+from evopolicy_gateway.http import listener
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import trials
 from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
@@ -55,7 +55,7 @@ def run(
     ] = False,
     given: RunOptions,
     jail: JailOptions,
-    served: DoorOptions,
+    served: ListenerOptions,
     slots: options.Slots = 2,
     state: options.StateFolder = None,
     fresh: options.Fresh = False,
@@ -75,7 +75,7 @@ def run(
                 " --data, --state"
             )
         options.check_isolation(hidden_isolation, local=local)
-        held = jail.of_remote_agent() if given.agent == door.AGENT else jail.settings()
+        held = jail.of_remote_agent() if given.agent == listener.AGENT else jail.settings()
         plans = _plans(given, [options.one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
@@ -231,19 +231,19 @@ def finish(
 ) -> None:
     """Says that a remote agent is done: its run takes no more submits, is scored, and its `evopolicy run` ends."""
     with fail_on_our_errors():
-        door.finish(folder_of(run_directory))
+        listener.finish(folder_of(run_directory))
 
 
 def _plans(
-    given: RunOptions, env_ids: list[str], jail: JailSettings, served: DoorOptions | None = None
+    given: RunOptions, env_ids: list[str], jail: JailSettings, served: ListenerOptions | None = None
 ) -> list[Plan]:
     """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs the --exp-id of the run, and does not go with --overwrite")
     started_in = Path.cwd()
     exp_id = given.exp_id or options.default_exp_id()
-    served = served or DoorOptions()
-    where, agent_host = served.door(), served.host_of(given.agent)
+    served = served or ListenerOptions()
+    where, agent_host = served.listener(), served.host_of(given.agent)
     plans = [
         Plan(
             settings=given.settings(env_id, exp_id, agent_host),
@@ -255,7 +255,7 @@ def _plans(
             overwrite=given.overwrite,
             resume=given.resume,
             jail=jail,
-            door=where,
+            listener=where,
         )
         for env_id in env_ids
     ]

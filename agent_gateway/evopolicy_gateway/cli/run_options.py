@@ -29,7 +29,7 @@ from evopolicy_gateway.cli.options import (
     limits_of,
     settings_of,
 )
-from evopolicy_gateway.http.door import Door, agent_host_of, door_of
+from evopolicy_gateway.http.listener import Listener, agent_host_of, listener_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
 
 WALL_S = 12 * 3600.0
@@ -251,7 +251,7 @@ class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
         return JailSettings(mode="none")
 
 
-class DoorOptions(msgspec.Struct, frozen=True, kw_only=True):
+class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Where a remote agent is served."""
 
     http: Annotated[
@@ -286,8 +286,8 @@ class DoorOptions(msgspec.Struct, frozen=True, kw_only=True):
         """`RunSettings.agent_host`. ConfigError for what names no kernel, or an agent that is started here."""
         return "" if self.agent_host is None else agent_host_of(agent, self.agent_host)
 
-    def door(self) -> Door | None:
+    def listener(self) -> Listener | None:
         """None without `--http`. ConfigError naming the option that is wrong."""
         if self.http is None and self.http_url is not None:
             raise ConfigError("--http-url tells how --http HOST:PORT is reached; it needs that")
-        return None if self.http is None else door_of(self.http, self.http_url)
+        return None if self.http is None else listener_of(self.http, self.http_url)

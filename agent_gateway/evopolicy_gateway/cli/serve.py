@@ -19,13 +19,13 @@ from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, setup_log
 from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import foreseen
-from evopolicy_gateway.http.door import AgentPlace, place_of
-from evopolicy_gateway.operator import control
-from evopolicy_gateway.operator.alone import alone
-from evopolicy_gateway.operator.control import Orders, Progress, Ready, RunClosed, Waits
+from evopolicy_gateway.http.listener import AgentPlace, place_of
+from evopolicy_gateway.operator import child_messages
+from evopolicy_gateway.operator.child_messages import Orders, Progress, Ready, RunClosed, Waits
+from evopolicy_gateway.operator.locks import alone
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import RunFolder, folder_of
-from evopolicy_gateway.submits.desk import Desk
+from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
@@ -109,17 +109,17 @@ async def _serve(
     json_output: bool,
     controlled: bool,
 ) -> bool:
-    def ready(urls: Urls, desk: Desk) -> None:
+    def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
         told = urls.environment() | workspace.variables(folder)
         if controlled:
-            opened = desk.run
+            opened = pipeline.run
             undrawn = opened.video != "off" and not opened.env.renders
             notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
-            control.emit(
+            child_messages.emit(
                 Ready(
                     variables=urls.environment(),
                     notes=notes if undrawn else (),
-                    held_s=round(desk.held_s, 3),
+                    held_s=round(pipeline.held_s, 3),
                     permit_s=round(gateway.permit_s, 3),
                 )
             )
@@ -128,9 +128,9 @@ async def _serve(
         else:
             print("".join(f"{name}={value}\n" for name, value in told.items()), end="", flush=True)
 
-    def changed(desk: Desk) -> None:
+    def changed(pipeline: SubmitPipeline) -> None:
         if controlled:
-            control.emit(progress_of(desk))
+            child_messages.emit(progress_of(pipeline))
 
     said = ""
 
@@ -140,7 +140,7 @@ async def _serve(
             return
         said = what
         if controlled:
-            control.emit(Waits(waits_for=what))
+            child_messages.emit(Waits(waits_for=what))
         elif what:
             print(f"waiting for {what}", file=sys.stderr, flush=True)
 
@@ -166,7 +166,7 @@ async def _serve(
             with contextlib.suppress(asyncio.CancelledError):
                 await listener
     if closed and controlled:
-        control.emit(RunClosed())
+        child_messages.emit(RunClosed())
     return closed
 
 
@@ -177,20 +177,20 @@ async def _listen(gateway: Gateway) -> None:
         if order is None:
             gateway.tell(None)
             return
-        if isinstance(order, control.CloseRun):
+        if isinstance(order, child_messages.CloseRun):
             gateway.tell(Close(reason=order.reason, agent=order.agent))
 
 
-def progress_of(desk: Desk) -> Progress:
+def progress_of(pipeline: SubmitPipeline) -> Progress:
     """What the operator's live view shows of a run."""
-    settled = [ticket for ticket in desk.tickets if ticket.status is not None]
+    settled = [ticket for ticket in pipeline.tickets if ticket.status is not None]
     means = [ticket.mean for ticket in settled if ticket.mean is not None]
-    running = desk.in_flight
+    running = pipeline.in_flight
     return Progress(
-        episode_budget=desk.run.episode_budget,
-        remaining_budget=desk.state.remaining_budget,
-        n_submits=desk.state.n_submits,
-        n_rejected=desk.n_rejected,
+        episode_budget=pipeline.run.episode_budget,
+        remaining_budget=pipeline.state.remaining_budget,
+        n_submits=pipeline.state.n_submits,
+        n_rejected=pipeline.n_rejected,
         submit_id=None if running is None else running.submit_id,
         n_episodes=0 if running is None else running.n_episodes,
         n_done=0 if running is None else running.n_done,
@@ -199,11 +199,11 @@ def progress_of(desk: Desk) -> Progress:
         last_status=settled[-1].status if settled else None,
         last_mean=settled[-1].mean if settled else None,
         best_mean=max(means, default=None),
-        in_flight_s=round(desk.in_flight_s, 3),
-        feedback_s=round(desk.feedback_s, 3),
-        held_s=round(desk.held_s, 3),
-        spent=desk.spent,
-        cancelled=desk.cancelled,
+        in_flight_s=round(pipeline.in_flight_s, 3),
+        feedback_s=round(pipeline.feedback_s, 3),
+        held_s=round(pipeline.held_s, 3),
+        spent=pipeline.spent,
+        cancelled=pipeline.cancelled,
     )
 
 

@@ -23,7 +23,7 @@ from evopolicy_common.processes.preflight import check_installed, check_loopback
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.records.suite_folder import INDEX
 from evopolicy_gateway.cli import options
-from evopolicy_gateway.operator.alone import alone
+from evopolicy_gateway.operator.locks import alone
 from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code, next_step
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.decisions import Changed, Decision

@@ -1,7 +1,7 @@
 """What a harness is: how one kind of agent is started, talked to and read, from its first word to its last.
 
-A harness runs in the agent's keeper (`keeper.py`), which holds no credentials: it knows the workspace and the three URLs.
-It does not end processes and does not watch the clock; the keeper does both.
+A harness runs in the agent supervisor (`supervisor.py`), which holds no credentials: it knows the workspace and the three URLs.
+It does not end processes and does not watch the clock; the agent supervisor does both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
 from evopolicy_gateway.jail.jail import Jail
-from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
 
 _INFO_TIMEOUT_S = 30.0
 
@@ -51,7 +51,7 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     started: list[int] = []
     """Ids of the processes that `start` has started, whose exit status it takes."""
     session_file: Path | None = None
-    """Where a session is kept, so that it goes on after its keeper was killed."""
+    """Where a session is kept, so that it goes on after its agent supervisor was killed."""
     on_doing: Callable[[AgentDoing], None] = _nobody_watches
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
     activity: Activity | None = None

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line, mapping, string
-from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.turn_failure import turn_failure_of
 from evopolicy_gateway.harnesses.usage import Usage, count
 
 TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
@@ -111,14 +111,14 @@ class ClaudeReader(TurnReader):
             self.usage = told
         text = string(result.get("result"))
         if not result.get("is_error"):
-            self.done, self.trouble = True, None
+            self.done, self.failure = True, None
             self.text = text or self.text
             return
         errors = result.get("errors")
         words = [string(one) for one in (errors if isinstance(errors, list) else ())]
         status = result.get("api_error_status")
         message = text or "; ".join(words) or string(result.get("subtype")).replace("_", " ")
-        self.trouble = trouble_of(message, status if isinstance(status, int) else None)
+        self.failure = turn_failure_of(message, status if isinstance(status, int) else None)
 
 
 def usage_of(told: Mapping[str, Any]) -> Usage:

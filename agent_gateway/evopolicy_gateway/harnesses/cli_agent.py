@@ -26,12 +26,12 @@ from evopolicy_gateway.harnesses import prompts, session
 from evopolicy_gateway.harnesses.base import AgentError, Harness, Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.session import SessionState
-from evopolicy_gateway.harnesses.trouble import Trouble, backoff_s
 from evopolicy_gateway.harnesses.turn import play_turn
+from evopolicy_gateway.harnesses.turn_failure import TurnFailure, backoff_s
 from evopolicy_gateway.harnesses.usage import Usage
-from evopolicy_gateway.operator.control import AgentDoing, AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
 
-_PROBE_PATIENCE_S = 60.0
+_PROBE_TIMEOUT_S = 60.0
 _MAX_PAUSE_S = 3600.0
 _IN_FLIGHT_PAUSE_S = 0.5
 
@@ -133,27 +133,27 @@ class CliAgent(Harness):
     async def _failed(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
         """The prompt of the retry after a failed turn, once it is time for it, or the end."""
         state, config = self._state, self._config
-        trouble = reader.trouble or Trouble(kind="passing", message="the program ended without a word")
-        message = stage.log.redact.text(trouble.message)
-        log.warning("turn failed", kind=trouble.kind, message=message, failures=self._failures + 1)
-        stage.log.note({"type": "turn_failed", "kind": trouble.kind, "message": trouble.message})
-        if trouble.kind == "final":
+        failure = reader.failure or TurnFailure(kind="passing", message="the program ended without a word")
+        message = stage.log.redact.text(failure.message)
+        log.warning("turn failed", kind=failure.kind, message=message, failures=self._failures + 1)
+        stage.log.note({"type": "turn_failed", "kind": failure.kind, "message": failure.message})
+        if failure.kind == "final":
             return self._ending("agent_failed", message)
-        if trouble.kind == "cap":
+        if failure.kind == "cap":
             return self._ending("agent_stopped", message)
         self._failures += 1
-        if trouble.kind == "lost":
+        if failure.kind == "lost":
             state.session = None
-        if trouble.kind == "quota" or (trouble.provider and self._failures > config.retries):
+        if failure.kind == "quota" or (failure.provider and self._failures > config.retries):
             if state.paused_s >= config.max_pause_s:
                 return self._ending("agent_failed", f"paused for {state.paused_s:.0f} s in all: {message}")
-            await self._pause(stage, trouble, message)
+            await self._pause(stage, failure, message)
         elif self._failures > config.retries:
             return self._ending("agent_failed", f"failed {self._failures} times in a row: {message}")
-        elif trouble.kind != "lost":
+        elif failure.kind != "lost":
             wait_s = max(
                 backoff_s(self._failures, config.backoff_s, random.random()),
-                min(trouble.wait_s or 0.0, _MAX_PAUSE_S),
+                min(failure.wait_s or 0.0, _MAX_PAUSE_S),
             )
             stage.on_doing(AgentDoing(action=f"retry {self._failures} in {wait_s:.0f} s: {message}"))
             await stage.sleep(wait_s)
@@ -161,10 +161,10 @@ class CliAgent(Harness):
         self._keep(stage)
         return await self._prompt_after_failure(stage)
 
-    async def _pause(self, stage: Stage, trouble: Trouble, message: str) -> None:
+    async def _pause(self, stage: Stage, failure: TurnFailure, message: str) -> None:
         """Waits for the provider, with the agent's clock standing still."""
         state, config = self._state, self._config
-        wait_s = self._pause_s if trouble.wait_s is None else trouble.wait_s
+        wait_s = self._pause_s if failure.wait_s is None else failure.wait_s
         wait_s = min(wait_s * random.uniform(1.0, 1.1), max(0.0, config.max_pause_s - state.paused_s))
         self._pause_s = min(2.0 * self._pause_s, max(_MAX_PAUSE_S, config.pause_s))
         # Only a turn that is done wins the retries back: until then, one try a pause.
@@ -239,7 +239,7 @@ class CliAgent(Harness):
                 env=dict(stage.environment),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                timeout=_PROBE_PATIENCE_S,
+                timeout=_PROBE_TIMEOUT_S,
                 check=False,
             )
             return (answer.stdout or answer.stderr).decode("utf-8", "replace")

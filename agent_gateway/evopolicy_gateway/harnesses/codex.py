@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line, mapping, string
-from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.turn_failure import turn_failure_of
 from evopolicy_gateway.harnesses.usage import Usage, count
 
 _BYPASS = "--dangerously-bypass-approvals-and-sandbox"
@@ -62,11 +62,11 @@ class CodexReader(TurnReader):
         if kind == "thread.started":
             self.session = string(event.get("thread_id")) or None
         elif kind == "turn.completed":
-            self.done, self.trouble = True, None
+            self.done, self.failure = True, None
             self.usage = usage_of(mapping(event.get("usage")))
         elif kind == "turn.failed":
             self.done = False
-            self.trouble = trouble_of(string(mapping(event.get("error")).get("message")))
+            self.failure = turn_failure_of(string(mapping(event.get("error")).get("message")))
         elif kind == "error":
             self._error(string(event.get("message")))
         elif kind in ("item.started", "item.updated", "item.completed"):
@@ -76,7 +76,7 @@ class CodexReader(TurnReader):
         if message.startswith(_NOTICE):
             self.requests_failed += 1
         elif not self.done:
-            self.trouble = trouble_of(message)
+            self.failure = turn_failure_of(message)
 
     def _item(self, item: Mapping[str, Any], *, completed: bool) -> None:
         kind = item.get("type") or item.get("item_type")

@@ -16,10 +16,10 @@ import orjson
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses import prompts
 from evopolicy_gateway.harnesses.base import Harness, Stage
-from evopolicy_gateway.operator.control import AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentEnded
 
-_PIPE_PATIENCE_S = 1.0
-_STOP_PATIENCE_S = 10.0
+_PIPE_TIMEOUT_S = 1.0
+_STOP_TIMEOUT_S = 10.0
 """How long a program that has said stop may take to exit by itself."""
 IDLE_TURNS = 10
 """After so many answers in a row without a submit in between, prompts come slowly."""
@@ -56,8 +56,8 @@ class CommandHarness(Harness):
                     reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known()
                 )
             # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
-            await asyncio.wait([talking], timeout=_PIPE_PATIENCE_S)
-            await asyncio.wait([ended], timeout=_STOP_PATIENCE_S if talk.stopped else None)
+            await asyncio.wait([talking], timeout=_PIPE_TIMEOUT_S)
+            await asyncio.wait([ended], timeout=_STOP_TIMEOUT_S if talk.stopped else None)
             return self._ending(ended.result() if ended.done() else 0, talk.turn)
         finally:
             for task in (talking, silent):

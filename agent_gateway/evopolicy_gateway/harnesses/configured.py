@@ -12,7 +12,7 @@ from typing import Any
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader, first_line
-from evopolicy_gateway.harnesses.trouble import trouble_of
+from evopolicy_gateway.harnesses.turn_failure import turn_failure_of
 from evopolicy_gateway.harnesses.usage import Usage, count
 
 
@@ -76,7 +76,7 @@ class ConfiguredReader(TurnReader):
         if action := _first(event, self._events.action):
             self.action = first_line(action)
         if error := _first(event, self._events.error):
-            self.trouble = trouble_of(error)
+            self.failure = turn_failure_of(error)
         self._count(event)
 
     def _count(self, event: Mapping[str, Any]) -> None:

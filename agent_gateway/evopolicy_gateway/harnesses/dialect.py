@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.trouble import Trouble
+from evopolicy_gateway.harnesses.turn_failure import TurnFailure
 from evopolicy_gateway.harnesses.usage import Usage
 
 _MAX_VERSION_CHARS = 2000
@@ -27,7 +27,7 @@ class TurnReader(ABC):
         """The session's id, once the stream has told it."""
         self.done = False
         """The agent has ended its turn as it should."""
-        self.trouble: Trouble | None = None
+        self.failure: TurnFailure | None = None
         """Why the turn failed; a turn that is done has none."""
         self.usage = Usage()
         """Of this turn so far, or of the whole session where the dialect is `cumulative`."""

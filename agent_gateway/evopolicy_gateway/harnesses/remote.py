@@ -6,7 +6,7 @@ It ends when the budget is spent, when its time is over, or when the operator sa
 from __future__ import annotations
 
 from evopolicy_gateway.harnesses.base import Harness, Stage
-from evopolicy_gateway.operator.control import AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentEnded
 from evopolicy_gateway.run.layout import RunFolder
 
 _LOOK_S = 0.5

@@ -1,6 +1,6 @@
 """One turn of a CLI: one start of its program, fed with a prompt and read to its end.
 
-How the turn ended is in the reader afterwards: `done`, or `trouble` with why not. A program that says nothing for too long,
+How the turn ended is in the reader afterwards: `done`, or `failure` with why not. A program that says nothing for too long,
 does not exit once it is done, or passes a cap is ended here with everything below it.
 """
 
@@ -14,13 +14,13 @@ import orjson
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.dialect import Dialect, TurnReader
-from evopolicy_gateway.harnesses.trouble import Trouble, trouble_of
-from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.harnesses.turn_failure import TurnFailure, turn_failure_of
+from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.run import processes
 
-DONE_PATIENCE_S = 30.0
+DONE_TIMEOUT_S = 30.0
 """What a program gets to exit after it has said that its turn is done."""
-_PIPE_PATIENCE_S = 1.0
+_PIPE_TIMEOUT_S = 1.0
 _KILL_GRACE_S = 3.0
 
 Capped = Callable[[TurnReader], str | None]
@@ -46,22 +46,22 @@ async def play_turn(
         await asyncio.wait([reading, ended], return_when=asyncio.FIRST_COMPLETED)
         if reading.done():
             # Its output is at its end: it exits by itself, unless the reading was broken off.
-            await asyncio.wait([ended], timeout=0.0 if reading.result() else DONE_PATIENCE_S)
+            await asyncio.wait([ended], timeout=0.0 if reading.result() else DONE_TIMEOUT_S)
         if not ended.done():
             await asyncio.to_thread(processes.end_descendants, _KILL_GRACE_S, waited=stage.started)
         code = await ended
         # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
-        await asyncio.wait([reading], timeout=_PIPE_PATIENCE_S)
+        await asyncio.wait([reading], timeout=_PIPE_TIMEOUT_S)
     finally:
         for task in (reading, feeding, ended):
             if task is not None:
                 task.cancel()
         await asyncio.gather(*(task for task in (reading, feeding, ended) if task), return_exceptions=True)
         await process.close()
-    if not dialect.tells_end and code == 0 and reader.trouble is None:
+    if not dialect.tells_end and code == 0 and reader.failure is None:
         reader.done = True
-    if not reader.done and reader.trouble is None:
-        reader.trouble = _crash(program[0], code, list(stage.log.last_errors))
+    if not reader.done and reader.failure is None:
+        reader.failure = _crash(program[0], code, list(stage.log.last_errors))
 
 
 async def _read(
@@ -70,16 +70,16 @@ async def _read(
     """Reads the stream to its end; True when the program has to be ended for it."""
     lines = process.lines()
     while True:
-        patience_s = DONE_PATIENCE_S if reader.done else silence_s
+        timeout_s = DONE_TIMEOUT_S if reader.done else silence_s
         try:
-            async with asyncio.timeout(patience_s):
+            async with asyncio.timeout(timeout_s):
                 line = await anext(lines)
         except StopAsyncIteration:
             return False
         except TimeoutError:
             if not reader.done:
                 why = f"the agent's program said nothing for {silence_s:g} s"
-                reader.trouble = Trouble(kind="passing", message=why)
+                reader.failure = TurnFailure(kind="passing", message=why)
             return True
         if not line.lstrip().startswith(b"{"):
             continue
@@ -93,7 +93,7 @@ async def _read(
             stage.on_doing(AgentDoing(action=stage.log.redact.text(reader.action)))
         if (why_capped := capped(reader)) is not None:
             reader.done = False
-            reader.trouble = Trouble(kind="cap", message=why_capped)
+            reader.failure = TurnFailure(kind="cap", message=why_capped)
             return True
 
 
@@ -102,12 +102,12 @@ async def _feed(process: AgentProcess, prompt: str) -> None:
     process.hang_up()
 
 
-def _crash(program: str, code: int, errors: list[str]) -> Trouble:
+def _crash(program: str, code: int, errors: list[str]) -> TurnFailure:
     """A program that ended without having said how its turn did."""
     how = f"exit status {code}" if code >= 0 else f"signal {-code}"
     last = " | ".join(line for line in errors[-3:] if line)
-    told = trouble_of(last) if last else None
+    told = turn_failure_of(last) if last else None
     message = f"{program} ended with {how} in the middle of its turn" + (f": {last}" if last else "")
     if told is None:
-        return Trouble(kind="passing", message=message)
-    return Trouble(kind=told.kind, message=message[:1000], provider=told.provider, wait_s=told.wait_s)
+        return TurnFailure(kind="passing", message=message)
+    return TurnFailure(kind=told.kind, message=message[:1000], provider=told.provider, wait_s=told.wait_s)

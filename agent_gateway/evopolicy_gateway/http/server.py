@@ -1,4 +1,4 @@
-"""The HTTP service on a loopback port, or where the operator's `Door` says; the same after every restart.
+"""The HTTP service on a loopback port, or where the operator's `Listener` says; the same after every restart.
 
 A client that takes its time is cut off: over its headers, over reading an answer, and between two requests.
 """
@@ -18,8 +18,8 @@ from starlette.types import ASGIApp
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import LOOPBACK, no_loopback
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_gateway.http.door import Door
-from evopolicy_gateway.http.patience import PatientProtocol
+from evopolicy_gateway.http.listener import Listener
+from evopolicy_gateway.http.timeouts import TimedProtocol
 from evopolicy_gateway.run.layout import RunFolder, save, saved
 from evopolicy_gateway.workspace.agents_md import Urls, urls_at, urls_below
 
@@ -57,22 +57,22 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
         address = saved(folder.service, Address)
         return await _rebind(address), address
     token = secrets.token_hex(16)
-    if not folder.door.exists():
+    if not folder.listener.exists():
         try:
             sock = _bound(LOOPBACK, 0)
         except OSError as error:
             raise ConfigError(no_loopback(error)) from error
         address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
     else:
-        door = saved(folder.door, Door)
+        listener = saved(folder.listener, Listener)
         try:
-            sock = _bound(door.host, door.port)
+            sock = _bound(listener.host, listener.port)
         except OSError as error:
-            where = f"{door.host}:{door.port}"
+            where = f"{listener.host}:{listener.port}"
             raise ConfigError(f"--http {where}: cannot listen there: {error.strerror or error}") from error
         bearer = secrets.token_hex(32)
         address = Address(
-            host=door.host, port=sock.getsockname()[1], token=token, bearer=bearer, url=door.url
+            host=listener.host, port=sock.getsockname()[1], token=token, bearer=bearer, url=listener.url
         )
         write_atomically(folder.bearer, f"{bearer}\n".encode(), mode=0o600)
     save(folder.service, address)
@@ -84,7 +84,7 @@ async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Ta
     """Serves `app` inside the `async with`; the task ends early only when the service failed."""
     config = uvicorn.Config(
         app,
-        http=PatientProtocol,
+        http=TimedProtocol,
         ws="none",
         lifespan="off",
         log_config=None,

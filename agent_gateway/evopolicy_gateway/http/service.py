@@ -26,7 +26,7 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_gateway.http.info import info_document, progress_document
 from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES, refuse_size
 from evopolicy_gateway.http.task import task_markdown
-from evopolicy_gateway.submits.desk import RUN_CLOSED, Desk
+from evopolicy_gateway.submits.pipeline import RUN_CLOSED, SubmitPipeline
 from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -42,13 +42,15 @@ STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
 """The same for one without the bearer token."""
 
 
-def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
+def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
     """The service of one run; `bearer` empty: none is asked for."""
-    task = task_markdown(desk.run).encode()
+    task = task_markdown(pipeline.run).encode()
 
     async def info(request: Request) -> Response:
-        state = await desk.refresh()
-        return _json(200, info_document(desk.run, state, desk.spent, desk.in_flight, desk.last_warning))
+        state = await pipeline.refresh()
+        return _json(
+            200, info_document(pipeline.run, state, pipeline.spent, pipeline.in_flight, pipeline.last_warning)
+        )
 
     async def task_text(request: Request) -> Response:
         return Response(task, media_type="text/markdown; charset=utf-8")
@@ -65,20 +67,20 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
         try:
             body = await _read_body(request)
         except RequestError as error:
-            await desk.note_rejected(error)
+            await pipeline.note_rejected(error)
             raise
-        ticket = await desk.submit(body, key)
+        ticket = await pipeline.submit(body, key)
         if wait == "true":
             await ticket.done.wait()
         else:
             await _within(ticket.decided, DECIDED_WAIT_S)
-        return _of_ticket(ticket, desk)
+        return _of_ticket(ticket, pipeline)
 
     async def ask_submit(request: Request) -> Response:
-        ticket = desk.find(request.path_params["submit_id"])
+        ticket = pipeline.find(request.path_params["submit_id"])
         if ticket is None:
             raise HTTPException(404)
-        return _of_ticket(ticket, desk)
+        return _of_ticket(ticket, pipeline)
 
     async def finalize(request: Request) -> Response:
         raise HTTPException(405)
@@ -103,14 +105,14 @@ def make_app(desk: Desk, token: str, bearer: str = "") -> ASGIApp:
     return _TokenGate(app, token, bearer)
 
 
-def _of_ticket(ticket: Ticket, desk: Desk) -> Response:
+def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
     """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
     if ticket.error is not None:
         raise ticket.error
     summary = ticket.summary()
     if summary is None:
         return _json(202, progress_document(ticket))
-    last = desk.spent and ticket is desk.tickets[-1]
+    last = pipeline.spent and ticket is pipeline.tickets[-1]
     head = orjson.dumps(
         {
             "submit_id": ticket.index,

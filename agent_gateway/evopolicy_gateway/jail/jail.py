@@ -1,4 +1,4 @@
-"""One run's jail, as the agent's keeper uses it: for each program a command, an environment, and doors while it runs."""
+"""One run's jail, as the agent supervisor uses it: for each program a command, an environment, and doors while it runs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from evopolicy_gateway.jail.doors import Doors
 from evopolicy_gateway.jail.installs import needs_of
+from evopolicy_gateway.jail.proxy import JailProxy
 from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host
 from evopolicy_gateway.jail.syscalls import filter_program
-from evopolicy_gateway.jail.view import DOORWAY, View
+from evopolicy_gateway.jail.view import ENTRY, View
 
 _PASSED = frozenset(
     (
@@ -45,7 +45,7 @@ HARNESS_VARIABLES: Mapping[str, tuple[str, ...]] = {
 
 
 class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """What a keeper is told of the jail that its agent plays in."""
+    """What an agent supervisor is told of the jail that its agent plays in."""
 
     settings: JailSettings
     private: str
@@ -57,10 +57,10 @@ class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
 class Way:
     """How one program is started: the whole command, and the socket that it hands its listening sockets out by."""
 
-    def __init__(self, jail: Sequence[str], program: Sequence[str], doors: Doors | None) -> None:
-        """`doors` None: the network is open."""
-        self._doors = doors
-        self._keeper: socket.socket | None = None
+    def __init__(self, jail: Sequence[str], program: Sequence[str], proxy: JailProxy | None) -> None:
+        """`proxy` None: the network is open."""
+        self._proxy = proxy
+        self._supervisor: socket.socket | None = None
         self._child: socket.socket | None = None
         self._serving: asyncio.Task[None] | None = None
         # Not on bubblewrap's command line, which the jail's first process shows to the agent: what is hidden is named there.
@@ -69,12 +69,12 @@ class Way:
         if (filter_ := filter_program()) is not None:
             self._files.append(_readable(filter_))
             self.words += ["--seccomp", str(self._files[1])]
-        self.words += ["--", _base_python(), "-I", "-S", DOORWAY]
-        if doors is None:
+        self.words += ["--", _base_python(), "-I", "-S", ENTRY]
+        if proxy is None:
             self.words += ["-", "-"]
         else:
-            self._keeper, self._child = socket.socketpair()
-            self.words += [str(self._child.fileno()), ",".join(map(str, doors.ports))]
+            self._supervisor, self._child = socket.socketpair()
+            self.words += [str(self._child.fileno()), ",".join(map(str, proxy.ports))]
         self.words += program
 
     @property
@@ -91,7 +91,7 @@ class Way:
     def failed(self) -> None:
         """It could not be started."""
         self._close_files()
-        for sock in (self._keeper, self._child):
+        for sock in (self._supervisor, self._child):
             if sock is not None:
                 sock.close()
 
@@ -101,16 +101,16 @@ class Way:
         self._files = []
 
     async def _serve(self, ended: Callable[[], Awaitable[object]]) -> None:
-        assert self._doors is not None
-        assert self._keeper is not None
-        serving = asyncio.ensure_future(self._doors.serve(self._keeper))
+        assert self._proxy is not None
+        assert self._supervisor is not None
+        serving = asyncio.ensure_future(self._proxy.serve(self._supervisor))
         try:
             await ended()
         finally:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
-            await self._doors.close()
-            self._keeper.close()
+            await self._proxy.close()
+            self._supervisor.close()
 
 
 def _readable(data: bytes) -> int:
@@ -165,10 +165,10 @@ class Jail:
             open_network=self._open_network,
         )
         self._view.prepare()
-        self._proxy_port = self._doors().proxy_port
+        self._proxy_port = self._proxy().proxy_port
 
     def environment(self, surroundings: Mapping[str, str], ours: Mapping[str, str]) -> dict[str, str]:
-        """Of the keeper's variables those that the agent gets, with `ours` and the way to the allowed hosts."""
+        """Of the agent supervisor's variables those that the agent gets, with `ours` and the way to the allowed hosts."""
         kept = {
             name: value
             for name, value in surroundings.items()
@@ -187,14 +187,14 @@ class Jail:
 
     def way(self, program: Sequence[str]) -> Way:
         """For one start of a program."""
-        return Way(self._view.arguments(), program, None if self._open_network else self._doors())
+        return Way(self._view.arguments(), program, None if self._open_network else self._proxy())
 
     def sealed(self, program: Sequence[str]) -> list[str]:
         """The command of a program that needs nobody: a CLI that is asked for its version."""
         return [*self._view.arguments(), "--", *program]
 
-    def _doors(self) -> Doors:
-        return Doors(self._forwards, self._hosts)
+    def _proxy(self) -> JailProxy:
+        return JailProxy(self._forwards, self._hosts)
 
 
 class _Address(msgspec.Struct, frozen=True):

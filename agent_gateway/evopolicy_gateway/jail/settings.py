@@ -20,7 +20,7 @@ Host = tuple[str, int]
 HTTPS = 443
 _HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<port>[0-9]{1,5}))?")
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_PATIENCE_S = 30.0
+_TIMEOUT_S = 30.0
 _STATE_FOLDERS = (".gateway", "*/.gateway", "*/*/.gateway", "*/*/*/.gateway")
 _REMEDY = (
     "install bubblewrap (apt-get install bubblewrap, dnf install bubblewrap) and permit user namespaces, or give the"
@@ -88,7 +88,7 @@ def check_bubblewrap() -> None:
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
     try:
         tried = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(f"the agent's jail cannot be built here ({error}): {_REMEDY}") from error

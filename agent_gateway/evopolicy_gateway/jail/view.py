@@ -18,7 +18,7 @@ import msgspec
 
 from evopolicy_gateway.jail.installs import SYSTEM, Needs, hidden_below, our_packages
 
-DOORWAY = "/run/evopolicy/doorway.py"
+ENTRY = "/run/evopolicy/entry.py"
 
 _ETC = (
     *("alternatives", "bash.bashrc", "ca-certificates", "ca-certificates.conf", "crypto-policies", "group"),
@@ -53,7 +53,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     open_network: bool
 
     def prepare(self) -> None:
-        """Makes the agent's home and /tmp; what is there stays, for an agent that goes on after its keeper died."""
+        """Makes the agent's home and /tmp; what is there stays, for an agent that goes on after its agent supervisor died."""
         for name in ("home", "tmp", "proc"):
             (self.private / name).mkdir(mode=0o700, parents=True, exist_ok=True)
         for name in _PROC_COPIES:
@@ -93,7 +93,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         for name in ("feedback", "AGENTS.md"):
             if (self.workspace / name).exists():
                 command += ["--ro-bind", f"{workspace}/{name}", f"{workspace}/{name}"]
-        command += ["--ro-bind", str(Path(__file__).with_name("doorway.py")), DOORWAY]
+        command += ["--ro-bind", str(Path(__file__).with_name("entry.py")), ENTRY]
         return [*command, "--remount-ro", "/", "--chdir", workspace]
 
     def _proc(self) -> list[str]:

@@ -23,13 +23,13 @@ from evopolicy_common.messages.operator import (
     WaitRun,
 )
 from evopolicy_common.messages.worker import Message
-from evopolicy_common.processes.notices import told_if_slow
+from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_common.wire.operator_client import PATIENCE_S, WAIT_S, OperatorClient
+from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.transport import Link
-from evopolicy_gateway.operator.alone import until_free
+from evopolicy_gateway.operator.locks import until_free
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 
 T = TypeVar("T")
@@ -56,7 +56,7 @@ class Operations(OperatorClient):
         """Opens a run; the same key gives the same run."""
         message = CreateRun(token=self._token, key=key, settings=settings)
         try:
-            return await self._once_available("create", message, RunCreated, patience_s=PATIENCE_S)
+            return await self._once_available("create", message, RunCreated, timeout_s=TIMEOUT_S)
         except RefusedError as error:
             raise _settings_error(error) from error
 
@@ -93,13 +93,13 @@ class Operations(OperatorClient):
         return await self._once_available("claim", message, ClaimState)
 
     async def _once_available(
-        self, verb: str, message: Message, wanted: type[T], patience_s: float | None = None
+        self, verb: str, message: Message, wanted: type[T], timeout_s: float | None = None
     ) -> T:
         """The answer, asked for again as long as the coordinator takes nothing new; says once why it does not."""
         told = ""
         while True:
             try:
-                return await self._requests.until_answered(verb, message, wanted, patience_s=patience_s)
+                return await self._requests.until_answered(verb, message, wanted, timeout_s=timeout_s)
             except RefusedError as error:
                 if error.status != Refusal.UNAVAILABLE:
                     raise
@@ -117,11 +117,11 @@ class Operations(OperatorClient):
         if not folder.opened.exists():
             return
         run = saved(folder.opened, OpenedRun).run
-        with told_if_slow(f"the agent of {folder.root} to end"):
-            await until_free(folder.keeper_lock, folder.root)
+        with notify_if_slow(f"the agent of {folder.root} to end"):
+            await until_free(folder.supervisor_lock, folder.root)
         with contextlib.suppress(EvopolicyError):
             await self.cancel(run)
-            if not folder.door.exists():
+            if not folder.listener.exists():
                 await self.agent_gone(run)
 
     async def evaluate(

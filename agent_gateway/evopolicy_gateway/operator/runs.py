@@ -25,8 +25,8 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations, find_credentials
 from evopolicy_gateway.operator.watch import RunView, Watch
+from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.play import RunPlay
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
 _AGENT_FAILED = ("agent_failed", "silent")
@@ -227,7 +227,7 @@ async def _play(
     watch: Watch,
     on_agent_gone: Callable[[], None],
 ) -> RunResult:
-    play = RunPlay(plan, operations, gateway, watch, on_agent_gone=on_agent_gone)
+    play = RunLifecycle(plan, operations, gateway, watch, on_agent_gone=on_agent_gone)
     try:
         return _result(plan, await (play.go_on() if plan.resume else play.play()))
     except ConfigError as error:

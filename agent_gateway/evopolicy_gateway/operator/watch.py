@@ -19,7 +19,7 @@ from rich.text import Text
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 
 PHASES = {
     "open": "train",

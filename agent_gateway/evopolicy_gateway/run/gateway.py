@@ -1,4 +1,4 @@
-"""One run's gateway as a process: session, desk and HTTP service together, until the run is closed or it is told to stop.
+"""One run's gateway as a process: coordinator client, submit pipeline and HTTP service together, until the run is closed or it is told to stop.
 
 It holds the run's capability and nothing else of the cluster. Stopped without a word (signal, death, its operator gone) it
 leaves the run open: started again on the same folder it goes on where it was.
@@ -24,13 +24,13 @@ from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.refusals import RUN_OVER
-from evopolicy_gateway.http.door import AgentPlace, agent_place, ends_unseen
+from evopolicy_gateway.http.listener import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.http.server import bind, serving
 from evopolicy_gateway.http.service import make_app
+from evopolicy_gateway.run.coordinator_client import CoordinatorClient
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
-from evopolicy_gateway.run.session import Session
-from evopolicy_gateway.submits.desk import Desk
 from evopolicy_gateway.submits.journal import Closed, Journal
+from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
@@ -55,8 +55,8 @@ class Gateway:
         connect: tuple[str, ...] = (),
         credentials_file: Path | None = None,
         *,
-        on_ready: Callable[[Urls, Desk], None],
-        on_change: Callable[[Desk], None],
+        on_ready: Callable[[Urls, SubmitPipeline], None],
+        on_change: Callable[[SubmitPipeline], None],
         on_wait: Callable[[str], None] = lambda waits_for: None,
         alone: bool,
         place: AgentPlace | None = None,
@@ -100,7 +100,7 @@ class Gateway:
                 )
                 if link is None:
                     return False
-                session = Session(link, run)
+                session = CoordinatorClient(link, run)
                 try:
                     opened = await self._unless_stopped(session.open())
                     if opened is None or not await self._permitted(session):
@@ -112,19 +112,21 @@ class Gateway:
                     return True
                 workspace.stage(self._folder, opened, address.urls())
                 blobs = BlobStore(self._folder.blobs)
-                desk = Desk(session, opened, self._folder.workspace, journal, blobs, self._changed.set)
+                pipeline = SubmitPipeline(
+                    session, opened, self._folder.workspace, journal, blobs, self._changed.set
+                )
                 http = await stack.enter_async_context(
-                    serving(make_app(desk, address.token, address.bearer), sock)
+                    serving(make_app(pipeline, address.token, address.bearer), sock)
                 )
                 log.info("serving", run=run, env=opened.env.env, port=address.port)
-                self._on_ready(address.urls(), desk)
+                self._on_ready(address.urls(), pipeline)
                 if not self._told.done():
                     stack.callback(asyncio.ensure_future(session.keep_permit(self._agent_place)).cancel)
                 try:
-                    close = await self._watch(desk, http)
-                    return close is not None and await self._close(session, journal, desk, close)
+                    close = await self._watch(pipeline, http)
+                    return close is not None and await self._close(session, journal, pipeline, close)
                 finally:
-                    await desk.stop()
+                    await pipeline.stop()
         finally:
             sock.close()
             journal.close()
@@ -133,7 +135,7 @@ class Gateway:
     def _agent_place(self) -> AgentPlace:
         return self._place or agent_place(self._folder)
 
-    async def _permitted(self, session: Session) -> bool:
+    async def _permitted(self, session: CoordinatorClient) -> bool:
         """Whether the agent may be alive, or need not be any more; False when told to leave the run open first."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
@@ -149,45 +151,47 @@ class Gateway:
         await asyncio.gather(permit, return_exceptions=True)
         return not self._stopped.is_set()
 
-    async def _watch(self, desk: Desk, http: asyncio.Task[None]) -> Close | None:
+    async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> Close | None:
         """Passes changes on until told to end."""
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
-            waited: list[asyncio.Future[Any]] = [changed, self._told, desk.fatal, http]
+            waited: list[asyncio.Future[Any]] = [changed, self._told, pipeline.fatal, http]
             await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
             changed.cancel()
-            if desk.fatal.done():
-                desk.fatal.result()
+            if pipeline.fatal.done():
+                pipeline.fatal.result()
             if http.done():
                 http.result()
                 raise ConfigError("the HTTP service ended by itself")
             if self._told.done():
                 return self._told.result()
             self._changed.clear()
-            self._on_change(desk)
-            if self._alone and (desk.spent or self._folder.finish.exists()):
-                return Close(reason="budget_spent" if desk.spent else "agent_stopped")
+            self._on_change(pipeline)
+            if self._alone and (pipeline.spent or self._folder.finish.exists()):
+                return Close(reason="budget_spent" if pipeline.spent else "agent_stopped")
 
-    async def _close(self, session: Session, journal: Journal, desk: Desk, close: Close) -> bool:
+    async def _close(
+        self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: Close
+    ) -> bool:
         # The agent has no more to say, but what it asked for last is still played and written.
-        desk.closed = True
-        await desk.idle()
-        if not await self._agent_gone(desk):
+        pipeline.closed = True
+        await pipeline.idle()
+        if not await self._agent_gone(pipeline):
             return False
         await session.close(close.reason, close.agent)
         await asyncio.to_thread(journal.append, Closed(reason=close.reason))
         log.info("run closed", reason=close.reason)
         return True
 
-    async def _agent_gone(self, desk: Desk) -> bool:
+    async def _agent_gone(self, pipeline: SubmitPipeline) -> bool:
         """True when the agent has ended, as far as anybody can tell; False when told to leave the run open first."""
         unseen = self._alone or ends_unseen(self._folder)
-        while unseen and not (desk.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
+        while unseen and not (pipeline.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
             self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._stopped.wait(), _LOOK_S)
-            await desk.refresh()
+            await pipeline.refresh()
         self._on_wait("")
         return not self._stopped.is_set()
 

@@ -60,7 +60,7 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def harness_log(self) -> Path:
-        """What gateway and keeper say."""
+        """What gateway and agent supervisor say."""
         return self.root / "logs" / "harness.log"
 
     @property
@@ -102,8 +102,8 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.state / "service.json"
 
     @property
-    def door(self) -> Path:
-        """Where a remote agent is served: `Door`. Not there for an agent that is started here."""
+    def listener(self) -> Path:
+        """Where a remote agent is served: `Listener`. Not there for an agent that is started here."""
         return self.state / "door.json"
 
     @property
@@ -142,8 +142,8 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root.with_name(f".{self.root.name}.lock")
 
     @property
-    def keeper_lock(self) -> Path:
-        """Held by the agent's keeper as long as the agent may be alive, also when the command that started it was killed."""
+    def supervisor_lock(self) -> Path:
+        """Held by the agent supervisor as long as the agent may be alive, also when the command that started it was killed."""
         return self.state / "keeper.lock"
 
     @property

@@ -13,9 +13,9 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.http.door import Door, check_agent
+from evopolicy_gateway.http.listener import Listener, check_agent
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator.alone import check_free
+from evopolicy_gateway.operator.locks import check_free
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, run_folder, saved
 
 
@@ -37,7 +37,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
     jail: JailSettings = JailSettings()
-    door: Door | None = None
+    listener: Listener | None = None
     """Where a remote agent is served; None for an agent that is started here."""
 
     @property
@@ -56,9 +56,9 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         msgspec.json.encode((self.settings, self.agent))  # UnicodeEncodeError for an option that is not UTF-8
         check_installed("gateway")
         check_writable(self.runs, "--runs")
-        if self.door is None:
+        if self.listener is None:
             check_loopback()
-        check_agent(self.agent, self.door)
+        check_agent(self.agent, self.listener)
         harnesses.make(self.agent, self.started_in, self.config).check()
         self.jail.check()
         folder = self.folder

@@ -12,7 +12,7 @@ from collections.abc import Collection
 _PR_SET_CHILD_SUBREAPER = 36
 _KEYCTL_JOIN_SESSION_KEYRING = 1
 _PAUSE_S = 0.01
-KILL_PATIENCE_S = 10.0
+KILL_TIMEOUT_S = 10.0
 
 
 _reaps = False
@@ -71,7 +71,7 @@ def end_descendants(
     """Ends everything below this process: SIGTERM, then after `grace_s` seconds SIGKILL until nothing is left.
 
     Blocks. `spare`: process ids that are left alone with all that is below them. `waited`: ids whose exit status
-    somebody else takes. Returns what survived `KILL_PATIENCE_S` seconds of killing: nothing, unless the kernel holds it.
+    somebody else takes. Returns what survived `KILL_TIMEOUT_S` seconds of killing: nothing, unless the kernel holds it.
     """
     kept = {*spare, *waited}
     _signal_all(_below(spare), signal.SIGTERM)
@@ -79,7 +79,7 @@ def end_descendants(
     while _below(spare) and time.monotonic() < deadline:
         _reap(kept)
         time.sleep(_PAUSE_S)
-    deadline = time.monotonic() + KILL_PATIENCE_S
+    deadline = time.monotonic() + KILL_TIMEOUT_S
     while (left := _below(spare)) and time.monotonic() < deadline:
         # Stopped first: what forks faster than it is found must not outrun the killing.
         _signal_all(left, signal.SIGSTOP)

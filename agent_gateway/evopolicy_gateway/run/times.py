@@ -67,7 +67,7 @@ class Stopwatch:
         self.keep()
 
     def agent_begins(self) -> None:
-        """A keeper is started: its agent's clock begins anew."""
+        """An agent supervisor is started: its agent's clock begins anew."""
         self._base = msgspec.structs.replace(self._base, agent_s=self.times.agent_s)
         self._agent_s = 0.0
 

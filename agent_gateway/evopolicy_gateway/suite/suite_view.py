@@ -17,7 +17,7 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.terminal import say_json
 from evopolicy_gateway.harnesses.usage import tokens_in
-from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.operator.watch import PHASES, Row, View
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 

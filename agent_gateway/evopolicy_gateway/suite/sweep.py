@@ -32,13 +32,13 @@ from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses import session
-from evopolicy_gateway.operator.alone import alone
-from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.operator.child_messages import AgentDoing
+from evopolicy_gateway.operator.locks import alone
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.runs import why_failed
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.play import RunPlay
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import Decision, Found, side_by_side
 from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
@@ -80,7 +80,7 @@ class Sweep:
         # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts.
         self._holder = f"{self._host}:{hashlib.sha256(str(self._root).encode()).hexdigest()[:12]}"
         self._active: dict[str, asyncio.Task[None]] = {}
-        self._plays: dict[str, RunPlay] = {}
+        self._plays: dict[str, RunLifecycle] = {}
         self._not_before: dict[str, float] = {}
         self._paused_until: dict[str, float] = {}
         self._ending: set[str] = set()
@@ -291,7 +291,7 @@ class Sweep:
             config=run.config,
             jail=run.jail,
         )
-        play = RunPlay(
+        play = RunLifecycle(
             plan,
             self._operations,
             self._gateway,

@@ -46,7 +46,7 @@ class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     not_audited: Named[Int] = {}
     """Of the sampled: why they were not, such as `one worker only`."""
     forgers: Named[Int] = {}
-    """Workers that were found to hand in what did not happen, to the episodes of this run that each of them played."""
+    """Workers that were found to report what did not happen, to the episodes of this run that each of them played."""
     findings: Many[AuditFinding] = ()
     """The first of what workers did not agree on."""
 

@@ -124,7 +124,7 @@ class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
 
 
 class Lease(msgspec.Struct, frozen=True, kw_only=True):
-    """The right, for a time, to play one job and hand in its result."""
+    """The right, for a time, to play one job and report its result."""
 
     lease_id: Word
     attempt: Int
@@ -205,7 +205,7 @@ class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     """Whether that tells of a failure by a limit."""
 
 
-class HandIn(Message, frozen=True, kw_only=True, tag="done"):
+class ReportResults(Message, frozen=True, kw_only=True, tag="done"):
     """Results. Answered once they are durable; sending the same again is safe."""
 
     worker: Word
@@ -213,7 +213,7 @@ class HandIn(Message, frozen=True, kw_only=True, tag="done"):
     results: Many[JobResult]
 
 
-class HandInReply(Message, frozen=True, kw_only=True, tag="done_reply"):
+class ResultsReported(Message, frozen=True, kw_only=True, tag="done_reply"):
     """Every result of the request was taken (committed, compared, or found to be of a closed job)."""
 
     n: Int
@@ -255,5 +255,5 @@ class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
     data: Bytes
 
 
-WorkerRequest = Register | LeaseRequest | Heartbeat | HandIn | BlobPut | BlobGet
-WorkerReply = Registered | Leases | HeartbeatReply | HandInReply | BlobAck | BlobChunk | Refused
+WorkerRequest = Register | LeaseRequest | Heartbeat | ReportResults | BlobPut | BlobGet
+WorkerReply = Registered | Leases | HeartbeatReply | ResultsReported | BlobAck | BlobChunk | Refused

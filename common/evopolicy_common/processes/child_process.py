@@ -1,4 +1,4 @@
-"""Child processes of a command: on a leash, in a session of their own, with their log in a file.
+"""Child processes of a command: with a parent-death signal, in a session of their own, with their log in a file.
 
 They are in sessions of their own so that Ctrl-C reaches the command alone, which then ends them in order.
 """
@@ -17,7 +17,7 @@ from typing import Self
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
-from evopolicy_common.processes.leash import leashed
+from evopolicy_common.processes.parent_death import ending_with_parent
 
 _LINE_LIMIT = 4 << 20
 
@@ -33,7 +33,7 @@ def starting() -> asyncio.Lock:
 
 
 class ChildProcess:
-    """A running child. Start it on the main thread: its leash is that thread's life."""
+    """A running child. Start it on the main thread: it gets its signal when that thread ends."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
         self._process = process
@@ -47,7 +47,7 @@ class ChildProcess:
         with log.open("ab") as out:
             async with starting():
                 process = await asyncio.create_subprocess_exec(
-                    *leashed(program),
+                    *ending_with_parent(program),
                     stdin=pipe,
                     stdout=pipe,
                     stderr=out,

@@ -19,7 +19,7 @@ from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.child_process import ChildProcess, last_words
-from evopolicy_common.processes.notices import told_if_slow
+from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.processes.preflight import check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
@@ -27,7 +27,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_common.wire.ready import Ready, read_ready
 
-START_PATIENCE_S = 60.0
+START_TIMEOUT_S = 60.0
 END_GRACE_S = 10.0
 _RESTART_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 5.0
@@ -128,13 +128,13 @@ async def local_cluster(
         try:
             await processes.keep_up("coordinator", coordinator)
             try:
-                with told_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
-                    async with asyncio.timeout(START_PATIENCE_S):
+                with notify_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
+                    async with asyncio.timeout(START_TIMEOUT_S):
                         ready = await read_ready(ready_file, processes.failed)
             except TimeoutError as error:
                 why = last_words(processes.log("coordinator")) or "it has said nothing"
                 raise ConfigError(
-                    f"the local coordinator did not start within {START_PATIENCE_S:g} s: {why}"
+                    f"the local coordinator did not start within {START_TIMEOUT_S:g} s: {why}"
                 ) from error
             served = True
             kept = None if state is None else root / "open"
@@ -143,7 +143,7 @@ async def local_cluster(
                 await _end_permits_of_killed(kept, Path(ready.credentials["operator"]))
             yield LocalCluster(ready, processes, audited=bool(audit), kept=kept)
         finally:
-            with told_if_slow("the local cluster to end"):
+            with notify_if_slow("the local cluster to end"):
                 await processes.end()
             # Not where the coordinator never served: the folder may be another command's, whose workers are alive.
             if served and state is not None:
@@ -203,7 +203,7 @@ class _Processes:
         self._logs = logs
         self._kind = kind
         self._running: list[ChildProcess] = []
-        self._keepers: list[asyncio.Task[None]] = []
+        self._restarting: list[asyncio.Task[None]] = []
 
     def log(self, name: str) -> Path:
         """Where that process writes."""
@@ -211,14 +211,14 @@ class _Processes:
 
     async def keep_up(self, name: str, program: Sequence[str]) -> None:
         child = await self._start(name, program)
-        keeper = asyncio.create_task(self._keep_up(child, name, program))
-        keeper.add_done_callback(self._given_up)
-        self._keepers.append(keeper)
+        restarting = asyncio.create_task(self._keep_up(child, name, program))
+        restarting.add_done_callback(self._given_up)
+        self._restarting.append(restarting)
 
     async def end(self) -> None:
-        for task in self._keepers:
+        for task in self._restarting:
             task.cancel()
-        await asyncio.gather(*self._keepers, return_exceptions=True)
+        await asyncio.gather(*self._restarting, return_exceptions=True)
         if not self.failed.cancel():
             self.failed.exception()  # looked at, so that asyncio does not complain that nobody did
         for child in reversed(self._running):
@@ -244,9 +244,9 @@ class _Processes:
         self._running.append(child)
         return child
 
-    def _given_up(self, keeper: asyncio.Task[None]) -> None:
-        if not keeper.cancelled() and not self.failed.done():
-            error = keeper.exception()
+    def _given_up(self, restarting: asyncio.Task[None]) -> None:
+        if not restarting.cancelled() and not self.failed.done():
+            error = restarting.exception()
             assert error is not None
             self.failed.set_exception(error)
 

@@ -14,7 +14,7 @@ AFTER_S = 3.0
 
 
 @contextlib.contextmanager
-def told_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
+def notify_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
     """Warns that `what` is waited for if the inside takes longer than `after_s` seconds. On an event loop."""
     timer = asyncio.get_running_loop().call_later(after_s, lambda: log.warning(f"waiting for {what}"))
     try:

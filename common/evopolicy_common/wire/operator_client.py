@@ -39,7 +39,7 @@ from evopolicy_common.wire.transport import Link
 
 WAIT_S = 3.0
 """Of a long poll: so often a command hears what it waits for."""
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 """Of what must be answered soon: TransportError when nobody does."""
 _SENDER = "operator"
 
@@ -56,7 +56,7 @@ class OperatorClient:
     async def status(self) -> StatusReply:
         """What the cluster is doing."""
         message = StatusRequest(token=self._token)
-        return await self._requests.until_answered("status", message, StatusReply, patience_s=PATIENCE_S)
+        return await self._requests.until_answered("status", message, StatusReply, timeout_s=TIMEOUT_S)
 
     async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
         await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
@@ -64,7 +64,7 @@ class OperatorClient:
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
         """What there is for playing a finished run's episodes again."""
         asked = replace(message, token=self._token)
-        return await self._requests.until_answered("describe", asked, EnvironmentState, patience_s=PATIENCE_S)
+        return await self._requests.until_answered("describe", asked, EnvironmentState, timeout_s=TIMEOUT_S)
 
     # Runs.
 
@@ -82,7 +82,7 @@ class OperatorClient:
         await self._done("repin", message)
 
     async def recorded(
-        self, run: str, split: Split, submit_index: int, *, patience_s: float | None = None
+        self, run: str, split: Split, submit_index: int, *, timeout_s: float | None = None
     ) -> AsyncIterator[EpisodeOutcome]:
         """Outcomes of a finished run as they were stored, in the order in which they came in.
 
@@ -94,7 +94,7 @@ class OperatorClient:
                 token=self._token, run=run, split=split, submit_index=submit_index, cursor=cursor
             )
             page = await self._requests.until_answered(
-                "recorded", message, EvaluationPage, patience_s=patience_s
+                "recorded", message, EvaluationPage, timeout_s=timeout_s
             )
             cursor = page.cursor
             for outcome in page.outcomes:
@@ -113,7 +113,7 @@ class OperatorClient:
         entries: list[bytes] = []
         while True:
             message = JournalRequest(token=self._token, cursor=len(entries))
-            page = await self._requests.until_answered("journal", message, JournalPage, patience_s=PATIENCE_S)
+            page = await self._requests.until_answered("journal", message, JournalPage, timeout_s=TIMEOUT_S)
             entries += page.entries
             if page.finished:
                 return entries
@@ -121,12 +121,12 @@ class OperatorClient:
     async def opening(self, run: str) -> RunOpening:
         """What the coordinator committed to for a run that is disclosed."""
         message = OpeningRequest(token=self._token, run=run)
-        return await self._requests.until_answered("opening", message, RunOpening, patience_s=PATIENCE_S)
+        return await self._requests.until_answered("opening", message, RunOpening, timeout_s=TIMEOUT_S)
 
     async def sign(self, digest: str) -> Signed:
         """The coordinator's signature of a manifest, by its SHA-256."""
         message = SignRequest(token=self._token, digest=digest)
-        return await self._requests.until_answered("sign", message, Signed, patience_s=PATIENCE_S)
+        return await self._requests.until_answered("sign", message, Signed, timeout_s=TIMEOUT_S)
 
     # Episodes outside any run.
 
@@ -139,7 +139,7 @@ class OperatorClient:
         """
         asked = replace(message, token=self._token)
         started = await self._requests.until_answered(
-            "evaluate", asked, EvaluationStarted, patience_s=PATIENCE_S
+            "evaluate", asked, EvaluationStarted, timeout_s=TIMEOUT_S
         )
         cursor, finished = 0, False
         try:
@@ -176,4 +176,4 @@ class OperatorClient:
     async def _done(
         self, verb: str, message: AgentGone | CancelRun | Disclose | RepinRun | SetWorker
     ) -> None:
-        await self._requests.until_answered(verb, message, Done, patience_s=PATIENCE_S)
+        await self._requests.until_answered(verb, message, Done, timeout_s=TIMEOUT_S)

@@ -25,10 +25,10 @@ class Ready(msgspec.Struct, frozen=True, kw_only=True):
     """What its operator is to know of the cases of new runs; empty for nothing."""
 
 
-async def read_ready(path: Path, keeper: asyncio.Future[None]) -> Ready:
-    """Waits for the file and reads it. `keeper` ends only with an error, which is raised here when it comes first."""
+async def read_ready(path: Path, failed: asyncio.Future[None]) -> Ready:
+    """Waits for the file and reads it. `failed` ends only with an error, which is raised here when it comes first."""
     while not path.exists():
-        if keeper.done():
-            keeper.result()
+        if failed.done():
+            failed.result()
         await asyncio.sleep(_LOOK_S)
     return msgspec.json.decode(path.read_bytes(), type=Ready)

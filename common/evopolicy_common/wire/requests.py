@@ -1,7 +1,7 @@
-"""Typed requests to the coordinator, with patience: what workers, gateways and operators ask through.
+"""Typed requests to the coordinator, with timeouts: what workers, gateways and operators ask through.
 
 Every request of ours may be sent again, so an answer that does not come is asked for again, with back-off, until it does
-or the caller's patience ends. A refusal is an answer.
+or the caller's timeout passes. A refusal is an answer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
-from evopolicy_common.processes.notices import AFTER_S, told_if_slow
+from evopolicy_common.processes.notices import AFTER_S, notify_if_slow
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.transport import Link
@@ -55,7 +55,7 @@ class Requester(Generic[Reply]):
 
         `wait_s` is how long the message itself asks the coordinator to wait. Raises RefusedError, TransportError when no answer came, ProtocolError for another answer.
         """
-        with told_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
+        with notify_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
             answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
         return expect(codec.decode(self._replies, answer), wanted)
 
@@ -66,9 +66,9 @@ class Requester(Generic[Reply]):
         wanted: type[Wanted],
         *,
         wait_s: float = 0.0,
-        patience_s: float | None = None,
+        timeout_s: float | None = None,
     ) -> Wanted:
-        """`once`, sent again until answered; TransportError when `patience_s` seconds went by without (None: never)."""
+        """`once`, sent again until answered; TransportError when `timeout_s` seconds went by without (None: never)."""
         pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
         started = time.monotonic()
         while True:
@@ -76,7 +76,7 @@ class Requester(Generic[Reply]):
                 return await self.once(verb, message, wanted, wait_s=wait_s)
             except TransportError as error:
                 waited = time.monotonic() - started
-                if patience_s is not None and waited > patience_s:
+                if timeout_s is not None and waited > timeout_s:
                     raise
                 if waited > warn_after_s:
                     warn_after_s = 2.0 * waited

@@ -29,7 +29,7 @@ import structlog
 import zenoh
 
 from evopolicy_common.errors import TransportError
-from evopolicy_common.processes.notices import told_if_slow
+from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
 from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
 
@@ -222,7 +222,7 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
     Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
     a wrong password looks like: the router does not say.
     """
-    with told_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
+    with notify_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
         session = await _open_client(credentials, timeout_s)
     link = Link(session, credentials)
     try:
@@ -255,7 +255,7 @@ def client_config(credentials: Credentials) -> zenoh.Config:
             **_COMMON,
             "mode": "client",
             "connect/endpoints": list(credentials.endpoints),
-            # One attempt: opening a client blocks its thread until it is in, so the patience is `connect`'s.
+            # One attempt: opening a client blocks its thread until it is in, so the timeout is `connect`'s.
             "connect/timeout_ms": 0,
             "transport/auth/usrpwd/user": credentials.user,
             "transport/auth/usrpwd/password": credentials.password,

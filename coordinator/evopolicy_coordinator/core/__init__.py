@@ -3,7 +3,7 @@
     core, effects = Core.load(settings, snapshot, now)
     effects = core.handle(event, now)
     effects = core.handle_deadline(now)         # when now >= core.next_deadline()
-    core.validate()                             # raises InvariantError with a story; cheap enough for tests only
+    core.validate()                             # raises InvariantError with a trace; cheap enough for tests only
 
 No clock, RNG, disk, log or await in here: `now` and randomness come in, ordered effects and the next deadline go out.
 
@@ -45,11 +45,11 @@ each event with a `request` is answered by exactly one effect that names it. A s
 its first with no leases.
 
 *Bundles and blobs.* The shell makes sure that a submit's bundle is stored before it hands a `Submit` in, and that the
-blobs an outcome names are stored before it hands a `HandIn` in. Inline trajectories travel in the outcome; whether a
+blobs an outcome names are stored before it hands a `ReportResults` in. Inline trajectories travel in the outcome; whether a
 row keeps them inline or as a blob is the store's business, as long as digests stay.
 
 *Status* is read, not an event: `core.status(now, words)` gives workers, runs, stalls, episodes done and their rate as the parts of
-a `StatusReply`. `core.story(key)` tells what happened to a job, lease, run or worker, as far back as is kept.
+a `StatusReply`. `core.trace(key)` tells what happened to a job, lease, run or worker, as far back as is kept.
 
 *Memory.* A core holds open work only: for each open group of episodes their returns and order of arrival, for each
 unfinished run its submits without their episodes, for each finished run its key and capability. Outcomes are read from

@@ -89,7 +89,7 @@ class AuditPrepared(Event, frozen=True, kw_only=True):
     error: str = ""
     """Why there are none."""
     at_fault: bool = False
-    """What the player handed in is no recording; else the coordinator's own store is to blame."""
+    """What the player reported is no recording; else the coordinator's own store is to blame."""
 
 
 class AuditCompared(Event, frozen=True, kw_only=True):
@@ -100,7 +100,7 @@ class AuditCompared(Event, frozen=True, kw_only=True):
     replay: int
     """Which replay was compared, from 1."""
     with_player: str | None
-    """Where it parts from what the player handed in; None when they are the same."""
+    """Where it parts from what the player reported; None when they are the same."""
     with_first: str | None = None
     """Where it parts from the first replay; None when they are the same, or it is the first."""
     error: str = ""

@@ -9,11 +9,11 @@ from .isolation.kernels import all_related, related
 from .model import N_PRIORITIES, TRAIN, JobState
 from .records import train_group
 from .state import State
-from .structures.story import InvariantError
+from .structures.trace import InvariantError
 
 
 def check(state: State) -> None:
-    """Raise InvariantError, with the story of what is concerned, at the first thing that contradicts itself."""
+    """Raise InvariantError, with the trace of what is concerned, at the first thing that contradicts itself."""
     _jobs(state)
     _queue(state)
     _workers(state)
@@ -51,21 +51,26 @@ def check(state: State) -> None:
 def _isolation(state: State) -> None:
     """Hidden jobs, agents and train jobs of related runs are on different kernels; what is over is forgotten."""
     for kernel in state.kernels.values() if state.isolates else ():
-        for stay in all_related(kernel.hidden, None):
-            if stay.lease is None or not stay.lease.live:
+        for occupancy in all_related(kernel.hidden, None):
+            if occupancy.lease is None or not occupancy.lease.live:
                 continue
             others = (kernel, state.everywhere)
-            beside = [each for there in others for each in all_related(there.train, stay.family)]
+            beside = [each for there in others for each in all_related(there.train, occupancy.family)]
             # What a worker may have played besides, before it was heard, it has told when its lease was adopted.
-            train = any(each.lease is not None or each.worker != stay.worker for each in beside)
-            apart = not train and not any(related(there.permits, stay.family) for there in others)
-            want(state, stay.id, apart, "a hidden job is apart from related agents and train jobs")
-            want(state, stay.id, kernel is not state.everywhere, "a hidden job's kernel is known")
+            train = any(each.lease is not None or each.worker != occupancy.worker for each in beside)
+            apart = not train and not any(related(there.permits, occupancy.family) for there in others)
+            want(state, occupancy.id, apart, "a hidden job is apart from related agents and train jobs")
+            want(state, occupancy.id, kernel is not state.everywhere, "a hidden job's kernel is known")
     for worker in state.workers.values():
         for lease in worker.leases.values():
             group = lease.job.group
             wanted = group.hidden or group.kind == "train"
-            want(state, lease.id, (lease.stay is not None) == wanted, "what a worker holds is on its kernel")
+            want(
+                state,
+                lease.id,
+                (lease.occupancy is not None) == wanted,
+                "what a worker holds is on its kernel",
+            )
     flows = {group.flow for group in state.groups.values()}
     flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
     users = Counter(flow.family for flow in flows if flow.family is not None)
@@ -99,10 +104,10 @@ def _audits(state: State) -> None:
 
 
 def want(state: State, key: str, holds: bool, what: str) -> None:
-    """InvariantError with the story of `key` when something does not hold."""
+    """InvariantError with the trace of `key` when something does not hold."""
     if not holds:
         lines = "\n".join(
-            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in state.story.of(key)
+            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in state.trace.of(key)
         )
         raise InvariantError(f"{key}: violated: {what}\n{lines}")
 

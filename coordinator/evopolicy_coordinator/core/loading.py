@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .agents import permits, requests
-from .isolation import stays
+from .isolation import occupancies
 from .leasing import fleet, pins
 from .model import Ended, JobGroup, Run
 from .records import AuditRow, RunStateRow, Snapshot, SubmitRow, validation_group
@@ -36,7 +36,7 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
         fleet.set_state(state, worker.worker, worker.state, worker.reason, worker.machine)
     stored = {row.run: row for row in snapshot.states}
     permits.load(state, snapshot.permits, {row.run: row for row in snapshot.runs}, stored, step)
-    stays.load(state, snapshot.kernels, step)
+    occupancies.load(state, snapshot.kernels, step)
     submits_of: dict[str, list[SubmitRow]] = {}
     for submit in snapshot.submits:
         submits_of.setdefault(submit.run, []).append(submit)

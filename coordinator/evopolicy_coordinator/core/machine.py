@@ -16,9 +16,9 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.wire.refusals import Refusal
 
 from . import events, invariants, loading, status, step
-from .agents import known, permits, precedence, requests
+from .agents import open_runs, permits, precedence, requests
 from .effects import Effect
-from .isolation import stays
+from .isolation import occupancies
 from .leasing import expiry, fleet, queue
 from .model import LaneKey
 from .reasons import Reason
@@ -29,7 +29,7 @@ from .runs import (
     finalisation,
     finished,
     journal,
-    results,
+    result_polls,
     runs,
     submits,
 )
@@ -37,8 +37,8 @@ from .settings import CoreSettings
 from .state import State
 from .status import CoreStatus, Words
 from .step import Step
-from .structures.story import StoryLine
-from .workers import handin, membership, scheduler
+from .structures.trace import TraceEntry
+from .workers import membership, results, scheduler
 
 TICK_S = 1.0
 """While leases are out the core wants to be called at least so often, to notice when it is not."""
@@ -89,7 +89,7 @@ class Core:
         return effects
 
     def validate(self) -> None:
-        """Check every invariant; InvariantError with the story of what breaks one. For tests: looks at everything."""
+        """Check every invariant; InvariantError with the trace of what breaks one. For tests: looks at everything."""
         invariants.check(self.state)
 
     # ---- reading ----
@@ -100,7 +100,7 @@ class Core:
 
     def over(self, run: str) -> tuple[Refusal, Reason]:
         """Why nothing more is taken of a run that is not open."""
-        return known.over(self.state, run)
+        return open_runs.over(self.state, run)
 
     def worker_of(self, session: str) -> str | None:
         """The worker whose present session is `session` (its right to read and write blobs); None when it is nobody's."""
@@ -110,9 +110,9 @@ class Core:
         """The core's part of a `StatusReply`; `words` puts a reason into words."""
         return status.status(self.state, now, words)
 
-    def story(self, key: str) -> list[StoryLine]:
+    def trace(self, key: str) -> list[TraceEntry]:
         """What happened to a job, lease, worker, group or run, oldest first, as far back as is kept."""
-        return self.state.story.of(key)
+        return self.state.trace.of(key)
 
     # ---- a step ----
 
@@ -166,12 +166,12 @@ EVENTS: dict[type, Rule] = {
     gateway.RequestPermit: requests.requested,
     gateway.StateRequest: runs.state_requested,
     gateway.Submit: submits.submit,
-    gateway.ResultsRequest: results.results,
+    gateway.ResultsRequest: result_polls.results,
     gateway.CloseRun: finalisation.close,
     wire.Register: membership.registered,
     wire.LeaseRequest: membership.lease_requested,
     wire.Heartbeat: membership.heartbeat,
-    wire.HandIn: membership.handed_in,
+    wire.ReportResults: membership.results_reported,
     events.LivenessLost: membership.liveness_lost,
     events.AuditPrepared: audits.prepared,
     events.AuditCompared: audits.compared,
@@ -180,7 +180,7 @@ EVENTS: dict[type, Rule] = {
 
 
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
-    (step.HandedIn, ""): (handin.take,),
+    (step.ResultsPersisted, ""): (results.take,),
     (step.EpisodesDone, "train"): (audits.sample, submits.progressed),
     (step.EpisodesDone, "validation"): (audits.sample, finalisation.progressed),
     (step.EpisodesDone, "heldout"): (audits.sample, finalisation.progressed),
@@ -214,7 +214,7 @@ def _look_at_lane(state: State, key: LaneKey, this: Step) -> None:
 
 
 POLLS: Mapping[str, Rule] = {
-    "results": results.answer,
+    "results": result_polls.answer,
     "evaluation": evaluations.answer,
     "permit": requests.answer,
     "run": finished.answer,
@@ -233,7 +233,7 @@ TIMERS: dict[str, Rule] = {
     "hidden": precedence.look_at,
     "submit": submits.limit_passed,
     "audits": finalisation.look_at_audits,
-    "linger": stays.expire,
+    "linger": occupancies.expire,
     "ask": permits.ask_ended,
     "cancelled": permits.agent_ended,
 }

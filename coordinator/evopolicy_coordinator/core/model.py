@@ -51,7 +51,7 @@ HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
 GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
 
-class Mark(NamedTuple):
+class OutcomeDigest(NamedTuple):
     """What is kept of a finished episode while its group is open; equal for attempts that went the same way."""
 
     episode_return: float
@@ -60,9 +60,9 @@ class Mark(NamedTuple):
     trajectory: str | None
 
 
-def mark_of(outcome: EpisodeOutcome) -> Mark:
+def outcome_digest(outcome: EpisodeOutcome) -> OutcomeDigest:
     """The mark of an outcome."""
-    return Mark(
+    return OutcomeDigest(
         outcome.episode_return,
         outcome.length,
         None if outcome.failure is None else outcome.failure.category,
@@ -178,7 +178,7 @@ class JobGroup:
     stimulus_id: str
     priority: int
     created_at: float
-    marks: dict[int, Mark] = field(default_factory=dict)
+    digests: dict[int, OutcomeDigest] = field(default_factory=dict)
     jobs: dict[int, JobState] = field(default_factory=dict)
     """Open jobs, by their first index."""
     first_leased_at: float | None = None
@@ -206,7 +206,7 @@ class JobGroup:
         """Whether it is hidden work."""
         return self.priority in HIDDEN
 
-    def bars(self, worker: Worker) -> bool:
+    def excludes(self, worker: Worker) -> bool:
         """Whether a worker must not play it."""
         if worker.name in self.not_on or worker.machine in self.not_of:
             return True
@@ -220,11 +220,11 @@ class JobGroup:
     @property
     def done(self) -> int:
         """Episodes that have their outcome."""
-        return len(self.marks)
+        return len(self.digests)
 
     def returns(self) -> tuple[float, ...]:
         """Returns in order of index; every episode must be done."""
-        return tuple(self.marks[index].episode_return for index in range(self.n))
+        return tuple(self.digests[index].episode_return for index in range(self.n))
 
     def mean_return(self) -> float:
         """Mean of the returns, summed exactly, so that order of arrival cannot show."""
@@ -232,11 +232,11 @@ class JobGroup:
 
     def failed(self) -> int:
         """Episodes whose policy failed."""
-        return sum(mark.failure is not None for mark in self.marks.values())
+        return sum(digest.failure is not None for digest in self.digests.values())
 
     def first_unfinished(self) -> int:
         """Smallest index without an outcome; `n` when all are done."""
-        return next((index for index in range(self.n) if index not in self.marks), self.n)
+        return next((index for index in range(self.n) if index not in self.digests), self.n)
 
 
 @dataclass(slots=True, eq=False)
@@ -269,7 +269,7 @@ class Lease:
     """Where it is listed as one that may be preempted."""
     stopped_for: Lane | None = None
     """Whose train jobs it was preempted for."""
-    stay: Stay | None = None
+    occupancy: Occupancy | None = None
     """Where it is, if it is hidden or train: as long as it is its worker's."""
 
     @property
@@ -464,7 +464,7 @@ class Family:
 
 
 @dataclass(slots=True, eq=False)
-class Stay:
+class Occupancy:
     """A hidden or train lease on the kernel of its worker, as long as it may be played there."""
 
     id: str
@@ -487,7 +487,7 @@ class Stay:
         return f"{self.worker} {self.id}"
 
 
-Stays = dict[Family | None, dict[str, Stay]]
+Occupancies = dict[Family | None, dict[str, Occupancy]]
 
 
 @dataclass(slots=True, eq=False)
@@ -517,8 +517,8 @@ class Kernel:
     permits: dict[Family | None, dict[str, PermitRow]] = field(default_factory=dict)
     """By run."""
     asks: dict[Family | None, dict[str, Ask]] = field(default_factory=dict)
-    hidden: Stays = field(default_factory=dict)
-    train: Stays = field(default_factory=dict)
+    hidden: Occupancies = field(default_factory=dict)
+    train: Occupancies = field(default_factory=dict)
     reversals: dict[Family | None, dict[str, Reversal]] = field(default_factory=dict)
 
 

@@ -21,19 +21,19 @@ from .model import (
     Kernel,
     Lane,
     LaneKey,
+    Occupancy,
     OutOfService,
     Profile,
     ProfileKey,
     Run,
-    Stay,
     Worker,
 )
 from .records import BegunRow, JournalRow, KernelRow, OutcomeHead, PermitRow
 from .settings import CoreSettings
 from .structures.polls import Polls
 from .structures.rate import Rate
-from .structures.story import Story
 from .structures.timers import Timers
+from .structures.trace import Trace
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
 
@@ -63,7 +63,7 @@ class State:
         self.first_attempt = (incarnation - 1) * ATTEMPTS_PER_INCARNATION
         """Attempts up to this number were granted by earlier incarnations."""
         self.timers = Timers()
-        self.story = Story()
+        self.trace = Trace()
         self.polls = Polls(self.timers, settings.max_wait_s)
         self.rate = Rate()
         self.loading: Loading | None = None
@@ -131,7 +131,7 @@ class State:
         self.families = Families(strict=settings.hidden_isolation == "strict")
         self.everywhere = Kernel(EVERYWHERE)
         self.kernels: dict[str, Kernel] = {EVERYWHERE: self.everywhere}
-        self.lingering: dict[str, dict[str, Stay]] = {}
+        self.lingering: dict[str, dict[str, Occupancy]] = {}
         """By worker: stays without a lease."""
         self.permits: dict[str, dict[Kernel, tuple[PermitRow, Family]]] = {}
         """By run."""

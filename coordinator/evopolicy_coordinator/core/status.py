@@ -11,7 +11,7 @@ from typing import NamedTuple
 from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 
 from .agents import permits
-from .isolation import bars
+from .isolation import conflicts
 from .leasing import pins
 from .model import AUDIT, Lane, Lease, Run, Worker
 from .reasons import Reason
@@ -78,7 +78,7 @@ def _worker(state: State, worker: Worker, now: float) -> WorkerStatus:
         last_seen_s=max(0.0, now - worker.last_seen),
         refused=pins.refused_runs(state, worker),
         boot_id=worker.kernel.boot_id,
-        hidden_bar=bars.bar_of_worker(state, worker),
+        hidden_bar=conflicts.conflict_of_worker(state, worker),
         playing=_playing(live),
     )
 

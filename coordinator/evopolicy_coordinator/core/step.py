@@ -33,8 +33,8 @@ from .records import AuditRow, Row, SubmitRow
 
 
 @dataclass(slots=True, eq=False)
-class HandedIn:
-    """A worker handed in what came of one lease."""
+class ResultsPersisted:
+    """A worker reported what came of one lease."""
 
     worker: Worker
     result: JobResult
@@ -107,7 +107,7 @@ class AuditsMoved:
     kind: ClassVar[str] = ""
 
 
-News = HandedIn | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved
+News = ResultsPersisted | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved
 
 
 # ---- steps ----

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 from evopolicy_common.messages.gateway import SubmitStatus
 
-from .structures.story import InvariantError
+from .structures.trace import InvariantError
 
 Table = Mapping[str, Collection[str]]
 """State to those that may follow it; nothing follows a state with none."""

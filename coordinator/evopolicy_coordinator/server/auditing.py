@@ -2,7 +2,7 @@
 
 Rules that this module owns:
 - A worker that plays an episode again is given its actions and nothing that came of them.
-- What a player handed in is never trusted to be a recording; what cannot be read is its fault, what the store has lost is
+- What a player reported is never trusted to be a recording; what cannot be read is its fault, what the store has lost is
   not.
 """
 
@@ -21,7 +21,7 @@ _LOST = "its record is not in the store any more"
 
 
 def carry_out(effect: AuditEffect, reader: Reader, blobs: BlobStore) -> AuditEvent:
-    """Carries out an audit's effect: reads, stores, compares. Never raises for what a worker handed in, or the store."""
+    """Carries out an audit's effect: reads, stores, compares. Never raises for what a worker reported, or the store."""
     return (
         _prepare(effect, reader, blobs)
         if isinstance(effect, PrepareAudit)

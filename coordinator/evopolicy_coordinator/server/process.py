@@ -22,9 +22,9 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.pki.machines import Machines
-from evopolicy_coordinator.server.answers import Answers
-from evopolicy_coordinator.server.intake import Intake
-from evopolicy_coordinator.server.remote_door import declare_all, remote_door
+from evopolicy_coordinator.server.reader import ServiceReader
+from evopolicy_coordinator.server.remote_listener import declare_all, remote_listener
+from evopolicy_coordinator.server.request_parser import RequestParser
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, secret_of
@@ -77,7 +77,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
         uploads = Uploads()
-        intake = Intake(
+        parser = RequestParser(
             state.identity,
             blobs,
             source,
@@ -86,14 +86,14 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
             denied_imports=SIMULATORS,
             machines=machines,
         )
-        answers = Answers(state.database, blobs, uploads)
-        service = Service(state.identity.cluster, store, answers, intake, options.core)
+        reader = ServiceReader(state.database, blobs, uploads)
+        service = Service(state.identity.cluster, store, reader, parser, options.core)
         try:
             await service.start()
-            door = remote_door(
+            listener = remote_listener(
                 state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
             )
-            async with door:
+            async with listener:
                 await _serve(state, options, listen, reachable(remote), service, stop, on_ready, note)
         finally:
             await service.stop()

@@ -51,13 +51,13 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.model import Worker
 from evopolicy_coordinator.core.records import latest_time
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.server.answers import Answers, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.claims import Claims
-from evopolicy_coordinator.server.intake import Intake, Parsed
 from evopolicy_coordinator.server.pending import PendingQueries
-from evopolicy_coordinator.server.turned_away import TurnedAwayWorkers
+from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
+from evopolicy_coordinator.server.reason_texts import message, words
+from evopolicy_coordinator.server.refused_workers import RefusedWorkers
+from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.server.watchdog import LoopWatchdog
-from evopolicy_coordinator.server.words import message, words
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
 
@@ -81,19 +81,19 @@ class Service:
         self,
         cluster: str,
         store: Store,
-        answers: Answers,
-        intake: Intake,
+        reader: ServiceReader,
+        parser: RequestParser,
         settings: CoreSettings,
     ) -> None:
         """To be made on the event loop. The store is the service's from now on; `stop` does not close it."""
         self._cluster = cluster
-        self._answers = answers
-        self._intake = intake
+        self._reader = reader
+        self._parser = parser
         self._settings = settings
         self._loop = asyncio.get_running_loop()
         self._writer = Writer(store)
         self._claims = Claims(self._writer)
-        self._turned_away = TurnedAwayWorkers()
+        self._refused_workers = RefusedWorkers()
         self._outbox: Outbox | None = None
         self._core: Core | None = None
         self._pending = PendingQueries()
@@ -145,7 +145,7 @@ class Service:
             await self._writer.call(lambda store: None)
         self._pending.let_go()
         await self._writer.close()
-        await asyncio.to_thread(self._answers.close)
+        await asyncio.to_thread(self._reader.close)
         if self._watchdog is not None:
             self._watchdog.close()
 
@@ -193,7 +193,7 @@ class Service:
             self._turn_away(query)
             return
         try:
-            parsed = self._intake.parse(query.key, query.payload, core)
+            parsed = self._parser.parse(query.key, query.payload, core)
             self._serve(core, query, parsed)
         except RefusedError as error:
             self._refuse(query, error)
@@ -215,9 +215,9 @@ class Service:
         elif isinstance(message, operator.StatusRequest):
             query.reply(answer_bytes(self._status(core)), lane_of(parsed.asker))
         elif isinstance(message, operator.RecordedRequest):
-            self._answers.recorded(message, answer_to(query, parsed.asker))
+            self._reader.recorded(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.JournalRequest | operator.OpeningRequest | operator.SignRequest):
-            self._answers.published(message, answer_to(query, parsed.asker))
+            self._reader.published(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
             offering = [
                 each for each in core.state.workers.values() if message.env in each.profile.descriptions
@@ -228,12 +228,12 @@ class Service:
                 }.values()
             )
             self._spawn(self._serve_description(query, message, fingerprints))
-        elif self._intake.reads_files(message):
+        elif self._parser.reads_files(message):
             self._spawn(self._serve_from_thread(query, parsed))
         else:
             request = self._pending.admit(query, parsed.asker)
             try:
-                event = self._intake.event(parsed, request, self._stimulus_of(message))
+                event = self._parser.event(parsed, request, self._stimulus_of(message))
             except BaseException:
                 self._pending.take(request)
                 raise
@@ -274,12 +274,12 @@ class Service:
     def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
         message = parsed.message
         if isinstance(message, operator.Evaluate) and message.as_in is not None:
-            row = self._answers.finished_run(message.as_in.run)
-            return self._intake.evaluation_requested(message, request, stimulus, row)
+            row = self._reader.finished_run(message.as_in.run)
+            return self._parser.evaluation_requested(message, request, stimulus, row)
         if isinstance(message, operator.Disclose):
-            epochs = self._answers.epochs(message.runs)
+            epochs = self._reader.epochs(message.runs)
             return DisclosureAsked(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
-        return self._intake.event(parsed, request, stimulus)
+        return self._parser.event(parsed, request, stimulus)
 
     async def _serve_description(
         self,
@@ -289,8 +289,8 @@ class Service:
     ) -> None:
         """What is here for playing a run's episodes again."""
         try:
-            row = await asyncio.to_thread(self._answers.finished_run, message.run)
-            hashes = await asyncio.to_thread(self._intake.split_hashes, message, row)
+            row = await asyncio.to_thread(self._reader.finished_run, message.run)
+            hashes = await asyncio.to_thread(self._parser.split_hashes, message, row)
         except RefusedError as error:
             self._refuse(query, error)
         except Exception:
@@ -331,7 +331,7 @@ class Service:
                 raise RefusedError(*_over(core, parsed.asker))
         run_id = parsed.asker if parsed.room == "gw" else None
         answer = answer_to(query, parsed.asker)
-        self._answers.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
+        self._reader.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":
@@ -342,7 +342,7 @@ class Service:
                     f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
                 )
         run = parsed.asker if parsed.room == "gw" else None
-        self._answers.get(run, message, answer_to(query, parsed.asker))
+        self._reader.get(run, message, answer_to(query, parsed.asker))
 
     def _status(self, core: Core) -> operator.StatusReply:
         part = core.status(self.now(), words)._asdict()
@@ -351,21 +351,21 @@ class Service:
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
             uptime_s=self.now() - self._started_at,
-            turned_away=self._turned_away.told(self.now()),
+            turned_away=self._refused_workers.told(self.now()),
             **part,
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
         log.info("refused", key=query.key, status=error.status, why=error.message)
         answer = Refused(status=error.status, message=error.message)
-        self._turned_away.answered(query.key, query.payload, answer, self.now())
+        self._refused_workers.answered(query.key, query.payload, answer, self.now())
         query.reply(answer_bytes(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core nothing can be served; who would change something is told why."""
-        if self._storage_error and self._intake.asks_for_change(query.key, query.payload):
+        if self._storage_error and self._parser.asks_for_change(query.key, query.payload):
             why = "the coordinator cannot write its store and takes nothing new until it can"
-            if not self._intake.is_gateways(
+            if not self._parser.is_gateways(
                 query.key
             ):  # the reason names paths, which no agent needs to know
                 why += f": {self._storage_error}"
@@ -513,14 +513,14 @@ class Service:
             pending = self._pending.take(effect.request)
             if pending is not None:
                 query, told = pending.query, message(effect)
-                self._turned_away.answered(query.key, query.payload, told, self.now())
+                self._refused_workers.answered(query.key, query.payload, told, self.now())
                 query.reply(answer_bytes(told), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._pending.take(effect.request)
             if pending is not None:
-                self._answers.page(effect, answer_to(pending.query, pending.asker))
+                self._reader.page(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
-            self._answers.audit(effect, self._told_of_audit(self._incarnation))
+            self._reader.audit(effect, self._told_of_audit(self._incarnation))
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 

@@ -30,7 +30,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.checkpoints import bundle_of
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.trajectory import Trajectory, decode
-from evopolicy_common.wire.operator_client import PATIENCE_S, OperatorClient
+from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.verify import compare as verify_compare
 from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
@@ -249,7 +249,7 @@ class Verifier:
     async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
         """Outcomes that the coordinator stored, by index."""
         found = self._ask.recorded(
-            self._run.record.run, played.split, played.submit_index, patience_s=PATIENCE_S
+            self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
         )
         return {outcome.index: outcome async for outcome in found}
 

@@ -164,7 +164,7 @@ def _():
                 line = file.read()
         except OSError:
             continue
-        if b"evopolicy_coordinator" in line or b"agent_supervisor.keeper" in line:
+        if b"evopolicy_coordinator" in line or b"agent_supervisor.supervisor" in line:
             found.append(path)
     return found[0]
 

@@ -1,6 +1,6 @@
 """A real worker process that cheats: `cheating_worker.py HOW OPTIONS…`, the options being the worker's own.
 
-HOW: `honest`; `rewards` adds to every reward that it hands in, returns and recordings in accord; `return` to the returns
+HOW: `honest`; `rewards` adds to every reward that it reports, returns and recordings in accord; `return` to the returns
 alone; `old-code` tells another code version; `old-protocol` speaks another wire version. All but the last two tell the
 same fingerprint, whatever is edited meanwhile.
 """
@@ -55,7 +55,7 @@ FORGERIES: dict[str, Callable[[EpisodeOutcome], EpisodeOutcome]] = {
 
 
 class CheatingSlot(Slot):
-    """Plays, and hands in something else."""
+    """Plays, and reports something else."""
 
     async def play(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]

@@ -33,7 +33,7 @@ NEEDS_MORE_THAN_NO_JAIL = {
     *("mount over feedback", "send to the world", "change the kernel's settings", "read the kernel's log"),
     # There is none outside.
     "read what is hidden from the jail's own command",
-    # Stopped without a jail too: its keeper leaves the login's keyring behind.
+    # Stopped without a jail too: its agent supervisor leaves the login's keyring behind.
     "read a key of the operator's login",
     *(
         "read another process's variables",

@@ -106,7 +106,8 @@ def test_no_answer_to_a_gateway_holds_more_than_its_type_has_fields_for(golden: 
 
 
 @pytest.mark.parametrize(
-    "place", ["keeper, after the validation", "gateway, after the validation", "gateway, after the scoring"]
+    "place",
+    ["supervisor, after the validation", "gateway, after the validation", "gateway, after the scoring"],
 )
 def test_nothing_hidden_is_in_the_memory_of_the_agents_side(golden: GoldenRun, place: str) -> None:
     hidden, visible = hidden_of(golden), visible_of(golden)
@@ -127,7 +128,7 @@ def test_nothing_hidden_is_in_the_workspace_or_the_logs_while_the_run_is_scored(
 def test_hidden_returns_are_written_only_when_gateway_and_agent_are_gone(golden: GoldenRun) -> None:
     hidden = hidden_of(golden)
     assert not golden.record_came_early
-    assert not golden.keeper_outlived_the_run
+    assert not golden.supervisor_outlived_the_run
     assert golden.gateway_is_gone
     record = (golden.folder / "run.json").read_bytes()
     assert {f"return of held-out {index}" for index in range(2)} <= hidden.found_in(record)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from golden_run import GoldenCluster
 from signalling_policy import LEVELS
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 from whereabouts import heard_by, met, moments
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
@@ -61,7 +61,7 @@ class Listening:
             )
 
     def wait_for(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 2 * PATIENCE_S
+        deadline = time.monotonic() + 2 * TIMEOUT_S
         while not condition():
             assert self.process.poll() is None, self.said.read_text()
             assert time.monotonic() < deadline, self.said.read_text()
@@ -85,7 +85,7 @@ class Listening:
         return self.record()
 
     def record(self) -> RunRecord:
-        assert self.process.wait(timeout=2 * PATIENCE_S) == 0, self.said.read_text()
+        assert self.process.wait(timeout=2 * TIMEOUT_S) == 0, self.said.read_text()
         return decode_run_record(self.folder.run_json.read_bytes())
 
 
@@ -98,7 +98,7 @@ def listening(cluster: GoldenCluster, name: str, n_submits: int, *options: str) 
     finally:
         if found.process.poll() is None:
             found.process.terminate()
-        found.process.wait(timeout=PATIENCE_S)
+        found.process.wait(timeout=TIMEOUT_S)
 
 
 @contextlib.contextmanager
@@ -241,7 +241,7 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
     finally:
         if far.process.poll() is None:
             far.process.terminate()
-        far.process.wait(timeout=PATIENCE_S)
+        far.process.wait(timeout=TIMEOUT_S)
     assert met(isolated, moments(isolated), [elsewhere]) == []
 
 
@@ -252,5 +252,5 @@ def submitted(run: Listening, episodes: list[int]) -> str:
         data=json.dumps({"env_instances": episodes}).encode(),
         headers={"Authorization": f"Bearer {run.folder.bearer.read_text().strip()}"},
     )
-    with urllib.request.urlopen(request, timeout=2 * PATIENCE_S) as answer:
+    with urllib.request.urlopen(request, timeout=2 * TIMEOUT_S) as answer:
         return str(json.load(answer)["status"])

@@ -19,12 +19,12 @@ from urllib.parse import urlsplit
 import pytest
 from gateway_double import Double, Served, answering, gateway_on, opened, prepare
 
-from evopolicy_gateway.http.door import Door
+from evopolicy_gateway.http.listener import Listener
 from evopolicy_gateway.run.layout import save
-from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.submits.feedback import SubmitTree
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 BODY = b'{"env_instances": [0]}'
 DISCLOSED = re.compile(
     rb"Traceback|File \"|/usr/|/home/|/tmp/|\.py\b|starlette|uvicorn|h11|evopolicy", re.IGNORECASE
@@ -48,7 +48,7 @@ class Wire:
         reader, writer = await asyncio.open_connection(self._address.hostname, self._address.port)
         answer = b""
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 with contextlib.suppress(ConnectionError):
                     for part in parts:
                         writer.write(part)
@@ -84,12 +84,12 @@ def status(answer: bytes) -> int:
 
 
 @asynccontextmanager
-async def serving(tmp_path: Path, door: Door | None = None) -> AsyncIterator[Wire]:
+async def serving(tmp_path: Path, listener: Listener | None = None) -> AsyncIterator[Wire]:
     double = Double(opened())
     async with answering(tmp_path, double) as found:
         folder = prepare(tmp_path / "run", found, double)
-        if door is not None:
-            save(folder.door, door)
+        if listener is not None:
+            save(folder.listener, listener)
         async with gateway_on(folder, double) as service:
             yield Wire(service, tmp_path)
 
@@ -211,7 +211,7 @@ def test_a_request_inside_another_ones_body_is_never_served_or_has_to_know_the_t
 
 def test_a_smuggled_request_needs_the_bearer_token_again(tmp_path: Path) -> None:
     async def main() -> None:
-        async with serving(tmp_path, Door(host="127.0.0.2", port=0)) as w:
+        async with serving(tmp_path, Listener(host="127.0.0.2", port=0)) as w:
             bearer = w.served.folder.bearer.read_text().strip()
             request = f"GET {w.path}/info HTTP/1.1\r\nHost: {w.host}\r\n"
             mine = f"{request}Authorization: Bearer {bearer}\r\n\r\n".encode()
@@ -270,7 +270,7 @@ def test_a_fault_of_ours_is_told_without_a_word_of_it(
             raise RuntimeError(f"{tmp_path} {w.served.double.capability}")
 
         with monkeypatch.context() as patched:
-            patched.setattr(w.served.desk, "refresh", fail)
+            patched.setattr(w.served.pipeline, "refresh", fail)
             answer = await w.ask(f"{w.path}/info")
         assert status(answer) == 500
         assert json.loads(answer.partition(b"\r\n\r\n")[2])["error"]["message"].startswith(
@@ -299,7 +299,7 @@ def test_feedback_that_cannot_be_written_is_told_without_the_machines_paths(
                 told = json.loads((await w.ask(f"{w.path}/info")).partition(b"\r\n\r\n")[2])
                 waits_for = told["submit_in_flight"]["waits_for"]
         assert waits_for == "the gateway cannot write feedback: No space left on device"
-        await w.served.desk.idle()
+        await w.served.pipeline.idle()
         await w.submit_honestly(1)
 
     play(tmp_path, script)

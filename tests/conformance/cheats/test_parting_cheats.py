@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cheated import PATIENCE_S, Cheated
+from cheated import TIMEOUT_S, Cheated
 
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.checkpoints import METADATA
@@ -57,7 +57,7 @@ def check_readers(folder: Path, report: Path) -> None:
         [sys.executable, "-m", "evopolicy_gateway.cli", "report", str(folder), "--out", str(report)],
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cheated import PATIENCE_S, Cheated
+from cheated import TIMEOUT_S, Cheated
 from coordinator_harness import (
     Coordinator,
     GatewayClient,
@@ -51,7 +51,7 @@ class Eavesdropped:
             self.code, self.said, self.honest = cheated.play("evolve", "overheard")
             (workspace / "enough").touch()
         finally:
-            thread.join(PATIENCE_S)
+            thread.join(TIMEOUT_S)
         ((code, said, self.folder),) = played
         assert code == 0, said
         self.report: dict[str, Any] = json.loads((workspace / "report.json").read_text())
@@ -109,7 +109,7 @@ async def two_runs(
 
 
 def in_time(scenario: Any) -> None:
-    asyncio.run(asyncio.wait_for(scenario, 2 * PATIENCE_S))
+    asyncio.run(asyncio.wait_for(scenario, 2 * TIMEOUT_S))
 
 
 def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(coordinator: Coordinator) -> None:

@@ -1,4 +1,4 @@
-"""A worker that hands in what did not happen is caught by audits and named, next to honest ones that are not; and one with
+"""A worker that reports what did not happen is caught by audits and named, next to honest ones that are not; and one with
 an old version is refused with the reason.
 
 The coordinator and the workers are the real processes, the sandbox too; what a worker cheats with is in
@@ -24,7 +24,7 @@ from evopolicy_common.messages import operator
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.cli.status import status_app
 
-PATIENCE_S = 150.0
+TIMEOUT_S = 150.0
 EPISODES = 6
 HIDDEN = 2
 
@@ -246,7 +246,7 @@ def test_audits_of_a_local_run_are_in_its_run_json(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
     )
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "runs" / "tester" / "toy_line" / "audited"

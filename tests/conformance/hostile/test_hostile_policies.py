@@ -182,7 +182,7 @@ def test_in_the_environments_own_process_the_same_code_does_harm(attack: Breaker
 
 
 def test_an_honest_policy_plays_in_the_environments_own_process_too() -> None:
-    assert harmed(BREAKERS[0].source.replace("time.sleep(0.8)", "pass"), patience_s=60.0) is None
+    assert harmed(BREAKERS[0].source.replace("time.sleep(0.8)", "pass"), timeout_s=60.0) is None
 
 
 def test_nothing_of_an_episode_is_left_for_the_next(slots: Slots) -> None:

@@ -26,7 +26,7 @@ MAX_OUTPUT = 65536
 MAX_FILE = 64 << 20
 COMMANDS, REPLIES = 3, 4
 _LENGTH = struct.Struct("<I")
-_PATIENCE_S = 1.5
+_TIMEOUT_S = 1.5
 
 player: Any = sys.modules[__name__]
 
@@ -57,7 +57,7 @@ def play(folder: str) -> None:
         os.write(REPLIES, player.encoded(action))
 
 
-def harmed(source: str, patience_s: float = _PATIENCE_S) -> str | None:
+def harmed(source: str, timeout_s: float = _TIMEOUT_S) -> str | None:
     """What became of an episode of that policy; None when it is the honest one, step by step."""
     with tempfile.TemporaryDirectory(prefix="evp-undefended-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
@@ -72,7 +72,7 @@ def harmed(source: str, patience_s: float = _PATIENCE_S) -> str | None:
             os.close(commands)
             os.close(going)
         try:
-            status = process.wait(_patience(results, patience_s, process))
+            status = process.wait(_patience(results, timeout_s, process))
         except subprocess.TimeoutExpired:
             return "it never came to its end"
         finally:
@@ -112,12 +112,12 @@ def _arrange(commands: int, replies: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _patience(results: Path, patience_s: float, process: subprocess.Popen[bytes]) -> float:
+def _patience(results: Path, timeout_s: float, process: subprocess.Popen[bytes]) -> float:
     """Counted from the first result: how long the start takes is the machine's affair."""
     end = time.monotonic() + 60.0
     while process.poll() is None and results.stat().st_size == 0 and time.monotonic() < end:
         time.sleep(0.01)
-    return patience_s
+    return timeout_s
 
 
 def believe(path: str) -> str:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from evopolicy_gateway.http.submit_request import Bounds, parse
 from evopolicy_gateway.workspace.agents_md import NO_URLS, agents_md
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -26,7 +26,7 @@ async def output(program: list[str], cwd: Path) -> str:
     process = await asyncio.create_subprocess_exec(
         *program, cwd=cwd, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(TIMEOUT_S):
         out, err = await process.communicate()
     assert process.returncode == 0, err.decode()
     return out.decode()

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from coordinator_harness import PATIENCE_S, Coordinator, bundle_of, gateway_of, operator_of, working
+from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, operator_of, working
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.wire import credentials
@@ -40,7 +40,7 @@ def command(*args: object, **env: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, "-m", "evopolicy_coordinator.cli", *map(str, args)],
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
         env={**os.environ, **env},
     )
 
@@ -226,7 +226,7 @@ def test_full_disk_stops_what_is_new_with_a_clear_error_and_loses_nothing(coordi
                 wal = coordinator.state / "coordinator.sqlite-wal"
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (wal.stat().st_size, unlimited[1]))
                 worker.hold.set()
-                # "busy" until the results that are handed in meet the full disk.
+                # "busy" until the results that are reported meet the full disk.
                 while (
                     refused := await refusal(gateway.submit_digest(second.digest, (0,), "during"))
                 ).status == "busy":

@@ -83,7 +83,7 @@ def test_unknown_session_is_refused_for_every_request_of_a_worker(coordinator: C
             for verb, message in (
                 ("lease", worker.LeaseRequest(worker="w-known", session=session, n=1, wait_s=0)),
                 ("beat", worker.Heartbeat(worker="w-known", session=session, held=())),
-                ("done", worker.HandIn(worker="w-known", session=session, results=())),
+                ("done", worker.ReportResults(worker="w-known", session=session, results=())),
                 ("blob", worker.BlobGet(sender="w-known", token=session, digest="0" * 64, offset=0)),
                 (
                     "blob",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from commands import agent, command, record_in
 from coordinator_harness import Coordinator
-from waiting import PATIENCE_S, wait_until
+from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_common.records.summary import decode_summary
 
@@ -52,7 +52,7 @@ def worker(coordinator: Coordinator, root: Path) -> Iterator[subprocess.Popen[by
         yield process
     finally:
         process.terminate()
-        process.wait(timeout=PATIENCE_S)
+        process.wait(timeout=TIMEOUT_S)
 
 
 def test_workers_join_and_leave_during_a_run_and_it_comes_to_the_same(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_workers_join_and_leave_during_a_run_and_it_comes_to_the_same(tmp_path: 
             with worker(coordinator, tmp_path):
                 wait_until(lambda: [*(tmp_path / "runs").glob(f"{feedback}submit_001*/episodes/ep_*")])
                 first.terminate()
-                assert first.wait(PATIENCE_S) == 0
+                assert first.wait(TIMEOUT_S) == 0
                 with worker(coordinator, tmp_path):
                     assert running.wait() == 0, running.text
                 with command(tmp_path, *arguments("calm")) as calm:

@@ -144,7 +144,7 @@ def test_a_second_submit_while_one_runs_is_a_conflict_that_names_the_first(tmp_p
         assert second.json()["submit_id"] == 0
         assert "submit_000" in second.json()["error"]["message"]
         s.double.go.set()
-        await s.desk.idle()
+        await s.pipeline.idle()
         assert (await s.http.post(s.urls.submit, json={"env_instances": [1]})).json()["submit_id"] == 1
 
     assert len(play(tmp_path, script).submits) == 2
@@ -177,12 +177,12 @@ def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
         s.double.go.clear()
         request = asyncio.create_task(s.http.post(s.urls.submit, json={"env_instances": [0, 1]}))
-        while s.desk.in_flight is None:
+        while s.pipeline.in_flight is None:
             await asyncio.sleep(0.01)
         request.cancel()
         await asyncio.gather(request, return_exceptions=True)
         s.double.go.set()
-        await s.desk.idle()
+        await s.pipeline.idle()
         assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
         assert (await s.http.get(f"{s.urls.submit}/submit_000")).json()["status"] == "ok"
 
@@ -211,7 +211,7 @@ def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) 
             state = (await s.http.get(s.urls.info)).json()["state"]
             assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
             assert files_below(s.folder.feedback) == []
-            assert s.desk.n_rejected == number
+            assert s.pipeline.n_rejected == number
 
     double = play(tmp_path, script)
     assert double.submits == []
@@ -353,7 +353,7 @@ def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path
     async def script(s: Served) -> None:
         for _ in range(2):
             assert (await s.http.post(s.urls.submit, json={"env_instances": "0-5"})).status_code == 200
-        assert s.desk.spent
+        assert s.pipeline.spent
         answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
         assert answer.status_code == 409
         assert answer.json()["status"] == "run_closed"

@@ -18,7 +18,7 @@ from gateway_double import Double, answering, gateway_on, opened, prepare, serve
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, Submit
 from evopolicy_gateway.http import server
-from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.submits.feedback import SubmitTree
 
 BODY = {"env_instances": [1, 2, 3]}
@@ -112,7 +112,7 @@ def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(tmp_pat
             assert double.submits == []
             double.up = True
             async with gateway_on(folder, double) as s:
-                await s.desk.idle()
+                await s.pipeline.idle()
                 assert (folder.feedback / "submit_000" / "summary.json").is_file()
 
     asyncio.run(main())
@@ -205,7 +205,7 @@ def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path)
                 assert answer.json()["status"] == "cancelled"
                 assert "cancelled" in answer.json()["error"]["message"]
                 assert double.run_id not in answer.text
-            assert s.desk.spent
+            assert s.pipeline.spent
             assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
 
     asyncio.run(main())

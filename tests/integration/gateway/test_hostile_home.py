@@ -20,7 +20,7 @@ COORDINATOR = f"{sys.executable} -m evopolicy_coordinator.cli"
 PLAYED = f"--env toy/line --agent evolve --exp-id t {' '.join(SMALL)}"
 SUITE = 'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
 POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
-PATIENCE_S = 120
+TIMEOUT_S = 120
 COMMANDS = {
     "try": f"{EVOPOLICY} try policy --env toy/line",
     "run": f"{EVOPOLICY} run --local {PLAYED}",
@@ -79,7 +79,7 @@ def refused(where: str, command: str, folder: Path, *namespaces: str, code: int 
         cwd=folder,
         env={**os.environ, "XDG_STATE_HOME": str(folder / "xdg")},
         capture_output=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
     )
     said = done.stderr.decode("utf-8", "replace")
     assert done.returncode == code, (done.returncode, said, done.stdout)

@@ -15,9 +15,9 @@ from evopolicy_common.messages.operator import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
 from evopolicy_common.wire.refusals import Refusal
-from evopolicy_gateway.http import door
-from evopolicy_gateway.http.door import AgentPlace, Door
-from evopolicy_gateway.run import session
+from evopolicy_gateway.http import listener
+from evopolicy_gateway.http.listener import AgentPlace, Listener
+from evopolicy_gateway.run import coordinator_client
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
 
@@ -33,8 +33,8 @@ def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Ga
     said: list[object] = []
     gateway = Gateway(
         folder,
-        on_ready=lambda urls, desk: said.append(urls),
-        on_change=lambda desk: None,
+        on_ready=lambda urls, pipeline: said.append(urls),
+        on_change=lambda pipeline: None,
         on_wait=said.append,
         alone=alone,
         **more,  # type: ignore[arg-type]
@@ -49,7 +49,7 @@ async def until(what: Callable[[], object]) -> None:
 
 
 def remote(folder: RunFolder, agent_host: str) -> None:
-    save(folder.door, Door(host="127.0.0.1", port=0))
+    save(folder.listener, Listener(host="127.0.0.1", port=0))
     settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", agent_host=agent_host)
     save(folder.intended, IntendedRun(key="k", settings=settings))
 
@@ -101,7 +101,7 @@ def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
 def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "RENEWAL_S", 1.0)
+    monkeypatch.setattr(coordinator_client, "RENEWAL_S", 1.0)
 
     async def main() -> None:
         double = Double(opened())
@@ -165,8 +165,8 @@ def test_permit_of_a_remote_agent_is_for_the_kernel_that_its_operator_names(
     folder = RunFolder(tmp_path)
     folder.state.mkdir()
     remote(folder, agent_host)
-    assert door.agent_place(folder) == AgentPlace(boot_id=asks_for)
-    assert door.ends_unseen(folder) == (agent_host != ELSEWHERE)
+    assert listener.agent_place(folder) == AgentPlace(boot_id=asks_for)
+    assert listener.ends_unseen(folder) == (agent_host != ELSEWHERE)
 
 
 def test_run_of_a_remote_agent_is_closed_when_its_operator_says_that_it_has_ended(tmp_path: Path) -> None:
@@ -180,8 +180,8 @@ def test_run_of_a_remote_agent_is_closed_when_its_operator_says_that_it_has_ende
                 await until(lambda: len(service.waits) > 1)
                 assert "evopolicy finish" in service.waits[1]
                 assert double.closed is None
-                assert service.desk.closed
-                door.finish(folder)
+                assert service.pipeline.closed
+                listener.finish(folder)
                 assert await service.task
         assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
             "budget_spent"
@@ -229,7 +229,7 @@ def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) ->
                 await until(lambda: len(service.waits) > 1)
                 assert "evopolicy finish" in service.waits[1]
                 assert double.closed is None
-                door.finish(folder)
+                listener.finish(folder)
                 assert await service.task
         permit = asked(double, RequestPermit)[0]
         assert isinstance(permit, RequestPermit)
@@ -244,15 +244,15 @@ def test_submit_that_hidden_episodes_hold_up_tells_so_and_counts_against_no_limi
         double.held_s = 5.0
         double.go.clear()
         async with served(tmp_path, double) as service:
-            assert service.desk.held_s == 5.0
+            assert service.pipeline.held_s == 5.0
             await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
             double.held_s = 7.5
-            await until(lambda: service.desk.held_s == 7.5)
+            await until(lambda: service.pipeline.held_s == 7.5)
             running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
             assert running["waits_for"] == "a free slot"
             assert running["held_s"] >= 2.5
             double.go.set()
-            await service.desk.idle()
-            assert service.desk.tickets[0].held_s == 2.5
+            await service.pipeline.idle()
+            assert service.pipeline.tickets[0].held_s == 2.5
 
     asyncio.run(main())

@@ -73,7 +73,7 @@ def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None
 KILLED = """
 import asyncio, os, signal, sys
 from pathlib import Path
-from evopolicy_gateway.submits import desk as submits
+from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run.layout import RunFolder
 
@@ -156,7 +156,7 @@ def test_a_submit_that_ends_two_gateways_is_put_aside(
             with pytest.raises(KeyError):
                 await ended_by_a_submit(folder, double)
             async with gateway_on(folder, double) as s:
-                await s.desk.idle()
+                await s.pipeline.idle()
                 answer = await s.http.get(f"{s.urls.submit}/submit_000")
                 assert (answer.status_code, answer.json()["status"]) == (500, "gateway_failed")
                 assert "charged" in answer.json()["error"]["message"]

@@ -25,28 +25,30 @@ from waiting import wait_until
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_gateway.cli.main import app as evopolicy
-from evopolicy_gateway.http.door import Door, door_of, finish
+from evopolicy_gateway.http.listener import Listener, finish, listener_of
 from evopolicy_gateway.run.layout import RunFolder, save
 
 HOST = "127.0.0.2"
 """Of this machine, and not what a gateway listens on by itself."""
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 
 @asynccontextmanager
-async def open_door(tmp_path: Path, door: Door | None = None) -> AsyncIterator[Served]:
+async def open_listener(tmp_path: Path, listener: Listener | None = None) -> AsyncIterator[Served]:
     """A gateway that serves a remote agent."""
     double = Double(opened())
     async with answering(tmp_path, double) as found:
         folder = prepare(tmp_path / "run", found, double)
-        save(folder.door, door or Door(host=HOST, port=0))
+        save(folder.listener, listener or Listener(host=HOST, port=0))
         async with gateway_on(folder, double) as service:
             yield service
 
 
-def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], door: Door | None = None) -> None:
+def play(
+    tmp_path: Path, script: Callable[[Served], Awaitable[None]], listener: Listener | None = None
+) -> None:
     async def main() -> None:
-        async with open_door(tmp_path, door) as service:
+        async with open_listener(tmp_path, listener) as service:
             await script(service)
 
     asyncio.run(main())
@@ -86,7 +88,7 @@ def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> 
         assert answers[0].headers["WWW-Authenticate"] == "Bearer"
         assert not any(secret in answers[0].text for secret in (token, s.double.capability, str(tmp_path)))
         assert s.double.submits == []
-        assert s.desk.n_rejected == 0
+        assert s.pipeline.n_rejected == 0
 
     play(tmp_path, script)
 
@@ -125,7 +127,7 @@ def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> No
 
 def test_the_token_is_a_file_for_the_operator_alone_and_stays_the_same(tmp_path: Path) -> None:
     async def main() -> None:
-        async with open_door(tmp_path) as s:
+        async with open_listener(tmp_path) as s:
             assert stat.S_IMODE(s.folder.bearer.stat().st_mode) == 0o600
             first = (s.urls, token_of(s.folder))
             assert len(bytes.fromhex(first[1])) * 8 == 256
@@ -167,7 +169,7 @@ def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path:
         assert s.urls.submit.startswith("https://gym.example/run-7/")
         assert s.urls.submit in (s.folder.workspace / "AGENTS.md").read_text()
 
-    play(tmp_path, script, Door(host=HOST, port=0, url="https://gym.example/run-7"))
+    play(tmp_path, script, Listener(host=HOST, port=0, url="https://gym.example/run-7"))
 
 
 @pytest.mark.parametrize(
@@ -185,12 +187,12 @@ def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path:
 )
 def test_a_door_that_cannot_be_is_refused_by_name(http: str, url: str | None, told: str) -> None:
     with pytest.raises(ConfigError, match=told):
-        door_of(http, url)
+        listener_of(http, url)
 
 
 def test_a_door_is_what_the_operator_named() -> None:
-    assert door_of("[fd00::5]:8080", None) == Door(host="fd00::5", port=8080)
-    assert door_of("0.0.0.0:80", "https://gym.example/") == Door(
+    assert listener_of("[fd00::5]:8080", None) == Listener(host="fd00::5", port=8080)
+    assert listener_of("0.0.0.0:80", "https://gym.example/") == Listener(
         host="0.0.0.0", port=80, url="https://gym.example"
     )
 
@@ -235,7 +237,7 @@ class RemoteRun:
             )
 
     def wait_until_served(self) -> None:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while "when it is done before its budget" not in self.said.read_text():
             assert self.process.poll() is None, self.said.read_text()
             assert time.monotonic() < deadline, self.said.read_text()
@@ -250,7 +252,7 @@ class RemoteRun:
             headers={"Authorization": f"Bearer {token}"},
         )
         try:
-            with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
+            with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
                 return answer.status, json.load(answer)["status"]
         except urllib.error.HTTPError as error:
             with error:
@@ -258,11 +260,11 @@ class RemoteRun:
 
     def end(self) -> int:
         try:
-            return self.process.wait(timeout=PATIENCE_S)
+            return self.process.wait(timeout=TIMEOUT_S)
         finally:
             if self.process.poll() is None:
                 self.process.terminate()
-                self.process.wait(timeout=PATIENCE_S)
+                self.process.wait(timeout=TIMEOUT_S)
 
 
 def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
@@ -334,7 +336,7 @@ def test_finish_is_refused_where_no_remote_agent_plays(tmp_path: Path) -> None:
         [sys.executable, "-m", "evopolicy_gateway.cli", "finish", str(tmp_path)],
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
         check=False,
     )
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""A run goes on when its gateway, its agent's keeper or its command dies."""
+"""A run goes on when its gateway, its agent supervisor or its command dies."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import urllib.request
 from pathlib import Path
 
 from commands import agent, command, record_in, run_arguments, run_dir, run_on
-from waiting import PATIENCE_S, wait_until
+from waiting import TIMEOUT_S, wait_until
 
-from evopolicy_gateway.http import door
+from evopolicy_gateway.http import listener
 from evopolicy_gateway.run.layout import RunFolder
 
 
@@ -61,11 +61,11 @@ time.sleep(1000)
     with command(tmp_path, *arguments, "--jail", "none") as running:
         found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
         wait_until(found.read_text)
-        os.kill(running.running("evopolicy_gateway.agent_supervisor.keeper"), signal.SIGKILL)
+        os.kill(running.running("evopolicy_gateway.agent_supervisor.supervisor"), signal.SIGKILL)
         exit_code, out, err = running.finish()
         assert exit_code == 0, err
         assert running.alive() == []
-    assert "keeper died; starting it again" in " ".join(out.split())
+    assert "supervisor died; starting it again" in " ".join(out.split())
     assert (found.parent / "gone").read_text() == "True"
     outcome = record_in(run_dir(tmp_path)).outcome
     assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
@@ -164,8 +164,8 @@ def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: P
         # Nobody watches this agent: its run is closed by its operator's word.
         time.sleep(2.0)
         assert by_hand.poll() is None
-        door.finish(RunFolder(folder))
-        assert by_hand.wait(timeout=PATIENCE_S) == 0
+        listener.finish(RunFolder(folder))
+        assert by_hand.wait(timeout=TIMEOUT_S) == 0
     finally:
         by_hand.kill()
         by_hand.communicate()

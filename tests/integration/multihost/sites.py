@@ -32,7 +32,7 @@ from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 
-PATIENCE_S = 240.0
+TIMEOUT_S = 240.0
 SUBMITS = 3
 EPISODES = 6
 HIDDEN = 4
@@ -191,7 +191,7 @@ class Sites:
         """
 
         async def ask() -> operator.StatusReply:
-            deadline = time.monotonic() + PATIENCE_S
+            deadline = time.monotonic() + TIMEOUT_S
             async with connect(credentials.read(Path(self.own["operator"]))) as link:
                 requester = Requester(
                     link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
@@ -204,14 +204,14 @@ class Sites:
                             return told
                     assert process is None or process.poll() is None, "it ended before"
                     await asyncio.sleep(0.02)
-            raise AssertionError(f"not within {PATIENCE_S:g} s")
+            raise AssertionError(f"not within {TIMEOUT_S:g} s")
 
         return asyncio.run(ask())
 
 
 def until(condition: Callable[[], bool], process: subprocess.Popen[bytes], log: Path) -> None:
     """Waits for it; AssertionError with the log when the process ends before, or it takes too long."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not condition():
         if process.poll() is not None or time.monotonic() > deadline:
             raise AssertionError(log.read_text(errors="replace"))

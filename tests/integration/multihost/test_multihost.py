@@ -17,7 +17,7 @@ from pathlib import Path
 
 import hosts
 import pytest
-from sites import EPISODES, PATIENCE_S, REAL, SUBMITS, TOTAL, TOY, Sites, sites
+from sites import EPISODES, REAL, SUBMITS, TIMEOUT_S, TOTAL, TOY, Sites, sites
 
 from evopolicy_common.messages.operator import StatusReply
 from evopolicy_common.records.run_difference import differences
@@ -43,7 +43,7 @@ def cluster() -> Iterator[Sites]:
             command = made.begin("coordinator", "alone", env, Path(made.own["operator"]))
             ended_well(made, command, "coordinator", "alone")
         alone.terminate()
-        alone.wait(PATIENCE_S)
+        alone.wait(TIMEOUT_S)
         for name in ("one", "two"):
             worker = made.start_worker(name, root / name / "keys")
             made.status_until(partial(is_active, name), worker)
@@ -57,7 +57,7 @@ def is_active(name: str, told: StatusReply) -> bool:
 def ended_well(cluster: Sites, command: subprocess.Popen[bytes], host: str, name: str) -> None:
     """Waits for the end of a run's command, which has to be a good one."""
     try:
-        code = command.wait(PATIENCE_S)
+        code = command.wait(TIMEOUT_S)
     except subprocess.TimeoutExpired:
         pytest.fail(f"did not end by itself: {cluster.log(host, name)}")
     assert code == 0, cluster.log(host, name)

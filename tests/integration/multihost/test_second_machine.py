@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "second-machine.md"
 FIRST = "10.92.1.1"
-PATIENCE_S = 300.0
+TIMEOUT_S = 300.0
 
 
 class Machine:
@@ -48,7 +48,7 @@ class Machine:
             [*self.host.enter, *self._words(line)],
             capture_output=True,
             text=True,
-            timeout=PATIENCE_S,
+            timeout=TIMEOUT_S,
             check=False,
         )
         assert done.returncode == 0, done.stdout + done.stderr
@@ -76,7 +76,7 @@ def lines() -> list[str]:
 
 def wait(first: Machine, worker: str, running: subprocess.Popen[bytes], log: Path) -> None:
     """Until the coordinator knows the worker."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while True:
         told = json.loads(first.says("evopolicy status --json"))
         if any(one["worker"].startswith(worker) and one["state"] == "active" for one in told["workers"]):
@@ -117,7 +117,7 @@ def test_a_worker_that_is_there_before_its_coordinator_waits_and_joins(
     shutil.copytree(first.home / "worker-second", second.home / "worker-second")
     log = second.home / "worker.log"
     worker = second.leave_running(join.replace("core16", "toy"), log.name)
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not log.read_bytes():
         assert worker.poll() is None
         assert time.monotonic() < deadline
@@ -125,7 +125,7 @@ def test_a_worker_that_is_there_before_its_coordinator_waits_and_joins(
     time.sleep(3)  # a few of its tries
     assert worker.poll() is None, log.read_text()
     first.leave_running(listen, "coordinator.log")
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while "ready: " not in (said := (first.home / "coordinator.log").read_text()):
         assert time.monotonic() < deadline, said
         time.sleep(0.1)

@@ -23,7 +23,7 @@ from evopolicy_coordinator.analysis.behaviour.trace import trace
 from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.cli.report import app
 
-PATIENCE_S = 600.0
+TIMEOUT_S = 600.0
 ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")
 """The second one's episode is another when it is drawn without care."""
 SUITE = """
@@ -115,7 +115,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         start_new_session=True,
     )
     try:
-        said, _ = running.communicate(timeout=PATIENCE_S)
+        said, _ = running.communicate(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         os.killpg(running.pid, signal.SIGTERM)
         raise

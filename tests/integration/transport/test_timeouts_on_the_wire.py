@@ -22,8 +22,8 @@ from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import IncomingQuery, Link
 from evopolicy_coordinator.verify import run as verify_run
 from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.run import session
-from evopolicy_gateway.run.session import Session
+from evopolicy_gateway.run import coordinator_client
+from evopolicy_gateway.run.coordinator_client import CoordinatorClient
 
 SOON_S = 0.2
 QUESTION = WaitRun(token="", run="r", wait_s=0.0)
@@ -75,7 +75,7 @@ def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
 
     async def scenario(link: Link) -> None:
         with pytest.raises(TransportError):
-            await asking(link).until_answered("wait", QUESTION, Done, patience_s=0.5)
+            await asking(link).until_answered("wait", QUESTION, Done, timeout_s=0.5)
 
     with capture_logs() as logs:
         monkeypatch.setattr(requests, "log", structlog.get_logger())
@@ -87,7 +87,7 @@ def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
 
 def test_an_operators_command_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
-    monkeypatch.setattr(operator_client, "PATIENCE_S", SOON_S)
+    monkeypatch.setattr(operator_client, "TIMEOUT_S", SOON_S)
 
     async def scenario(link: Link) -> None:
         with pytest.raises(TransportError):
@@ -98,7 +98,7 @@ def test_an_operators_command_gives_up(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_verification_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
-    monkeypatch.setattr(verify_run, "PATIENCE_S", SOON_S)
+    monkeypatch.setattr(verify_run, "TIMEOUT_S", SOON_S)
 
     async def scenario(link: Link) -> None:
         verification: Any = object.__new__(verify_run.Verifier)
@@ -113,10 +113,10 @@ def test_a_verification_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_info_is_answered_without_a_state_that_does_not_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "STATE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(coordinator_client, "STATE_TIMEOUT_S", SOON_S)
 
     async def scenario(link: Link) -> None:
-        assert await Session(link, "r").state() is None
+        assert await CoordinatorClient(link, "r").state() is None
 
     run(tmp_path, "gateway", scenario)
 

@@ -21,7 +21,7 @@ from evopolicy_common.wire import keys, transport
 from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.transport import IncomingQuery, Link
 from evopolicy_coordinator.pki.machines import Machines
-from evopolicy_coordinator.server.remote_door import remote_door
+from evopolicy_coordinator.server.remote_listener import remote_listener
 
 KEYS: dict[Role, str] = {
     "worker": keys.worker_key(CLUSTER, "lease"),
@@ -40,7 +40,7 @@ async def coordinator(certs: OwnCerts) -> AsyncIterator[list[str]]:
             asked.append(query.key)
             query.reply(b"coordinator")
 
-    door = remote_door(CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None)
+    door = remote_listener(CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None)
     async with door:
         yield asked
 
@@ -52,9 +52,9 @@ async def answered(link: Link, key: str) -> bool:
         return False
 
 
-async def gets_in(credentials: Credentials, patience_s: float = 0.5) -> bool:
+async def gets_in(credentials: Credentials, timeout_s: float = 0.5) -> bool:
     try:
-        async with transport.connect(credentials, timeout_s=patience_s):
+        async with transport.connect(credentials, timeout_s=timeout_s):
             return True
     except TransportError:
         return False
@@ -303,7 +303,7 @@ def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
                     async with transport.connect(brief, timeout_s=life_s) as ending:
                         while now() < made + dt.timedelta(days=DAYS):
                             if await answered(ending, KEYS["worker"]):
-                                await eventually(partial(stops_being_answered, ending), patience_s=200.0)
+                                await eventually(partial(stops_being_answered, ending), timeout_s=200.0)
                                 assert now() >= made + dt.timedelta(days=DAYS)
                                 assert await answered(link, KEYS["worker"])
                                 return
@@ -315,7 +315,7 @@ def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
 
 def test_listening_for_other_machines_needs_certificates(tmp_path: Path) -> None:
     async def scenario() -> None:
-        door = remote_door(
+        door = remote_listener(
             CLUSTER, ("tls/127.0.0.1:1",), Machines(tmp_path), lambda queries: None, lambda key, alive: None
         )
         with pytest.raises(ConfigError, match="certs init"):

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from coordinator_harness import (
-    PATIENCE_S,
+    TIMEOUT_S,
     Coordinator,
     GatewayClient,
     InstantWorker,
@@ -46,14 +46,14 @@ def coordinator(certs: OwnCerts) -> Iterator[Coordinator]:
 
 @contextlib.asynccontextmanager
 async def operators(folder: Path) -> AsyncIterator[OperatorClient]:
-    async with connect(of(folder, "operator"), timeout_s=PATIENCE_S) as link:
+    async with connect(of(folder, "operator"), timeout_s=TIMEOUT_S) as link:
         yield OperatorClient(link)
 
 
 @contextlib.asynccontextmanager
 async def joined(folder: Path, name: str, slots: int = 4) -> AsyncIterator[InstantWorker]:
     """A worker on the machine of that folder, which has registered."""
-    async with connect(of(folder), timeout_s=PATIENCE_S) as link:
+    async with connect(of(folder), timeout_s=TIMEOUT_S) as link:
         worker = InstantWorker(link, name, slots)
         await worker.register()
         yield worker
@@ -72,7 +72,7 @@ async def at_work(worker: InstantWorker) -> AsyncIterator[None]:
 
 async def play_run(operator: OperatorClient, gateway_folder: Path) -> RunFinished:
     created = await operator.create()
-    async with connect(of(gateway_folder, "gateway"), timeout_s=PATIENCE_S) as link:
+    async with connect(of(gateway_folder, "gateway"), timeout_s=TIMEOUT_S) as link:
         gateway = GatewayClient(link, created.run, created.capability)
         submit = await gateway.submit(bundle_of("policy"), IDS, "first")
         episodes, _ = await gateway.results(submit.submit_index)
@@ -168,7 +168,7 @@ def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_
                 second = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
                 try:
                     created = await operator.create("again")
-                    async with connect(of(boss, "gateway"), timeout_s=PATIENCE_S) as link:
+                    async with connect(of(boss, "gateway"), timeout_s=TIMEOUT_S) as link:
                         gateway = GatewayClient(link, created.run, created.capability)
                         await gateway.submit(bundle_of("policy"), IDS, "first")
                         certs.issue("worker", "later")
@@ -189,7 +189,7 @@ def refused(*args: object) -> str:
         [sys.executable, "-m", "evopolicy_coordinator.cli", *map(str, args)],
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
         env=os.environ,
     )
     assert ended.returncode == 2, ended.stderr

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from coordinator_harness import FINGERPRINT, LINE, Coordinator, bundle_of, gateway_of, operator_of
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 from evopolicy_common.messages.episode import Job
 from evopolicy_common.records.blobs import BlobStore
@@ -96,7 +96,7 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
     coordinators = [Coordinator(tmp_path / "state")]
 
     async def wait_for(look: Callable[[], bool]) -> None:
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while not look():
                 await asyncio.sleep(0.02)
 
@@ -132,7 +132,7 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
                 await gateway.close()
             finished = await operator.finished(created.run)
             worker.drain()
-            await asyncio.wait_for(working, PATIENCE_S)
+            await asyncio.wait_for(working, TIMEOUT_S)
         assert finished.infrastructure_retries == 0
         played = stored.played()
         assert len(played) == 60

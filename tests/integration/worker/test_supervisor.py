@@ -374,7 +374,7 @@ def test_a_result_that_is_refused_for_good_blocks_no_other(
 def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "CANCEL_PATIENCE_S", 0.2)
+    monkeypatch.setattr(supervisor, "CANCEL_TIMEOUT_S", 0.2)
     reached = asyncio.Event()
 
     async def deaf(slot: ScriptedSlot, job: Job) -> None:
@@ -387,7 +387,7 @@ def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
 def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "WITHDRAW_PATIENCE_S", 0.2)
+    monkeypatch.setattr(supervisor, "WITHDRAW_TIMEOUT_S", 0.2)
     played, come_back = asyncio.Event(), asyncio.Event()
 
     async def until_it_is_away(slot: ScriptedSlot, job: Job) -> None:

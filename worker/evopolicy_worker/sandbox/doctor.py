@@ -30,7 +30,7 @@ _NAMESPACES = {
     "uts": 0x04000000,
 }
 _CLONE_NEWUSER = 0x10000000
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 _UNMASK = (
     "a slot mounts a /proc of its own, which the kernel refuses while parts of this one are covered; in a container:"
     " --security-opt systempaths=unconfined"
@@ -95,7 +95,7 @@ def _bubblewrap() -> Check:
         return Check(name="bubblewrap", verdict="missing", found="not on the PATH", advice=jail.INSTALL_BWRAP)
     try:
         said = subprocess.run(
-            [path, "--version"], capture_output=True, text=True, timeout=_PATIENCE_S, check=False
+            [path, "--version"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
         ).stdout.strip()
     except (OSError, subprocess.TimeoutExpired) as error:
         return Check(name="bubblewrap", verdict="missing", found=str(error), advice=jail.INSTALL_BWRAP)

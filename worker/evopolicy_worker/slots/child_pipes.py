@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 
-from evopolicy_common.processes.leash import end_with_parent
+from evopolicy_common.processes.parent_death import end_with_parent
 
 
 def take_pipes() -> tuple[int, int]:

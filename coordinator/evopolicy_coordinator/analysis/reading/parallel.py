@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from evopolicy_common.processes.leash import leashed
+from evopolicy_common.processes.parent_death import ending_with_parent
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -99,7 +99,7 @@ class _Child:
     def _started(self) -> subprocess.Popen[bytes]:
         # A session of its own, so that Ctrl-C reaches the command alone.
         return subprocess.Popen(
-            leashed([sys.executable, "-P", "-m", __name__], signal.SIGKILL),
+            ending_with_parent([sys.executable, "-P", "-m", __name__], signal.SIGKILL),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,

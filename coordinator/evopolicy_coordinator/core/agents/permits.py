@@ -16,7 +16,7 @@ import msgspec
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.operator import ELSEWHERE
 from evopolicy_common.wire.refusals import Refusal
-from evopolicy_coordinator.core.isolation import bars, kernels, stays
+from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases
 from evopolicy_coordinator.core.model import Ask, Family, Kernel, Run
@@ -64,13 +64,13 @@ def _preempt(state: State, family: Family, kernel: Kernel, step: Step) -> None:
     if any(related(each.reversals, family) for each in there):
         return
     for each in there:
-        for stay in all_related(each.hidden, family):
-            if stay.lease is not None and stay.lease.live:
-                leases.put_off(state, stay.lease, "an agent is to start there", step)
+        for occupancy in all_related(each.hidden, family):
+            if occupancy.lease is not None and occupancy.lease.live:
+                leases.put_off(state, occupancy.lease, "an agent is to start there", step)
 
 
 def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -> Reason | None:
-    waits_for = bars.permit_bar(state, family, kernel)
+    waits_for = conflicts.permit_conflict(state, family, kernel)
     if waits_for is not None:
         return waits_for
     ask = _withdraw(state, run, kernel, family)
@@ -174,9 +174,9 @@ def booted(state: State, machine_id: str, boot_id: str, step: Step) -> None:
         for row in all_related(kernel.permits, None):
             if row.machine_id == machine_id:
                 _end(state, kernel, row, step, "its machine was started anew")
-        for stay in (*all_related(kernel.hidden, None), *all_related(kernel.train, None)):
-            if stay.machine_id == machine_id and stay.lease is None:
-                stays.forget(state, stay, step)
+        for occupancy in (*all_related(kernel.hidden, None), *all_related(kernel.train, None)):
+            if occupancy.machine_id == machine_id and occupancy.lease is None:
+                occupancies.forget(state, occupancy, step)
 
 
 def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:

@@ -10,7 +10,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.isolation import bars, kernels
+from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related
 from evopolicy_coordinator.core.leasing import leases
 from evopolicy_coordinator.core.model import (
@@ -78,7 +78,7 @@ def _hidden(
             turn_back(state, reversal, step, "its workers are gone")
         return
     known = [kernel for kernel in there if kernel.boot_id != EVERYWHERE]
-    if played or not known or not all(bars.hidden_bar(state, family, kernel) for kernel in known):
+    if played or not known or not all(conflicts.hidden_conflict(state, family, kernel) for kernel in known):
         return
     kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
     if kept_s >= state.settings.hidden_wait_s:
@@ -88,12 +88,12 @@ def _hidden(
 def _played(state: State, lane: Lane, family: Family) -> bool:
     """Whether hidden jobs of the lane's closed runs are leased, or are being handed back."""
     return any(
-        stay.lease is not None
-        and (stay.lease.live or stay.lease.parting)
-        and stay.lease.job.group.flow.closed
+        occupancy.lease is not None
+        and (occupancy.lease.live or occupancy.lease.parting)
+        and occupancy.lease.job.group.flow.closed
         for kernel in state.kernels.values()
-        for stay in kernel.hidden.get(family, {}).values()
-        if stay.lease is not None and stay.lease.job.group.flow.lane is lane
+        for occupancy in kernel.hidden.get(family, {}).values()
+        if occupancy.lease is not None and occupancy.lease.job.group.flow.lane is lane
     )
 
 
@@ -105,8 +105,8 @@ def _turn_over(state: State, lane: Lane, family: Family, known: list[Kernel], st
     reversal = lane.reversals[family] = Reversal(kernel, lane, family)
     family.users += 1
     kernel.reversals.setdefault(family, {})[str(lane.key)] = reversal
-    for stay in all_related(kernel.hidden, family):
-        lease = stay.lease
+    for occupancy in all_related(kernel.hidden, family):
+        lease = occupancy.lease
         if lease is not None and lease.live and lease.job.priority == EARLY_VALIDATION:
             leases.put_off(state, lease, "hidden jobs of closed runs go first there", step)
     step.dirty[lane] = None
@@ -132,7 +132,7 @@ def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> N
     barred = {
         family
         for family in lane.waiting[TRAIN]
-        if there and all(bars.train_bar(state, family, kernel) for kernel in there)
+        if there and all(conflicts.train_conflict(state, family, kernel) for kernel in there)
     }
     for group in [group for group in state.held if group.flow.lane is lane]:
         if group.flow.family not in barred:

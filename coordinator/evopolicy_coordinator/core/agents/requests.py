@@ -6,8 +6,8 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.operator import ELSEWHERE, HiddenIsolation
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.agents.known import over
-from evopolicy_coordinator.core.isolation import bars, kernels
+from evopolicy_coordinator.core.agents.open_runs import over
+from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.model import EVERYWHERE, Run
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import PermitRow, RunRow
@@ -53,7 +53,7 @@ def requested(state: State, event: events.Asked[gateway.RequestPermit], step: St
 def answer(state: State, poll: Poll, step: Step) -> None:
     """A gateway has waited for a permit in vain."""
     _, run, boot_id = poll.target.split(" ", 2)
-    waits_for = bars.permit_bar(state, state.runs[run].family, kernels.kernel(state, boot_id))
+    waits_for = conflicts.permit_conflict(state, state.runs[run].family, kernels.kernel(state, boot_id))
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 

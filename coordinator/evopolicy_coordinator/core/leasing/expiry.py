@@ -12,7 +12,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 from . import fleet, leases
-from .retry import Mishap
+from .retry import JobFailure
 
 FORGET_S = 3600.0
 """A lost worker is listed for so long."""
@@ -51,8 +51,8 @@ def look(state: State, worker: Worker, step: Step) -> None:
             live, orphan = lease.live, lease.orphan_until is not None
             leases.release(state, worker, lease, step, "no heartbeat names it")
             if live:
-                mishap: Mishap = "worker_lost" if orphan else "unlisted"
-                leases.give_back(state, lease.job, mishap, worker, step, ran=orphan and lease.id in running)
+                failure: JobFailure = "worker_lost" if orphan else "unlisted"
+                leases.give_back(state, lease.job, failure, worker, step, ran=orphan and lease.id in running)
         else:
             deadlines.append(min(due, overdue) if lease.live or lease.parting else due)
     if deadlines:

@@ -8,7 +8,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.model import JobGroup, JobState, Mark
+from evopolicy_coordinator.core.model import JobGroup, JobState, OutcomeDigest
 from evopolicy_coordinator.core.records import OutcomeHead
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
@@ -33,7 +33,7 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
             state.adopting[job] = None
         else:
             queue.put(state, job, step)
-    state.story.tell(step.now, step.stimulus_id, group.id, f"opened, {group.done} of {group.n} done")
+    state.trace.add(step.now, step.stimulus_id, group.id, f"opened, {group.done} of {group.n} done")
 
 
 def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
@@ -42,10 +42,12 @@ def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -
     A job of several episodes is stored whole or not at all.
     """
     for head in sorted(heads, key=lambda head: head.seq):
-        group.marks[head.index] = Mark(head.episode_return, head.length, head.failure, head.trajectory)
+        group.digests[head.index] = OutcomeDigest(
+            head.episode_return, head.length, head.failure, head.trajectory
+        )
     per_job = group.template.per_job
     for first in range(0, group.n, per_job):
-        if first in group.marks:
+        if first in group.digests:
             continue
         group.jobs[first] = JobState(
             job_id=f"{group.id}/{first}",
@@ -67,7 +69,7 @@ def close_group(state: State, group: JobGroup, step: Step, why: str) -> None:
     leases.let_go(state, group, step.now)
     state.groups.pop(group.id, None)
     state.timers.disarm(("submit", group.id))
-    state.story.tell(step.now, step.stimulus_id, group.id, f"closed: {why}")
+    state.trace.add(step.now, step.stimulus_id, group.id, f"closed: {why}")
 
 
 def close_job(state: State, job: JobState, step: Step, why: str) -> None:

@@ -18,14 +18,14 @@ import hmac
 from collections.abc import Iterable
 
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core.isolation import bars, stays
+from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.model import TRAIN, JobGroup, JobState, Lease, Worker
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import JobRetried, Step
 
 from . import fleet, queue
 from .jobs import build
-from .retry import Mishap, decide
+from .retry import JobFailure, decide
 
 MISSING_BEATS = 3
 """A lease that its worker has not named for so many heartbeats since it was granted never arrived."""
@@ -62,7 +62,7 @@ def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease
     job.held_attempts.add(lease.attempt)
     group = job.group
     description = group.flow.description or worker.profile.descriptions[group.template.env]
-    state.story.tell(step.now, step.stimulus_id, lease.id, f"granted to {worker.name}")
+    state.trace.add(step.now, step.stimulus_id, lease.id, f"granted to {worker.name}")
     return wire.Lease(
         lease_id=lease.id,
         attempt=lease.attempt,
@@ -85,7 +85,7 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
     group.n_leased += 1
     group.flow.n_leased += 1
     state.n_live += 1
-    stays.leased(state, lease, worker, serial, step)
+    occupancies.leased(state, lease, worker, serial, step)
     let_go(state, group, now)
     list_hidden(state, lease, worker, step)
     if group.first_leased_at is None:
@@ -145,7 +145,7 @@ def hear(
         named.add(item.lease_id)
         lease = worker.leases.get(item.lease_id) or _adopt(state, worker, item, step)
         if lease is None:
-            stays.unknown(state, worker, item, step)
+            occupancies.unknown(state, worker, item, step)
         elif lease.live or lease.parting:
             lease.doubtful = lease.doubtful or now - lease.renewed > state.settings.silence_s
             lease.renewed = now
@@ -162,14 +162,14 @@ def hear(
     missing_since = now - MISSING_BEATS * state.settings.heartbeat_s
     for lease in [each for each in worker.leases.values() if each.id not in named]:
         if not lease.live:
-            sure = stays.surely(worker, lease.stay, settled)
+            sure = occupancies.surely(worker, lease.occupancy, settled)
             if sure or not lease.parting:
                 _leave(state, worker, lease, step, sure=sure)
         elif not lease.named and lease.granted_at < missing_since and now >= state.hold_until:
-            sure = stays.surely(worker, lease.stay, settled)
+            sure = occupancies.surely(worker, lease.occupancy, settled)
             release(state, worker, lease, step, "it never arrived", sure=sure)
             give_back(state, lease.job, "unlisted", worker, step, ran=False)
-    stays.heard(state, worker, named, settled, step)
+    occupancies.heard(state, worker, named, settled, step)
     return tuple(stop)
 
 
@@ -181,8 +181,8 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
         or job.lease is not None
         or item.attempt in job.held_attempts
         or not granted(state, item.lease_id, item.job_id, item.attempt, worker)
-        or job.group.bars(worker)
-        or not bars.adoptable(state, job, worker)
+        or job.group.excludes(worker)
+        or not conflicts.adoptable(state, job, worker)
     ):
         return None
     fleet.unreserve(state, job)
@@ -190,7 +190,7 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
     state.timers.disarm(("job", job.job_id))
     state.adopting.pop(job, None)
     job.held_attempts.add(item.attempt)
-    state.story.tell(step.now, step.stimulus_id, item.lease_id, f"adopted from {worker.name}")
+    state.trace.add(step.now, step.stimulus_id, item.lease_id, f"adopted from {worker.name}")
     lease = _enter(state, job, worker, item.attempt, step, serial=0)
     lease.doubtful = True
     return lease
@@ -214,7 +214,7 @@ def end(state: State, lease: Lease, step: Step, why: str) -> None:
     worker.held[job.priority] -= 1
     if lease.hidden_in is not None:
         lease.hidden_in.pop(lease, None)
-    state.story.tell(step.now, step.stimulus_id, lease.id, why)
+    state.trace.add(step.now, step.stimulus_id, lease.id, why)
 
 
 def stop(state: State, lease: Lease, step: Step, why: str) -> None:
@@ -231,7 +231,7 @@ def release(state: State, worker: Worker, lease: Lease, step: Step, why: str, *,
 
 def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool) -> None:
     worker.leases.pop(lease.id, None)
-    stays.left(state, lease, worker, step, sure=sure)
+    occupancies.left(state, lease, worker, step, sure=sure)
     if lease.stopped_for is not None:
         lease.stopped_for.stopping -= 1
         lease.stopped_for = None
@@ -249,27 +249,34 @@ def parted(state: State, lease: Lease, worker: Worker, step: Step) -> None:
 
 
 def give_back(
-    state: State, job: JobState, mishap: Mishap, worker: Worker, step: Step, *, ran: bool, error: str = ""
+    state: State,
+    job: JobState,
+    failure: JobFailure,
+    worker: Worker,
+    step: Step,
+    *,
+    ran: bool,
+    error: str = "",
 ) -> None:
     """Put a job whose lease has ended back into the queue, as `retry` decides."""
-    retry = decide(state.settings, mishap, failures=job.failures + 1, ran=ran)
+    retry = decide(state.settings, failure, failures=job.failures + 1, ran=ran)
     job.since = step.now
     if retry.counted:
         job.failures += 1
-        job.last_failure = f"{mishap} on {worker.name}" + (f": {error[:200]}" if error else "")
+        job.last_failure = f"{failure} on {worker.name}" + (f": {error[:200]}" if error else "")
         step.tell(JobRetried(job))
         step.log(
             "warning",
             "job_retried",
             job=job.job_id,
             worker=worker.name,
-            mishap=mishap,
+            failure=failure,
             failures=job.failures,
             delay_s=retry.delay_s,
             alone=retry.alone,
             error=error[:2000],
         )
-    state.story.tell(step.now, step.stimulus_id, job.job_id, f"{mishap} on {worker.name}: {retry}")
+    state.trace.add(step.now, step.stimulus_id, job.job_id, f"{failure} on {worker.name}: {retry}")
     job.alone = job.alone or retry.alone
     if retry.avoid:
         job.avoid, job.avoid_until = worker.name, step.now + retry.delay_s + state.settings.avoid_s

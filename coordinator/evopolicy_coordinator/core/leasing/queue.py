@@ -7,7 +7,7 @@ Rules that this module owns:
 - Between flows of one priority the one that got the least play time goes first (start-time fair queueing: each priority
   has a virtual clock; a flow that was idle starts at the clock, so idleness earns nothing). A worker that has the
   environment or the bundle warm may bend this by a bounded amount.
-- Within a flow jobs go in order; what goes back after a mishap goes to the front.
+- Within a flow jobs go in order; what goes back after a failure goes to the front.
 - A job is not given to a worker it avoids, as long as its lane has another; never to one that its group bars.
 - No operation looks at all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
 """
@@ -17,7 +17,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection
 
-from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.model import (
     HIDDEN,
     HIDDEN_FIRST,
@@ -183,7 +183,7 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
                 break
             flow, priority = found
             lane = found[0].lane
-            if bars.bar(state, priority, flow.family, worker):
+            if conflicts.conflict(state, priority, flow.family, worker):
                 barred += 1
             else:
                 job = _first(flow, priority, worker, now, sole=lane.workers() <= 1)
@@ -226,9 +226,9 @@ def _open(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
     there = lane.waiting[priority]
     if not there:
         return False
-    if len(there) > BARRED_MAX or not bars.concerns(state, priority, worker):
+    if len(there) > BARRED_MAX or not conflicts.concerns(state, priority, worker):
         return True
-    return any(not bars.bar(state, priority, family, worker) for family in there)
+    return any(not conflicts.conflict(state, priority, family, worker) for family in there)
 
 
 def _serve(state: State, job: JobState) -> None:
@@ -245,7 +245,7 @@ def _best(
         return None
     best: tuple[Flow, int] | None = None
     best_score = 0.0
-    concerned = [priority for priority in rank if bars.concerns(state, priority, worker)]
+    concerned = [priority for priority in rank if conflicts.concerns(state, priority, worker)]
     for lane in worker.profile.busy:
         for priority in rank:
             if not lane.n_ready[priority] or not (heap := lane.heaps[priority]):
@@ -274,7 +274,7 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
         ticket, job = ready[0]
         if job.ticket != ticket:
             ready.popleft()
-        elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.bars(worker):
+        elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.excludes(worker):
             skipped.append(ready.popleft())
         else:
             found = job

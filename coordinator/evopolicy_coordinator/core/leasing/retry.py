@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 from evopolicy_coordinator.core.settings import CoreSettings
 
-Mishap = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
+JobFailure = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
 """returned: given back unplayed. unlisted: its worker lives but does not know of it, the lease never arrived. failed: the
 worker's own trouble. worker_lost: its worker went silent. overdue: it was played for longer than any episode may take."""
 
@@ -34,11 +34,11 @@ def backoff_s(settings: CoreSettings, failures: int) -> float:
     return min(settings.retry_max_s, settings.retry_base_s * 2.0 ** min(failures - 1, 30))
 
 
-def decide(settings: CoreSettings, mishap: Mishap, *, failures: int, ran: bool) -> Retry:
-    """The retry of a job after `mishap`; `failures` counts this one, `ran` tells whether it was being played."""
-    if mishap == "returned":
+def decide(settings: CoreSettings, failure: JobFailure, *, failures: int, ran: bool) -> Retry:
+    """The retry of a job after `failure`; `failures` counts this one, `ran` tells whether it was being played."""
+    if failure == "returned":
         return Retry(0.0, avoid=False, alone=False, counted=False)
-    if mishap == "unlisted" or (mishap == "worker_lost" and not ran):
+    if failure == "unlisted" or (failure == "worker_lost" and not ran):
         return Retry(0.0, avoid=False, alone=False, counted=True)
     delay_s = backoff_s(settings, failures)
-    return Retry(delay_s, avoid=True, alone=mishap == "worker_lost", counted=True)
+    return Retry(delay_s, avoid=True, alone=failure == "worker_lost", counted=True)

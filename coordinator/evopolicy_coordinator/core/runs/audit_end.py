@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from evopolicy_common.messages.audit import AuditFinding, AuditRecord
-from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.model import Run, Worker
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import AuditRow
@@ -81,7 +81,7 @@ def _playable(state: State, run: Run, row: AuditRow) -> bool:
     return (
         not able
         or not state.isolates
-        or any(bars.hidden_bar(state, run.family, worker.kernel) is None for worker in able)
+        or any(conflicts.hidden_conflict(state, run.family, worker.kernel) is None for worker in able)
     )
 
 

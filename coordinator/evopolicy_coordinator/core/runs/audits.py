@@ -1,4 +1,4 @@
-"""Audits: of a sampled share of the episodes that workers hand in, the recorded actions are played again elsewhere.
+"""Audits: of a sampled share of the episodes that workers report, the recorded actions are played again elsewhere.
 
 Rules that this module owns:
 - Which episodes are drawn follows from the run's secret, so no worker can tell which of its own they will be.
@@ -52,7 +52,7 @@ def audit_id(group: str, index: int) -> str:
 
 
 def sample(state: State, news: EpisodesDone, step: Step) -> None:
-    """Draw from the episodes that a worker has handed in."""
+    """Draw from the episodes that a worker has reported."""
     group, worker = news.group, news.worker
     run, kind = state.runs.get(group.run), group.kind
     if run is None or worker is None or kind == "evaluation" or kind == "audit":
@@ -103,7 +103,7 @@ def prepared(state: State, event: events.AuditPrepared, step: Step) -> None:
             state, run, row, step, verdict="disputed" if event.at_fault else "not_audited", reason=event.error
         )
         if event.at_fault:
-            dispute(state, f"{row.player} handed in {row.group}, episode {row.index}: {event.error}", step)
+            dispute(state, f"{row.player} reported {row.group}, episode {row.index}: {event.error}", step)
     else:
         _play(state, run, step.put_audit(run, msgspec.structs.replace(row, actions=event.actions)), step)
     step.tell(AuditsMoved(run))
@@ -134,7 +134,7 @@ def _compare(row: AuditRow, step: Step) -> CompareAudit:
 
 
 def compared(state: State, event: events.AuditCompared, step: Step) -> None:
-    """The last replay was compared with what its player had handed in, and with the replay before it."""
+    """The last replay was compared with what its player had reported, and with the replay before it."""
     run, row = _open(state, event.run, event.audit)
     if run is None or row is None or event.replay != len(row.replayed_by) or row.compared >= event.replay:
         return
@@ -180,7 +180,7 @@ def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, *
         if group is not None:
             groups.close_group(state, group, step, "its audit is over")
     row = step.put_audit(run, msgspec.structs.replace(row, actions=None, state=verdict, **fields))
-    state.story.tell(step.now, step.stimulus_id, row.audit, f"audit: {row.state} {row.reason}")
+    state.trace.add(step.now, step.stimulus_id, row.audit, f"audit: {row.state} {row.reason}")
 
 
 def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:
@@ -223,8 +223,8 @@ def dispute(state: State, text: str, step: Step) -> None:
 
 
 def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
-    """A worker was found to have handed in what two others refute: it gets no more leases."""
-    said = "handed in" if name == row.player else "played again"
+    """A worker was found to have reported what two others refute: it gets no more leases."""
+    said = "reported" if name == row.player else "played again"
     text = f"forged results: what it {said} as {row.group}, episode {row.index}, two other workers refute ({row.difference})"
     if name in state.quarantined:
         return

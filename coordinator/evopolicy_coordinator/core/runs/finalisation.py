@@ -31,7 +31,7 @@ from evopolicy_coordinator.core.records import (
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step, SubmitEnded
 
-from . import audit_end, evaluations, finished, journal, results, runs, templates
+from . import audit_end, evaluations, finished, journal, result_polls, runs, templates
 
 # ---- hidden groups ----
 
@@ -145,7 +145,7 @@ def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) ->
         step.change_submit(run, index, status="cancelled", completed_at=step.now, refunded=True)
         group = state.groups[train_group(run.id, index)]
         groups.close_group(state, group, step, "run cancelled")
-        results.answer_polls(state, group, step)
+        result_polls.answer_polls(state, group, step)
     if run.state.phase == "open":
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
         permits.cancelled(state, run.id, step)
@@ -174,5 +174,5 @@ def _finish(
     step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     runs.forget(state, run)
     for poll in state.polls.take_all(run.id):
-        step.add(results.finished_effect(poll.request, run.id, step))
+        step.add(result_polls.finished_effect(poll.request, run.id, step))
     step.log("info", "run_finished", run=run.id, status=result.status, best=result.best_submit_index)

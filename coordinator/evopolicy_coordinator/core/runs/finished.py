@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 from evopolicy_coordinator.core.structures.polls import Poll
 
-from . import audit_end, results, waits
+from . import audit_end, result_polls, waits
 
 
 def unspent(run: Run) -> int:
@@ -149,7 +149,7 @@ def waited(state: State, event: events.Asked[operator.WaitRun], step: Step) -> N
     run = state.runs.get(message.run)
     if run is None:
         if message.run in state.capabilities:
-            step.add(results.finished_effect(event.request, message.run, step))
+            step.add(result_polls.finished_effect(event.request, message.run, step))
         else:
             step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return

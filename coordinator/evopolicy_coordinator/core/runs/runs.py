@@ -15,7 +15,7 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
-from evopolicy_coordinator.core.agents.known import live
+from evopolicy_coordinator.core.agents.open_runs import live
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.model import Run
 from evopolicy_coordinator.core.reasons import Reason, because

@@ -17,7 +17,7 @@ from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
-from evopolicy_coordinator.core.agents.known import live, over
+from evopolicy_coordinator.core.agents.open_runs import live, over
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.model import JobGroup, Run
 from evopolicy_coordinator.core.reasons import because
@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import EpisodesDone, Step, SubmitEnded
 from evopolicy_coordinator.core.structures.ledger import refusal
 
-from . import results, templates
+from . import result_polls, templates
 
 
 def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> None:
@@ -133,8 +133,8 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
             return
     if group.done == group.n:
         end(state, run, group, "ok", None, step)
-    elif 0 in group.marks:
-        results.answer_polls(state, group, step)
+    elif 0 in group.digests:
+        result_polls.answer_polls(state, group, step)
 
 
 def limit_passed(state: State, name: str, step: Step) -> None:
@@ -190,6 +190,6 @@ def end(
     run.ledger.settle(group.submit_index)
     run.open = None
     groups.close_group(state, group, step, f"submit ended: {status}")
-    results.answer_polls(state, group, step)
+    result_polls.answer_polls(state, group, step)
     step.log("info", "submit_ended", run=run.id, submit=group.submit_index, status=status, episodes=group.n)
     step.tell(SubmitEnded(run, row))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.model import Flow, JobGroup
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.state import State
@@ -15,7 +15,7 @@ def waits_for(state: State, group: JobGroup) -> Reason | None:
     flow = group.flow
     if missing := waits_for_workers(state, flow):
         return missing
-    if obstacle := bars.obstacle(state, group):
+    if obstacle := conflicts.obstacle(state, group):
         return obstacle
     if any(job.place == "parting" for job in group.jobs.values()):
         return because("hand_back")

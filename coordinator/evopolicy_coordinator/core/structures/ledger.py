@@ -11,7 +11,7 @@ from __future__ import annotations
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core.reasons import Reason, because
 
-from .story import InvariantError
+from .trace import InvariantError
 
 
 class Ledger:

@@ -1,1 +1,1 @@
-"""What workers ask and hand in: membership, polls for leases and who gets them, hand-ins."""
+"""What workers ask and report: membership, polls for leases and who gets them, result reports."""

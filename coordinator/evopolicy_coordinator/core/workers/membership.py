@@ -5,7 +5,7 @@ Rules that this module owns:
 - A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
 - A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
 - A name is its machine's as long as the worker is there.
-- Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it hands in
+- Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it reports
   from then on is not taken. An operator may take it back.
 - Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
 """
@@ -17,13 +17,13 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import permits
-from evopolicy_coordinator.core.isolation import bars, kernels, stays
+from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.model import Profile, Worker
 from evopolicy_coordinator.core.reasons import because
 from evopolicy_coordinator.core.records import WorkerRow
 from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import HandedIn, Step
+from evopolicy_coordinator.core.step import ResultsPersisted, Step
 
 from . import scheduler
 
@@ -44,17 +44,17 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
             fleet.answer_beat(state, old, (), step)
     state.timers.disarm(("forget", message.worker))
     worker = fleet.register(state, event, kernels.kernel(state, message.boot_id), step)
-    stays.joined(state, worker, step)
+    occupancies.joined(state, worker, step)
     permits.booted(state, worker.machine_id, worker.kernel.boot_id, step)
-    stays.replaced(state, worker, step)
+    occupancies.replaced(state, worker, step)
     if old is not None and old.kernel is not worker.kernel:
-        stays.forgotten(state, old)
+        occupancies.forgotten(state, old)
     reply = wire.Registered(
         session=event.session,
         lease_ttl_s=state.settings.lease_ttl_s,
         heartbeat_s=state.settings.heartbeat_s,
         refused=pins.refused_runs(state, worker),
-        hidden_bar="" if message.boot_id or not state.isolates else bars.NO_BOOT_ID,
+        hidden_bar="" if message.boot_id or not state.isolates else conflicts.NO_BOOT_ID,
     )
     step.reply(event.request, reply)
     name = _class_of_worker(state, worker.profile)
@@ -72,7 +72,7 @@ def _refused_as_forger(state: State, name: str, machine: str, request: events.Re
 
 
 def worker_of(
-    state: State, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.HandIn], step: Step
+    state: State, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
 ) -> Worker | None:
     """Who speaks; None, and the request is refused, when its session is unknown or it is quarantined."""
     message = event.message
@@ -113,14 +113,14 @@ def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> 
         state.timers.arm(("beat", worker.name), step.now + min(message.wait_s, state.settings.max_wait_s))
 
 
-def handed_in(state: State, event: events.Asked[wire.HandIn], step: Step) -> None:
+def results_reported(state: State, event: events.Asked[wire.ReportResults], step: Step) -> None:
     """Take results, and answer once they are durable."""
     worker = worker_of(state, event, step)
     if worker is None:
         return
     for result in event.message.results:
-        step.tell(HandedIn(worker, result))
-    step.reply_last(event.request, wire.HandInReply(n=len(event.message.results)))
+        step.tell(ResultsPersisted(worker, result))
+    step.reply_last(event.request, wire.ResultsReported(n=len(event.message.results)))
 
 
 def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
@@ -192,4 +192,4 @@ def forget(state: State, name: str, _step: Step) -> None:
     worker = state.workers.get(name)
     if worker is not None and worker.state == "lost":
         fleet.forget(state, worker)
-        stays.forgotten(state, worker)
+        occupancies.forgotten(state, worker)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from itertools import islice
 
-from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import leases, queue
 from evopolicy_coordinator.core.model import (
     AUDIT,
@@ -54,7 +54,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                 if wanted <= 0:
                     return
                 worker = state.workers[lease.worker]
-                if lease.worker == avoided or bars.goes_first(lease):
+                if lease.worker == avoided or conflicts.goes_first(lease):
                     continue
                 if not queue.may_train(state, lane, worker):
                     continue
@@ -74,7 +74,7 @@ def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, 
     them: one that stays bars its whole kernel. Gives the slots that come free."""
     slots = 0
     wanted = lane.waiting[TRAIN].get(family, 0)
-    for kernel, playing in bars.to_clear(state, family):
+    for kernel, playing in conflicts.to_clear(state, family):
         if slots >= wanted:
             break
         there = [state.workers[name] for name in kernel.workers if name != avoided]

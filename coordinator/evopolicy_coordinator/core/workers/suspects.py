@@ -9,7 +9,7 @@ from __future__ import annotations
 from itertools import islice
 
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core.isolation import bars
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.model import EARLY_VALIDATION, TRAIN, JobState, Worker
 from evopolicy_coordinator.core.state import State
@@ -42,7 +42,7 @@ def next_of(state: State, worker: Worker, step: Step) -> wire.Lease | None:
             continue
         if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
             continue
-        if job.group.bars(worker) or _barred(state, job, worker):
+        if job.group.excludes(worker) or _barred(state, job, worker):
             continue
         if idle:
             return _alone(state, job, worker, step)
@@ -52,17 +52,17 @@ def next_of(state: State, worker: Worker, step: Step) -> wire.Lease | None:
 
 
 def _barred(state: State, job: JobState, worker: Worker) -> bool:
-    return bars.bar(state, job.priority, job.group.flow.family, worker)
+    return conflicts.conflict(state, job.priority, job.group.flow.family, worker)
 
 
 def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
     """Begin to empty a busy worker for a suspect; a train job does not wait for what is hidden there to end."""
     job.reserved = worker.name
     worker.reserved = job
-    state.story.tell(step.now, step.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
+    state.trace.add(step.now, step.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
     if job.priority == TRAIN:
         for lease in list(worker.leases.values()):
-            first = bars.goes_first(lease)
+            first = conflicts.goes_first(lease)
             if (
                 lease.live
                 and lease.job.priority != TRAIN

@@ -63,7 +63,7 @@ def test_a_local_coordinator_that_does_not_start_is_told_and_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     programs(monkeypatch, STUBBORN)
-    monkeypatch.setattr(local_cluster, "START_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(local_cluster, "START_TIMEOUT_S", SOON_S)
     monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
     started: list[ChildProcess] = []
     start = ChildProcess.start

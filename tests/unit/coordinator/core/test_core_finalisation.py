@@ -19,7 +19,7 @@ from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_coordinator.core.effects import ReadEvaluation
 from evopolicy_coordinator.core.leasing.seeds import policy_seed
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
-from evopolicy_coordinator.server.words import words
+from evopolicy_coordinator.server.reason_texts import words
 
 
 def value_of(job: Job) -> float:

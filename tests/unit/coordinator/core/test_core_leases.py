@@ -63,7 +63,7 @@ def test_a_result_of_an_expired_attempt_is_taken_while_the_job_is_open_and_stops
     rig, (first, second), lease = one_job("w1", "w2")
     keep(rig, 18.0, (second, ()))
     (again,) = rig.poll(second, wait_s=5.0)
-    assert isinstance(rig.play(first, lease, value=4.0), wire.HandInReply)
+    assert isinstance(rig.play(first, lease, value=4.0), wire.ResultsReported)
     assert rig.row(OutcomeRow, GROUP, 0).attempt == lease.attempt
     assert rig.beat(second, again).cancelled == (again.lease_id,)
 
@@ -110,7 +110,7 @@ def fields(outcome: Any) -> dict[str, Any]:
 def test_the_same_hand_in_twice_is_committed_once() -> None:
     rig, (first,), lease = one_job("w1")
     rig.play(first, lease, value=4.0)
-    assert isinstance(rig.play(first, lease, value=4.0), wire.HandInReply)
+    assert isinstance(rig.play(first, lease, value=4.0), wire.ResultsReported)
     assert rig.row(SubmitRow, "r1", 0).mean_return == 4.0
 
 

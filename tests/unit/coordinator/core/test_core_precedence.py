@@ -99,19 +99,19 @@ def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
     rig.create("r1", agent="remote", budget=64, train=64, most=64)
     closed(rig, session, "r0")
     rig.submit(*range(60), run="r1")
-    story: list[str] = []
+    trace: list[str] = []
     for _ in range(200):
         leases = rig.poll(session, 1)
         keep_alive(rig, session, 4.0, *leases)
         rig.play(session, *leases)
-        story += [split_of(lease.job) for lease in leases]
+        trace += [split_of(lease.job) for lease in leases]
         if "r0" not in rig.core.state.runs:
             break
-    hidden = [place for place, split in enumerate(story) if split in ("validation", "heldout")]
+    hidden = [place for place, split in enumerate(trace) if split in ("validation", "heldout")]
     assert len(hidden) == 5
     assert 20.0 <= 4.0 * hidden[0] <= 20.0 + 4 * 4.0  # after their wait, and what ran then
     assert hidden == list(range(hidden[0], hidden[0] + 5))  # and then to their end
-    assert story[-1] == "random" or rig.finished("r0").status == "completed"
+    assert trace[-1] == "random" or rig.finished("r0").status == "completed"
 
 
 def test_submits_that_wait_for_hidden_cases_say_so() -> None:

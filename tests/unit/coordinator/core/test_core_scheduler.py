@@ -422,7 +422,7 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     (stall,) = rig.status().stalls
     assert "r1/s0/train" in stall
     assert "a worker that offers toy/line" in stall
-    assert rig.core.story("r1/s0/train")
+    assert rig.core.trace("r1/s0/train")
 
 
 def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hypothesis.strategies as st
 from hypothesis import given
 
-from evopolicy_coordinator.core.structures.story import Story
 from evopolicy_coordinator.core.structures.timers import TimerKey, Timers
+from evopolicy_coordinator.core.structures.trace import Trace
 
 STEPS = st.lists(
     st.tuples(st.sampled_from(["arm", "once", "disarm", "due"]), st.integers(0, 8), st.integers(0, 50)),
@@ -47,7 +47,7 @@ def test_moving_one_deadline_for_ever_takes_no_memory() -> None:
 
 
 def test_a_story_keeps_the_last_lines_about_a_key_and_what_is_below_it() -> None:
-    story = Story(lines=3)
+    trace = Trace(lines=3)
     for at, key in enumerate(("r1/s0/train/0", "r2", "r1/s0/train/0#1", "w1")):
-        story.tell(float(at), "s", key, "leased" if key != "w1" else "lost r1/s0/train/0#1")
-    assert [line.at for line in story.of("r1")] == [2.0, 3.0]
+        trace.add(float(at), "s", key, "leased" if key != "w1" else "lost r1/s0/train/0#1")
+    assert [line.at for line in trace.of("r1")] == [2.0, 3.0]

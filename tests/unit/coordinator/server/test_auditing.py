@@ -1,4 +1,4 @@
-"""What audits need of the store: actions by themselves, and comparisons that nothing a worker hands in can upset."""
+"""What audits need of the store: actions by themselves, and comparisons that nothing a worker reports can upset."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.events import AuditCompared, AuditPrepared
 from evopolicy_coordinator.core.records import AuditRow, OutcomeRow
 from evopolicy_coordinator.server import auditing
+from evopolicy_coordinator.storage.disk_use import collect
 from evopolicy_coordinator.storage.store import Reader, Store
-from evopolicy_coordinator.storage.upkeep import collect
 from evopolicy_coordinator.verify import compare
 
 GROUP = "r-1/s0/train"

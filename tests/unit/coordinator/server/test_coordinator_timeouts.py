@@ -12,7 +12,7 @@ from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import operator
 from evopolicy_common.wire import keys
 from evopolicy_coordinator.server import service
-from evopolicy_coordinator.storage import store, upkeep
+from evopolicy_coordinator.storage import disk_use, store
 from evopolicy_coordinator.storage.store import Store
 
 SOON_S = 0.2
@@ -37,15 +37,15 @@ def test_a_database_that_another_keeps_locked_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store, "BUSY_TIMEOUT_S", SOON_S)
-    monkeypatch.setattr(upkeep, "BUSY_TIMEOUT_S", SOON_S)
+    monkeypatch.setattr(disk_use, "BUSY_TIMEOUT_S", SOON_S)
     (tmp_path / "blobs").mkdir()
-    ours = Store(tmp_path / upkeep.DATABASE)
-    other = sqlite3.connect(tmp_path / upkeep.DATABASE, isolation_level=None)
+    ours = Store(tmp_path / disk_use.DATABASE)
+    other = sqlite3.connect(tmp_path / disk_use.DATABASE, isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
     with pytest.raises(StorageError, match="locked"):
         ours.write_claim("suite", "name", b"")
     with pytest.raises(StorageError, match="locked"):
-        upkeep.collect(tmp_path, -1.0)
+        disk_use.collect(tmp_path, -1.0)
     other.execute("ROLLBACK")
     ours.write_claim("suite", "name", b"")
     other.close()

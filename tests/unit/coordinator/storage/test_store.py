@@ -22,8 +22,8 @@ from evopolicy_coordinator.core.records import (
     WorkerRow,
     head_of,
 )
+from evopolicy_coordinator.storage import disk_use
 from evopolicy_coordinator.storage import store as store_module
-from evopolicy_coordinator.storage import upkeep
 from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
 
 TRAIN = records.train_group("r-1", 0)
@@ -318,8 +318,8 @@ def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> No
 
 def test_upkeep_of_what_is_no_state_folder_makes_nothing(tmp_path: Path) -> None:
     for upkeep_of in (
-        lambda: upkeep.collect(tmp_path / "nowhere", 0.0),
-        lambda: upkeep.use(tmp_path / "nowhere"),
+        lambda: disk_use.collect(tmp_path / "nowhere", 0.0),
+        lambda: disk_use.use(tmp_path / "nowhere"),
     ):
         with pytest.raises(ConfigError, match="no coordinator's state folder"):
             upkeep_of()
@@ -330,7 +330,7 @@ def test_upkeep_names_the_row_that_it_cannot_read(store: Store, path: Path) -> N
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
     with pytest.raises(DamagedStoreError, match=f"{path}: table submits, row"):
-        upkeep.collect(path.parent, 0.0)
+        disk_use.collect(path.parent, 0.0)
 
 
 def test_what_the_disk_may_take_later_is_told_from_what_it_never_will(store: Store) -> None:

@@ -1,4 +1,4 @@
-"""An agent is gone when nothing of it lives, and not before: a real keeper with processes that cannot be killed."""
+"""An agent is gone when nothing of it lives, and not before: a real agent supervisor with processes that cannot be killed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from frozen import freezer
 
-from evopolicy_gateway.http.door import Door
-from evopolicy_gateway.operator import alone, control
-from evopolicy_gateway.operator.control import (
+from evopolicy_gateway.http.listener import Listener
+from evopolicy_gateway.operator import child_messages, locks
+from evopolicy_gateway.operator.child_messages import (
     AgentEnded,
     AgentSurvives,
     AnyEvent,
@@ -28,19 +28,19 @@ from evopolicy_gateway.operator.control import (
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
 
 
-class Keeper:
-    """A keeper process with an agent that writes its process id into `folder`."""
+class SupervisorProcess:
+    """An agent supervisor process with an agent that writes its process id into `folder`."""
 
     def __init__(self, root: Path, wall_limit_s: float = 1000.0) -> None:
         self.folder = root / "pids"
         self.folder.mkdir(exist_ok=True)
         self.lock = root / "keeper.lock"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "evopolicy_gateway.agent_supervisor.keeper"],
+            [sys.executable, "-m", "evopolicy_gateway.agent_supervisor.supervisor"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -61,12 +61,12 @@ class Keeper:
 
     def tell(self, order: Order) -> None:
         assert self.process.stdin is not None
-        self.process.stdin.write(control.line(order))
+        self.process.stdin.write(child_messages.line(order))
         self.process.stdin.flush()
 
     def agent(self) -> int:
         """Its process id, once it runs."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not (found := os.listdir(self.folder)):
             assert time.monotonic() < deadline
             time.sleep(0.01)
@@ -76,7 +76,7 @@ class Keeper:
         """The next event of a kind."""
         assert self.process.stdout is not None
         for data in self.process.stdout:
-            event = control.event_of(data)
+            event = child_messages.event_of(data)
             if isinstance(event, kind):
                 return event
         raise AssertionError(f"the keeper ended without {kind.__name__}")
@@ -91,39 +91,43 @@ class Keeper:
 
 
 @pytest.fixture
-def keeper(tmp_path: Path) -> Iterator[Keeper]:
-    found = Keeper(tmp_path)
+def supervisor(tmp_path: Path) -> Iterator[SupervisorProcess]:
+    found = SupervisorProcess(tmp_path)
     yield found
     found.process.kill()
     found.process.communicate()
 
 
-def test_agent_that_survives_is_told_and_has_not_ended_before_it_is_gone(keeper: Keeper) -> None:
+def test_agent_that_survives_is_told_and_has_not_ended_before_it_is_gone(
+    supervisor: SupervisorProcess,
+) -> None:
     with freezer() as held:
-        agent = keeper.agent()
+        agent = supervisor.agent()
         held.freeze(agent)
-        keeper.tell(StopAgent())
-        told = keeper.until(AgentSurvives)
+        supervisor.tell(StopAgent())
+        told = supervisor.until(AgentSurvives)
         assert isinstance(told, AgentSurvives)
         assert agent in told.pids
-        assert keeper.holds_its_lock()
+        assert supervisor.holds_its_lock()
         held.thaw()
-        ended = keeper.until(AgentEnded)
+        ended = supervisor.until(AgentEnded)
         assert isinstance(ended, AgentEnded)
         assert ended.reason == "told"
-    assert keeper.process.wait(PATIENCE_S) == 0
-    assert not keeper.holds_its_lock()
+    assert supervisor.process.wait(TIMEOUT_S) == 0
+    assert not supervisor.holds_its_lock()
 
 
-def test_keeper_waits_for_one_before_it_that_still_has_an_agent(keeper: Keeper, tmp_path: Path) -> None:
-    first = keeper.agent()
-    second = Keeper(tmp_path)
+def test_keeper_waits_for_one_before_it_that_still_has_an_agent(
+    supervisor: SupervisorProcess, tmp_path: Path
+) -> None:
+    first = supervisor.agent()
+    second = SupervisorProcess(tmp_path)
     try:
         time.sleep(0.5)
-        assert os.listdir(keeper.folder) == [str(first)]
-        keeper.tell(StopAgent())
-        keeper.until(AgentEnded)
-        os.unlink(keeper.folder / str(first))
+        assert os.listdir(supervisor.folder) == [str(first)]
+        supervisor.tell(StopAgent())
+        supervisor.until(AgentEnded)
+        os.unlink(supervisor.folder / str(first))
         assert second.agent() != first
     finally:
         second.tell(StopAgent())
@@ -132,15 +136,15 @@ def test_keeper_waits_for_one_before_it_that_still_has_an_agent(keeper: Keeper, 
 
 
 def test_time_that_submits_were_held_is_given_back(tmp_path: Path) -> None:
-    keeper = Keeper(tmp_path, wall_limit_s=3.0)
+    supervisor = SupervisorProcess(tmp_path, wall_limit_s=3.0)
     started = time.monotonic()
-    keeper.agent()
-    keeper.tell(HeldTime(seconds=4.0))
-    ended = keeper.until(AgentEnded)
+    supervisor.agent()
+    supervisor.tell(HeldTime(seconds=4.0))
+    ended = supervisor.until(AgentEnded)
     assert isinstance(ended, AgentEnded)
     assert ended.reason == "wall_limit"
     assert time.monotonic() - started >= 7.0
-    keeper.process.communicate()
+    supervisor.process.communicate()
 
 
 class Cluster(Operations):
@@ -159,7 +163,7 @@ class Cluster(Operations):
 def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alone, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(locks, "_PAUSE_S", 0.01)
     folder = RunFolder(tmp_path / "run")
     folder.state.mkdir(parents=True)
     cluster = Cluster()
@@ -168,15 +172,15 @@ def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
         await cluster.drop(folder)
         assert cluster.asked == []
         save(folder.opened, OpenedRun(run="r-1"))
-        with folder.keeper_lock.open("w") as held:
+        with folder.supervisor_lock.open("w") as held:
             fcntl.flock(held, fcntl.LOCK_EX)
             dropping = asyncio.create_task(cluster.drop(folder))
             await asyncio.sleep(0.1)
             assert cluster.asked == []
-        await asyncio.wait_for(dropping, PATIENCE_S)
+        await asyncio.wait_for(dropping, TIMEOUT_S)
         assert cluster.asked == ["cancel r-1", "gone r-1"]
         # Of a remote agent nobody here knows whether it has ended.
-        save(folder.door, Door(host="127.0.0.1", port=0))
+        save(folder.listener, Listener(host="127.0.0.1", port=0))
         await cluster.drop(folder)
         assert cluster.asked[2:] == ["cancel r-1"]
 

@@ -52,7 +52,7 @@ def a_run(workspace: Path, budget: int, play: Play = play_point, **options: Any)
 
 def run_agent(gateway: FakeGateway) -> None:
     urls = {f"{name}_url": f"{gateway.url}/{name}" for name in ("info", "task", "submit")}
-    client = Client(**urls, sleep=lambda seconds: None, patience_s=5.0)
+    client = Client(**urls, sleep=lambda seconds: None, timeout_s=5.0)
     Agent(client, gateway.workspace).run()
 
 
@@ -139,7 +139,7 @@ ARM_ACTION = {"type": "Box", "shape": [4], "dtype": "float32", "low": [-1.0] * 4
 
 
 def play_arm(policy: Any, case: int) -> tuple[float, list[dict[str, Any]]]:
-    """A hand in space and a thing on a table; the hand carries the thing while closed on it (fourth output below 0)."""
+    """A report space and a thing on a table; the hand carries the thing while closed on it (fourth output below 0)."""
     rng = np.random.default_rng(case)
     hand = np.array([1.0, 0.7, 0.5]) + rng.uniform(-0.02, 0.02, 3)
     thing = np.array([*(hand[:2] + rng.uniform(-0.12, 0.12, 2)), 0.42])

@@ -19,7 +19,7 @@ from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, T
 from evopolicy_gateway.harnesses.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.codex import usage_of
 from evopolicy_gateway.harnesses.configured import ConfiguredCli, ConfiguredReader, values
-from evopolicy_gateway.harnesses.trouble import MAX_BACKOFF_S, backoff_s, trouble_of
+from evopolicy_gateway.harnesses.turn_failure import MAX_BACKOFF_S, backoff_s, turn_failure_of
 from evopolicy_gateway.harnesses.usage import MAX_COUNT, Usage
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
@@ -52,16 +52,16 @@ EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
 def test_what_a_cli_says_decides_what_follows(
     message: str, status: int | None, kind: str, provider: bool
 ) -> None:
-    trouble = trouble_of(message, status, now=1.0)
-    assert (trouble.kind, trouble.provider) == (kind, provider)
+    failure = turn_failure_of(message, status, now=1.0)
+    assert (failure.kind, failure.provider) == (kind, provider)
 
 
 def test_a_told_waiting_time_is_understood() -> None:
-    assert trouble_of("usage limit, try again in 3 hours 5 minutes").wait_s == 3 * 3600 + 300
-    assert trouble_of("Rate limit is exceeded. Try again in 17 seconds.").wait_s == 17
-    assert trouble_of("Claude AI usage limit reached|1900000000", now=1_899_999_990.0).wait_s == 10
-    assert trouble_of('{"type":"usage_limit_reached","resets_in_seconds":9568}').wait_s == 9568
-    assert trouble_of("try again later").wait_s is None
+    assert turn_failure_of("usage limit, try again in 3 hours 5 minutes").wait_s == 3 * 3600 + 300
+    assert turn_failure_of("Rate limit is exceeded. Try again in 17 seconds.").wait_s == 17
+    assert turn_failure_of("Claude AI usage limit reached|1900000000", now=1_899_999_990.0).wait_s == 10
+    assert turn_failure_of('{"type":"usage_limit_reached","resets_in_seconds":9568}').wait_s == 9568
+    assert turn_failure_of("try again later").wait_s is None
 
 
 @given(attempt=st.integers(1, 10_000), chance=st.floats(0.0, 1.0, exclude_max=True))
@@ -88,7 +88,7 @@ LONG = 1_000_000
     ],
 )
 def test_no_text_of_a_cli_gives_an_endless_wait_or_takes_long(text: str) -> None:
-    wait_s = trouble_of(text, now=1.0).wait_s
+    wait_s = turn_failure_of(text, now=1.0).wait_s
     assert wait_s is None or 0.0 <= wait_s < float("inf")
 
 
@@ -284,13 +284,13 @@ def test_an_event_counts_only_where_its_path_allows_it() -> None:
     reader = ConfiguredReader(events)
     reader.read({"type": "tool_result", "error": {"message": "no such file"}})
     reader.read({"type": "message", "role": "user", "content": "the prompt"})
-    assert (reader.trouble, reader.text) == (None, "")
+    assert (reader.failure, reader.text) == (None, "")
     reader.read({"type": "message", "role": "assistant", "content": "done"})
     # What is counted above input and output is reasoning.
     reader.read({"type": "result", "u": {"in": 10, "cached": 4, "out": 2, "all": 15}})
     assert (reader.text, reader.usage) == ("done", Usage(input_noncached=6, cache_read=4, output=5))
     reader.read({"type": "result", "error": {"message": "429 too many requests"}})
-    assert reader.trouble is not None
+    assert reader.failure is not None
     assert list(values({"a": [{"k": "x", "v": 1}, {"k": "y", "v": 2}]}, "a.*.[k=y].v")) == [2]
     for odd in ("[", "[a", "[a=", "]", "[k=x]", "a..b"):
         assert list(values({"k": 1}, odd)) == []

@@ -11,7 +11,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import session
 from evopolicy_gateway.harnesses.base import AgentError
 from evopolicy_gateway.harnesses.usage import Prices
-from evopolicy_gateway.operator.control import AgentEnded
+from evopolicy_gateway.operator.child_messages import AgentEnded
 
 both = pytest.mark.parametrize("harness", ["codex", "claude-code"])
 

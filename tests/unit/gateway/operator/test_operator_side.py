@@ -23,8 +23,8 @@ from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator import control
-from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator import child_messages
+from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 from evopolicy_gateway.operator.runs import Cluster, RunResult, ends_of, exit_code, report
 from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.layout import Staged
@@ -185,10 +185,10 @@ def test_profile_published_makes_every_published_choice_and_takes_no_other() -> 
 
 def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
     progress = Progress(episode_budget=8, remaining_budget=3, n_submits=1, last_mean=1.5)
-    assert control.event_of(control.line(progress)) == progress
+    assert child_messages.event_of(child_messages.line(progress)) == progress
     for junk in (b"", b"{}", b'{"event": "other"}', b"plain text"):
         with pytest.raises(ProtocolError):
-            control.event_of(junk)
+            child_messages.event_of(junk)
 
 
 def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:

@@ -11,7 +11,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 from evopolicy_gateway.operator.watch import RunView, first_line
 from evopolicy_gateway.suite.suite_view import SuiteView
 

@@ -29,9 +29,9 @@ from evopolicy_gateway.harnesses import base, cli_agent, command, turn
 from evopolicy_gateway.http import server
 from evopolicy_gateway.http import service as http
 from evopolicy_gateway.jail import settings as jail_settings
-from evopolicy_gateway.operator.children import Child
-from evopolicy_gateway.run import play
-from evopolicy_gateway.run.play import RunPlay
+from evopolicy_gateway.operator.child_rpc import Child
+from evopolicy_gateway.run import lifecycle
+from evopolicy_gateway.run.lifecycle import RunLifecycle
 
 SOON_S = 0.2
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
@@ -49,7 +49,7 @@ def mute_server() -> Iterator[str]:
 
 def test_an_agent_gives_up_on_a_gateway_that_says_nothing() -> None:
     with mute_server() as url:
-        client = Client(info_url=url, task_url=url, submit_url=url, answer_s=SOON_S, patience_s=SOON_S)
+        client = Client(info_url=url, task_url=url, submit_url=url, answer_s=SOON_S, timeout_s=SOON_S)
         with pytest.raises(ProtocolError, match="did not answer"):
             client.info()
 
@@ -78,7 +78,7 @@ def test_info_of_a_gateway_that_is_killed_while_it_answers_did_not_come() -> Non
 def test_a_program_that_has_said_stop_and_stays_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "_STOP_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(command, "_STOP_TIMEOUT_S", SOON_S)
     code = """
 import json, os, sys, time
 open("pid", "w").write(str(os.getpid()))
@@ -96,7 +96,7 @@ time.sleep(1000)
 
 
 def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_PIPE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(command, "_PIPE_TIMEOUT_S", SOON_S)
     monkeypatch.setattr(agent_process, "_LAST_WORDS_S", SOON_S)
     assert command_stage.play_with_a_child_that_holds_the_pipes(tmp_path).reason == "agent_stopped"
 
@@ -107,7 +107,7 @@ def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest
 def test_a_cli_that_does_not_tell_its_version_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli_agent, "_PROBE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(cli_agent, "_PROBE_TIMEOUT_S", SOON_S)
     mute = tmp_path / "bin" / "claude"
     mute.parent.mkdir()
     mute.write_text("#!/bin/sh\nexec sleep 1000\n")
@@ -122,7 +122,7 @@ def test_a_cli_that_is_done_and_does_not_exit_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: str
 ) -> None:
     """Also one that ignores SIGTERM."""
-    monkeypatch.setattr(turn, "DONE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(turn, "DONE_TIMEOUT_S", SOON_S)
     monkeypatch.setattr(turn, "_KILL_GRACE_S", SOON_S)
     played = cli_stage.play(tmp_path, settings("claude-code"), scenario, budget=2)
     assert played.ending is not None
@@ -132,7 +132,7 @@ def test_a_cli_that_is_done_and_does_not_exit_is_ended(
 def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(turn, "_PIPE_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(turn, "_PIPE_TIMEOUT_S", SOON_S)
     try:
         played = cli_stage.play(tmp_path, settings("claude-code"), "leaves_child", budget=2)
         assert played.ending is not None
@@ -141,10 +141,10 @@ def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
         os.kill(int((tmp_path / "fake" / "child").read_text()), signal.SIGKILL)
 
 
-KEEPER = """
+SUPERVISOR = """
 import asyncio, sys
-from evopolicy_gateway.operator.control import StartAgent, StopAgent
-from evopolicy_gateway.agent_supervisor import keeper
+from evopolicy_gateway.operator.child_messages import StartAgent, StopAgent
+from evopolicy_gateway.agent_supervisor import supervisor
 from evopolicy_gateway.harnesses.base import Harness
 
 class Deaf(Harness):
@@ -156,16 +156,21 @@ class Orders:
     async def next(self):
         return StopAgent()
 
-keeper.make = lambda *given: Deaf()
-keeper.LAST_WORDS_S = 0.2
+supervisor.make = lambda *given: Deaf()
+supervisor.LAST_WORDS_S = 0.2
 order = StartAgent(agent="deaf", workspace=".", agent_log="agent.jsonl", urls={}, started_in=".", wall_limit_s=1000.0)
-print(asyncio.run(keeper.keep(order, Orders())).reason)
+print(asyncio.run(supervisor.keep(order, Orders())).reason)
 """
 
 
 def test_a_harness_that_does_not_end_with_its_programs_is_cut_off(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", KEEPER], capture_output=True, text=True, timeout=60, cwd=tmp_path, check=False
+        [sys.executable, "-c", SUPERVISOR],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=tmp_path,
+        check=False,
     )
     assert done.stdout.splitlines()[-1:] == ["told"], done.stderr
 
@@ -174,7 +179,7 @@ def test_a_harness_that_does_not_end_with_its_programs_is_cut_off(tmp_path: Path
 
 
 def test_a_bubblewrap_that_hangs_builds_no_jail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jail_settings, "_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(jail_settings, "_TIMEOUT_S", SOON_S)
     program = tmp_path / "bwrap"
     program.write_text("#!/bin/sh\nexec sleep 1000\n")
     program.chmod(0o755)
@@ -246,7 +251,7 @@ def test_a_submit_that_is_not_waited_for_is_answered_before_it_is_decided(
             answer = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
             assert answer.status_code == 202
             s.double.up = True
-            await s.desk.idle()
+            await s.pipeline.idle()
 
     asyncio.run(main())
 
@@ -302,7 +307,7 @@ def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
 def test_giving_up_a_run_ends_although_nobody_hears_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(play, "GIVE_UP_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(lifecycle, "GIVE_UP_TIMEOUT_S", SOON_S)
 
     class Deaf:
         async def cancel(self, run: str) -> None:
@@ -310,7 +315,7 @@ def test_giving_up_a_run_ends_although_nobody_hears_of_it(
 
     async def main() -> None:
         plan: Any = SimpleNamespace(folder=None, settings=SimpleNamespace(env="toy/line"))
-        running = RunPlay(plan, Deaf(), None, None)  # type: ignore[arg-type]
+        running = RunLifecycle(plan, Deaf(), None, None)  # type: ignore[arg-type]
         async with asyncio.timeout(60):
             await running._give_up("r", None)
 

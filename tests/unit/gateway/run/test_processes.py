@@ -11,7 +11,7 @@ from own_processes import alive
 
 from evopolicy_gateway.run.processes import descendants, end_orphans
 
-KEEPER = """
+SUPERVISOR = """
 import os, subprocess, sys, time
 from evopolicy_gateway.run import processes
 processes.become_subreaper()
@@ -38,7 +38,7 @@ except ChildProcessError:
 
 def test_nothing_below_survives_however_it_hides(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", KEEPER],
+        [sys.executable, "-c", SUPERVISOR],
         env={**os.environ, "N": f"{tmp_path}/"},
         capture_output=True,
         text=True,

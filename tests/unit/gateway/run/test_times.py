@@ -16,7 +16,7 @@ def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_pat
     first.agent_begins()
     first.gateway_told(2.0, 0.5)
     first.agent_told(5.0)
-    # The second keeper and the second gateway tell more than the first did, and still do not take its place.
+    # The second agent supervisor and the second gateway tell more than the first did, and still do not take its place.
     first.agent_begins()
     first.agent_told(6.0)
     first.gateway_begins()

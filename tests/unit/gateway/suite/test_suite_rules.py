@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.operator.control import AgentDoing, Progress
+from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import (
     Decision,

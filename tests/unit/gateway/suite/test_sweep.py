@@ -13,7 +13,7 @@ import pytest
 from evopolicy_common.messages.operator import ClaimState, RunFinished
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.operator.control import AgentDoing
+from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.run.layout import RunFolder
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
@@ -24,7 +24,7 @@ from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
 CODEX = '[[agents]]\nname = "{}"\n[agents.config]\nharness = "codex"\n'
 EVOLVE = '[[agents]]\nname = "{}"\nagent = "evolve"\n'
@@ -79,7 +79,7 @@ class Stage:
         stage = self
 
         class Play:
-            """In place of `RunPlay`: the run is open at once, and does what the stage says."""
+            """In place of `RunLifecycle`: the run is open at once, and does what the stage says."""
 
             def __init__(
                 self,
@@ -132,7 +132,7 @@ class Stage:
         decided = [decide(run, Found(entry=self.index.runs.get(run.name))) for run in self.runs]
 
         async def main() -> None:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 await played.play(decided)
 
         asyncio.run(main())
@@ -195,7 +195,7 @@ def test_next_agent_begins_while_the_run_before_is_scored(
 ) -> None:
     text = HEAD + "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "_LOOK_S", PATIENCE_S)
+    monkeypatch.setattr(sweep, "_LOOK_S", TIMEOUT_S)
 
     async def score(name: str) -> None:
         # No run's score comes before the last agent has begun.

@@ -18,7 +18,7 @@ from slots import QUICK, Slots, make_job, misbehaving
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.messages.worker import HandIn, JobResult
+from evopolicy_common.messages.worker import JobResult, ReportResults
 from evopolicy_common.records.trajectory import Recorder
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
@@ -108,7 +108,7 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
         from evopolicy_worker.episodes.loop import _blob
 
         outcome = msgspec.structs.replace(outcome, trajectory=_blob(each.finish()))
-        assert handed_in(outcome) == outcome
+        assert results_reported(outcome) == outcome
 
 
 def finished(frame: bytes) -> list[EpisodeOutcome]:
@@ -116,14 +116,14 @@ def finished(frame: bytes) -> list[EpisodeOutcome]:
     return [message.outcome] if isinstance(message, messages.Finished) else []
 
 
-def handed_in(outcome: EpisodeOutcome) -> EpisodeOutcome:
+def results_reported(outcome: EpisodeOutcome) -> EpisodeOutcome:
     """The outcome after its way from the slot's process through the supervisor to the coordinator."""
     (outcome,) = finished(messages.framed(messages.Finished(outcome=outcome)))
     result = JobResult(lease_id="l", job_id="j", attempt=1, kind="done", episodes=(outcome,))
     message = codec.decode(
-        codec.worker_requests, codec.encode(HandIn(worker="w", session="s", results=(result,)))
+        codec.worker_requests, codec.encode(ReportResults(worker="w", session="s", results=(result,)))
     )
-    assert isinstance(message, HandIn)
+    assert isinstance(message, ReportResults)
     return message.results[0].episodes[0]
 
 
@@ -162,7 +162,7 @@ def test_whatever_comes_as_a_report_is_a_bounded_failure(
     outcome = EpisodeOutcome(
         index=0, episode_return=0.0, length=1, terminated=False, truncated=True, failure=failure
     )
-    assert handed_in(outcome) == outcome
+    assert results_reported(outcome) == outcome
 
 
 @pytest.fixture(scope="module")

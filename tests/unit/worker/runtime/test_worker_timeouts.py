@@ -177,7 +177,7 @@ def never() -> bool:
 def test_a_bubblewrap_that_does_not_answer_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor, "_PATIENCE_S", SOON_S)
+    monkeypatch.setattr(doctor, "_TIMEOUT_S", SOON_S)
     program = tmp_path / "bwrap"
     program.write_text("#!/bin/sh\nexec sleep 1000\n")
     program.chmod(0o755)

@@ -1,0 +1,199 @@
+"""The agent supervisor: a process that starts one agent, watches its clock, and leaves nothing of it behind.
+
+It speaks the lines of `control.py` with `evopolicy run`. It is apart from the gateway, so that an agent's parent holds no
+credentials, and so that a gateway that dies and comes back finds the agent still at work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import signal
+import sys
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from evopolicy_common.cli import setup_logging
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
+from evopolicy_gateway.agent_supervisor.agent_process import environment_of
+from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
+from evopolicy_gateway.agent_supervisor.redaction import Redaction
+from evopolicy_gateway.harnesses import make
+from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.base import Stage
+from evopolicy_gateway.jail.jail import Jail
+from evopolicy_gateway.operator import child_messages
+from evopolicy_gateway.operator.child_messages import (
+    AgentDoing,
+    AgentEnded,
+    AgentSurvives,
+    AgentTime,
+    AgentTurn,
+    Orders,
+    StartAgent,
+)
+from evopolicy_gateway.run import processes
+
+END_GRACE_S = 3.0
+"""From SIGTERM to SIGKILL."""
+LAST_WORDS_S = 2.0
+_TEXT_SHOWN = 2000
+_LINES_SHOWN = 8
+_TELL_TIME_S = 5.0
+_SURVIVORS_PAUSE_S = 1.0
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
+    """Plays the agent to its end, or until told; everything that it started is gone afterwards."""
+    environment = environment_of({**order.urls, **order.variables})
+    config = None if order.config is None else msgspec.convert(order.config, AgentConfig)
+    agent_log = AgentLog(Path(order.agent_log), Redaction.of(secrets_in(environment, config), order.urls))
+    clock = AgentClock(order.wall_limit_s)
+    activity = None if order.silence_s is None else Activity(order.silence_s, Path(order.workspace))
+    stage = Stage(
+        workspace=Path(order.workspace),
+        urls=order.urls,
+        environment=environment,
+        log=agent_log,
+        on_turn=lambda turn, text: child_messages.emit(AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
+        session_file=None if order.session_file is None else Path(order.session_file),
+        on_doing=_tell,
+        clock=clock,
+        activity=activity,
+    )
+    play = asyncio.create_task(_play(order, stage, config))
+    told = asyncio.create_task(_stopped(orders, clock, activity))
+    late = asyncio.create_task(clock.run_out())
+    telling = asyncio.create_task(_tell_time(clock))
+    log.info("agent started", agent=order.agent)
+    try:
+        await asyncio.wait([play, told, late], return_when=asyncio.FIRST_COMPLETED)
+        reason = None if play.done() else "told" if told.done() else "wall_limit"
+        stage.over.set()
+        await _until_gone(stage.started)
+        # With its programs gone a harness ends by itself, and can still say how far it came.
+        await asyncio.wait([play], timeout=LAST_WORDS_S)
+        play.cancel()
+        ending = (await asyncio.gather(play, return_exceptions=True))[0]
+    finally:
+        for task in (told, late, telling):
+            task.cancel()
+        child_messages.emit(AgentTime(used_s=clock.used_s()))
+        agent_log.close()
+    if isinstance(ending, AgentEnded):
+        if reason is not None:
+            return msgspec.structs.replace(ending, reason=reason, detail="")
+        failed = ending.reason == "agent_failed"
+        return msgspec.structs.replace(ending, said=_last_words(agent_log)) if failed else ending
+    if isinstance(ending, EvopolicyError) or reason is not None:
+        return AgentEnded(reason=reason or "agent_failed", detail=str(ending))
+    raise ending
+
+
+def _last_words(agent_log: AgentLog) -> tuple[str, ...]:
+    lines = [agent_log.redact(line.encode()).decode("utf-8", "replace") for line in agent_log.last_errors]
+    return tuple(line for line in lines if line)[-_LINES_SHOWN:]
+
+
+async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
+    harness = make(order.agent, Path(order.started_in), config)
+    if order.jail is not None:
+        jail = Jail(
+            order.jail,
+            harness=harness.name,
+            command=harness.command,
+            variables=harness.variables,
+            workspace=stage.workspace,
+            urls=order.urls,
+            started_in=Path(order.started_in),
+        )
+        inside = jail.environment(stage.environment, {**order.urls, **order.variables})
+        stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
+    return await harness.play(stage)
+
+
+def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
+    """Variables whose values may be secrets: what an agent's settings name for passing on is one whatever its name."""
+    named = (
+        {}
+        if config is None
+        else {f"{name}_KEY": environment.get(name, "") for name in config.pass_environment}
+    )
+    return {**environment, **named}
+
+
+def _tell(doing: AgentDoing) -> None:
+    shown = {"action": doing.action[:_TEXT_SHOWN], "note": doing.note[:_TEXT_SHOWN]}
+    child_messages.emit(msgspec.structs.replace(doing, **shown))
+
+
+async def _tell_time(clock: AgentClock) -> None:
+    """Again and again, so that an agent that is killed and goes on has no more time than another."""
+    while True:
+        await asyncio.sleep(_TELL_TIME_S)
+        child_messages.emit(AgentTime(used_s=clock.used_s()))
+
+
+async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None) -> None:
+    """Returns when the parent says stop, or is gone; passes on to the clocks what it is told meanwhile."""
+    while (order := await orders.next()) is not None:
+        if isinstance(order, child_messages.HeldTime):
+            clock.held(order.seconds)
+        if isinstance(order, child_messages.SubmitsSeen) and activity is not None:
+            activity.told(order.asked, order.running)
+        if isinstance(order, child_messages.StopAgent):
+            return
+
+
+async def _until_gone(started: Collection[int]) -> None:
+    """Ends all that the agent has started, and returns when nothing of it lives.
+
+    What survives being killed (the kernel holds it) is told to the parent: as long as it lives the agent is not gone.
+    """
+    told: list[int] = []
+    while left := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
+        if left != told:
+            log.error("processes of the agent survive", pids=left)
+            child_messages.emit(AgentSurvives(pids=tuple(left)))
+            told = left
+        await asyncio.sleep(_SURVIVORS_PAUSE_S)
+
+
+async def _main() -> int:
+    setup_logging()
+    processes.become_subreaper()
+    processes.leave_session_keyring()
+    orders = Orders()
+    loop = asyncio.get_running_loop()
+    first = await orders.next()
+    if not isinstance(first, StartAgent):
+        return 2
+    if first.lock is not None:
+        # Of this process alone, and let go of by its death: no program of the agent inherits it.
+        file = os.open(first.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        await asyncio.to_thread(fcntl.flock, file, fcntl.LOCK_EX)
+    main = asyncio.create_task(keep(first, orders))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, orders.end)
+    ended = await main
+    log.info("agent ended", reason=ended.reason, detail=ended.detail, turns=ended.turns)
+    child_messages.emit(ended)
+    return 0
+
+
+if __name__ == "__main__":
+    # A thread that still reads stdin must not hold up the exit.
+    try:
+        code = asyncio.run(_main())
+    except Exception:
+        log.exception("the agent supervisor failed")
+        code = 1
+    sys.stdout.flush()
+    os._exit(code)

@@ -1,0 +1,105 @@
+"""Why a turn failed, and what follows from it: rules without I/O.
+
+- `passing`: a crash, a timeout, an error of the provider that a retry may cure.
+- `quota`: the account's limit is reached; only time helps, so the run pauses.
+- `lost`: the CLI no longer knows the session; a new one is begun.
+- `final`: a retry would fail in the same way (a wrong key, an unknown model), so the run ends.
+- `cap`: the run has used the tokens or the money that it may.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from typing import Literal
+
+import msgspec
+
+Kind = Literal["passing", "quota", "lost", "final", "cap"]
+
+MAX_BACKOFF_S = 300.0
+_MAX_MESSAGE = 500
+_MAX_SEARCHED = 20_000
+"""Characters of a message in which a time to wait is looked for."""
+
+_LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
+_QUOTA = re.compile(
+    r"usage[ _]limit|insufficient_quota|exceeded your current quota|credit balance|billing|(hit|reached) your [\w ]*limit"
+    r"|weekly limit|quota exceeded|out of credits",
+    re.IGNORECASE,
+)
+_FINAL = re.compile(
+    r"invalid (api|x-api) ?-?key|failed to authenticate|not logged in|please run /login|invalid bearer"
+    r"|model_not_found|model [^\n]{0,80}(does not exist|not supported|not exist)|issue with the selected model"
+    r"|unexpected argument|unknown option|error loading config",
+    re.IGNORECASE,
+)
+_STATUS = re.compile(r"(?:status:?|API Error:?|HTTP)\D{0,3}(\d{3})\b|\((\d{3})\)", re.IGNORECASE)
+_PROVIDER = re.compile(
+    r"overloaded|rate.?limit|time[d ]*.?out|stream (disconnected|error)|connect|ECONN|ENOTFOUND|reset by peer|unavailable"
+    r"|high demand|server error|too many requests|at capacity|network|dns",
+    re.IGNORECASE,
+)
+_IN = re.compile(
+    r"(?:try again|resets?|retry)[^\d\n]{0,20}in ((?:\d+(?:\.\d+)?\s*[a-z]+[ ,and]*)+)", re.IGNORECASE
+)
+_PART = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
+_RESETS_IN = re.compile(r"resets_in_seconds\W{1,4}(\d+)")
+_EPOCH = re.compile(r"(?:\||resets_at\W{1,4})(\d{10})\b")
+_UNITS = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+class TurnFailure(msgspec.Struct, frozen=True, kw_only=True):
+    """A failed turn."""
+
+    kind: Kind
+    message: str
+    provider: bool = False
+    """The provider's doing; False for a crash of the CLI."""
+    wait_s: float | None = None
+    """When to try again, if the provider told."""
+
+
+def turn_failure_of(message: str, status: int | None = None, now: float | None = None) -> TurnFailure:
+    """What an error's text, and the HTTP status where it is told apart, mean. `now`: Unix time."""
+    text = " ".join(message.split())[:_MAX_MESSAGE] or "no message"
+    found = _STATUS.search(text)
+    code = status if status is not None else int(found.group(1) or found.group(2)) if found else None
+    if _LOST.search(text):
+        return TurnFailure(kind="lost", message=text)
+    if code in (401, 403) or _FINAL.search(text):
+        return TurnFailure(kind="final", message=text, provider=True)
+    wait_s = _wait_in(message[:_MAX_SEARCHED], time.time() if now is None else now)
+    if code == 402 or _QUOTA.search(text):
+        return TurnFailure(kind="quota", message=text, provider=True, wait_s=wait_s)
+    if code is not None and 400 <= code < 500 and code not in (408, 409, 425, 429):
+        return TurnFailure(kind="final", message=text, provider=True)
+    provider = code is not None or _PROVIDER.search(text) is not None
+    return TurnFailure(kind="passing", message=text, provider=provider, wait_s=wait_s)
+
+
+def backoff_s(attempt: int, base_s: float, chance: float) -> float:
+    """Seconds before retry `attempt` (from 1): base · 2^(attempt − 1), times 0.75 to 1.25 by `chance` in [0, 1)."""
+    whole = base_s * 2.0 ** min(attempt - 1, 16)
+    return min(MAX_BACKOFF_S, float(whole) * (0.75 + 0.5 * chance))
+
+
+def _wait_in(text: str, now: float) -> float | None:
+    """Seconds to wait, finite, where the text tells."""
+    told = _told_wait(text, now)
+    return told if told is not None and math.isfinite(told) else None
+
+
+def _told_wait(text: str, now: float) -> float | None:
+    if (seconds := _RESETS_IN.search(text)) is not None:
+        return float(seconds.group(1))
+    if (epoch := _EPOCH.search(text)) is not None:
+        return max(0.0, float(epoch.group(1)) - now)
+    if (told := _IN.search(text)) is None:
+        return None
+    total = 0.0
+    for number, unit in _PART.findall(told.group(1)):
+        name = unit.lower()
+        total += float(number) * _UNITS.get("ms" if name.startswith("ms") else name[0], 0.0)
+    return total or None

@@ -1,0 +1,150 @@
+"""What leads out of a jail: the ports of one program's network namespace, answered by the agent supervisor.
+
+A forwarded port leads to the same port of this machine. The proxy port takes `CONNECT HOST:PORT` for the named hosts
+only; names are resolved out here, since a jail has no name service.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Mapping
+
+import structlog
+
+from evopolicy_gateway.jail.settings import Host
+
+PROXY_PORT = 3128
+MAX_CONNECTIONS = 256
+"""At once, of one program."""
+_MAX_HEAD_BYTES = 16 << 10
+_HEAD_TIMEOUT_S = 30.0
+_CONNECT_TIMEOUT_S = 60.0
+_CHUNK = 64 << 10
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class JailProxy:
+    """The open doors of one program in its jail. `close` when the program is gone."""
+
+    def __init__(self, forwards: Mapping[int, Host], hosts: frozenset[Host]) -> None:
+        self._forwards = dict(forwards)
+        self._hosts = hosts
+        free = PROXY_PORT
+        while free in self._forwards:
+            free += 1
+        self.proxy_port = free
+        self._servers: list[asyncio.Server] = []
+        self._connections: set[asyncio.Task[None]] = set()
+
+    @property
+    def ports(self) -> tuple[int, ...]:
+        """To be listened on in the jail, in the order in which `serve` expects the sockets."""
+        return (*self._forwards, self.proxy_port)
+
+    async def serve(self, control: socket.socket) -> None:
+        """Takes the listening sockets from the jail and serves them; nothing when it ended without handing them out."""
+        loop = asyncio.get_running_loop()
+        control.setblocking(False)
+        ready = asyncio.Event()
+        loop.add_reader(control, ready.set)
+        try:
+            await ready.wait()
+        finally:
+            loop.remove_reader(control)
+        _, fds, _, _ = socket.recv_fds(control, 1, len(self.ports))
+        for port, fd in zip(self.ports, fds, strict=False):
+            sock = socket.socket(fileno=fd)
+            sock.setblocking(False)
+
+            def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, port: int = port) -> None:
+                self._accept(port, reader, writer)
+
+            self._servers.append(await asyncio.start_server(accept, sock=sock, limit=_MAX_HEAD_BYTES))
+
+    async def close(self) -> None:
+        for server in self._servers:
+            server.close()
+        for task in list(self._connections):
+            task.cancel()
+        await asyncio.gather(*self._connections, return_exceptions=True)
+
+    def _accept(self, port: int, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._connections) >= MAX_CONNECTIONS:
+            writer.close()
+            return
+        task = asyncio.ensure_future(self._connection(port, reader, writer))
+        self._connections.add(task)
+        task.add_done_callback(self._connections.discard)
+
+    async def _connection(
+        self, port: int, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        try:
+            if port in self._forwards:
+                await _join(reader, writer, self._forwards[port])
+            else:
+                await self._proxy(reader, writer)
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            pass
+        finally:
+            writer.close()
+
+    async def _proxy(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        async with asyncio.timeout(_HEAD_TIMEOUT_S):
+            head = await reader.readuntil(b"\r\n\r\n")
+        words = head.partition(b"\r\n")[0].decode("latin-1").split()
+        if len(words) != 3 or words[0] != "CONNECT":
+            await _refuse(writer, "405 Method Not Allowed", "only CONNECT is served here")
+            return
+        name, _, port = words[1].rpartition(":")
+        wanted = (name.lower(), int(port) if port.isdecimal() and port.isascii() else 0)
+        if wanted not in self._hosts:
+            log.warning("the agent asked for a host that it may not reach", host=words[1][:200])
+            await _refuse(writer, "403 Forbidden", f"{words[1][:200]} is not allowed in this run")
+            return
+        try:
+            await _join(reader, writer, wanted, b"HTTP/1.1 200 Connection established\r\n\r\n")
+        except _UnreachableError as error:
+            await _refuse(writer, "502 Bad Gateway", str(error))
+
+
+class _UnreachableError(OSError):
+    pass
+
+
+async def _refuse(writer: asyncio.StreamWriter, status: str, why: str) -> None:
+    body = f"{why}\n".encode()
+    head = f"HTTP/1.1 {status}\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+    writer.write(head.encode() + body)
+    await writer.drain()
+
+
+async def _join(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, to: Host, greeting: bytes = b""
+) -> None:
+    """Passes bytes both ways until both sides have ended."""
+    try:
+        async with asyncio.timeout(_CONNECT_TIMEOUT_S):
+            there, away = await asyncio.open_connection(*to)
+    except (OSError, TimeoutError) as error:
+        raise _UnreachableError(f"{to[0]}:{to[1]} cannot be reached") from error
+    try:
+        writer.write(greeting)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_copy(reader, away))
+            group.create_task(_copy(there, writer))
+    except* OSError:
+        pass
+    finally:
+        away.close()
+
+
+async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+    while data := await source.read(_CHUNK):
+        target.write(data)
+        await target.drain()
+    with contextlib.suppress(OSError):
+        target.write_eof()

@@ -1,0 +1,36 @@
+"""Child processes of an operator's command that speak the lines of `control.py`, and the end of what they leave behind."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+from evopolicy_common.processes import child_process
+from evopolicy_common.processes.child_process import ChildProcess
+from evopolicy_gateway.operator.child_messages import AnyEvent, Order, event_of, line
+from evopolicy_gateway.run import processes
+
+
+async def end_orphans() -> list[int]:
+    """Ends what has become this process's child by its parent's death; returns what survives, which the kernel holds."""
+    async with child_process.starting():
+        return await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
+
+
+class Child(ChildProcess):
+    """A running child, started with `talks=True`."""
+
+    async def events(self) -> AsyncIterator[AnyEvent]:
+        """What it says, until it ends."""
+        assert self._process.stdout is not None
+        while data := await self._process.stdout.readline():
+            yield event_of(data)
+
+    async def tell(self, order: Order) -> None:
+        """Gives an order; one to a child that is gone is dropped."""
+        stdin = self._process.stdin
+        assert stdin is not None
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            stdin.write(line(order))
+            await stdin.drain()

@@ -1,0 +1,175 @@
+"""The gateway's side of the conversation with the coordinator: typed questions about one run.
+
+Each is asked until it is answered, across restarts of the coordinator, and safe to ask again. Whoever calls decides
+what a refusal means.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import structlog
+
+from evopolicy_common.errors import ConfigError, RefusedError, TransportError
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.gateway import (
+    CloseRun,
+    GatewayReply,
+    OpenRun,
+    Permit,
+    RequestPermit,
+    ResultsPage,
+    ResultsRequest,
+    RunClosed,
+    RunOpened,
+    RunState,
+    StateReply,
+    StateRequest,
+    Submit,
+    SubmitAccepted,
+)
+from evopolicy_common.messages.worker import Message
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.refusals import NOT_NOW
+from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire.transport import Link
+from evopolicy_gateway.http.listener import AgentPlace
+from evopolicy_gateway.submits.journal import Requested
+
+RESULTS_WAIT_S = 10.0
+"""How long the coordinator may hold a question for results."""
+HELD_WAIT_S = 1.0
+"""The same while nothing of the submit runs: what it waits is given back to the agent's clock, which must not run out first."""
+RENEWAL_S = 5.0
+"""How often a permit is asked for again while the agent may be alive: an operator's word may have ended it by mistake."""
+FIRST_PERMIT_WAIT_S = 3.0
+"""A permit that takes longer is shown as waited for."""
+STATE_TIMEOUT_S = 1.0
+
+
+NOT_NOW_PAUSE_S = 0.5
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+def _permit_lost(waits_for: str) -> None:
+    log.warning("the agent's permit has ended; asking for another", waits_for=waits_for)
+
+
+Wanted = TypeVar("Wanted")
+
+
+class CoordinatorClient:
+    """One run, as its gateway talks about it. RefusedError where the coordinator says no, and not just not now."""
+
+    def __init__(self, link: Link, run: str) -> None:
+        self._run = run
+        self._token = link.credentials.token
+        self._requests: Requester[GatewayReply] = Requester(
+            link, partial(keys.gateway_key, link.credentials.cluster, run), codec.gateway_replies
+        )
+
+    async def open(self) -> RunOpened:
+        """All that is fixed for the run, and its state."""
+        message = OpenRun(run=self._run, token=self._token, asks_permit=True)
+        return await self._ask("open", message, RunOpened)
+
+    async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
+        """Returns True once the run's agent may be alive at `place`; `on_wait` is told what that waits for.
+
+        ConfigError where the coordinator knows no permits.
+        """
+        wait_s = FIRST_PERMIT_WAIT_S
+        while True:
+            message = RequestPermit(
+                run=self._run,
+                token=self._token,
+                boot_id=place.boot_id,
+                machine_id=place.machine_id,
+                host=place.host,
+                wait_s=wait_s,
+            )
+            try:
+                permit = await self._ask("permit", message, Permit, wait_s=wait_s)
+            except RefusedError as error:
+                if error.status != "bad_message":
+                    raise
+                raise ConfigError(
+                    "the coordinator is of an older version, which cannot keep hidden episodes from the agent's machine:"
+                    f" update it, or use the version of evopolicy that it is of ({error.message})"
+                ) from error
+            if permit.granted:
+                return True
+            on_wait(permit.waits_for)
+            wait_s = RESULTS_WAIT_S
+
+    async def keep_permit(self, place: AgentPlace) -> None:
+        """Asks for the permit again and again, until cancelled or the run takes no more."""
+        with contextlib.suppress(RefusedError):
+            while True:
+                await asyncio.sleep(RENEWAL_S)
+                await self.permit(place, _permit_lost)
+
+    async def state(self) -> RunState | None:
+        """The run's state now; None when the coordinator does not answer at once."""
+        question = StateRequest(run=self._run, token=self._token)
+        try:
+            async with asyncio.timeout(STATE_TIMEOUT_S):
+                return (await self._requests.once("state", question, StateReply)).state
+        except (TransportError, TimeoutError):
+            return None
+
+    async def upload(self, digest: str, data: bytes) -> None:
+        """Brings a bundle to the coordinator."""
+        await self._requests.upload(self._run, self._token, digest, data)
+
+    async def submit(self, request: Requested) -> SubmitAccepted:
+        """Asks for an evaluation; the same request gives the same answer however often it is sent."""
+        message = Submit(
+            run=self._run,
+            token=self._token,
+            key=request.key,
+            env_instances=request.env_instances,
+            bundle=request.bundle,
+            bundle_error=request.bundle_error,
+        )
+        return await self._ask("submit", message, SubmitAccepted)
+
+    async def results(self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S) -> ResultsPage:
+        """What happened to a submit since `cursor`; comes after `wait_s` seconds at the latest, empty if need be."""
+        question = ResultsRequest(
+            run=self._run,
+            token=self._token,
+            submit_index=submit_index,
+            cursor=cursor,
+            wait_s=wait_s,
+        )
+        return await self._ask("results", question, ResultsPage, wait_s=wait_s)
+
+    async def fetch(self, ref: BlobRef) -> bytes:
+        """The bytes that `ref` names, checked."""
+        return await self._requests.fetch(self._run, self._token, ref)
+
+    async def close(self, reason: str, agent: dict[str, Any]) -> None:
+        """No more submits: to be called when the agent and all its children are gone."""
+        message = CloseRun(run=self._run, token=self._token, reason=reason, agent=agent)
+        await self._ask("close", message, RunClosed)
+
+    async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
+        told = ""
+        while True:
+            try:
+                return await self._requests.until_answered(verb, message, wanted, wait_s=wait_s)
+            except RefusedError as error:
+                if error.status not in NOT_NOW:
+                    raise
+                if error.message != told:
+                    log.warning(
+                        "the coordinator cannot serve this now; asking again", verb=verb, why=error.message
+                    )
+                    told = error.message
+            await asyncio.sleep(NOT_NOW_PAUSE_S)

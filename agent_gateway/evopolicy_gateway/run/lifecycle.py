@@ -1,0 +1,472 @@
+"""One run from its opening to `run.json`, as the operator's process sees it.
+
+Order is what counts here: the run is opened, the coordinator permits the agent to be alive here, the gateway serves, the agent
+starts; the agent and all that it started are gone before the run is closed or cancelled, which ends the permit; only then its
+hidden cases are scored here, and only this process is told. A gateway that dies is
+started again on the same port while the agent goes on; an agent supervisor that dies is started again with its agent. When this
+process itself is killed its children end, and the folder holds all that going on with the run needs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.processes import child_process, host
+from evopolicy_common.processes.notices import Waiting
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.http.listener import TOKEN_VARIABLE, agent_place, said_of_place
+from evopolicy_gateway.jail.jail import JailOrder
+from evopolicy_gateway.operator import child_messages, child_rpc
+from evopolicy_gateway.operator.child_messages import (
+    AgentDoing,
+    AgentEnded,
+    AgentSurvives,
+    AgentTime,
+    AgentTurn,
+    CloseRun,
+    HeldTime,
+    Progress,
+    Ready,
+    RunClosed,
+    StartAgent,
+    Waits,
+)
+from evopolicy_gateway.operator.child_rpc import Child
+from evopolicy_gateway.operator.locks import alone
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.operator.watch import Watch
+from evopolicy_gateway.run import record
+from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, save, saved
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.times import Stopwatch
+from evopolicy_gateway.workspace import staging as workspace
+from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
+
+END_GRACE_S = 15.0
+GIVE_UP_TIMEOUT_S = 10.0
+"""For telling the coordinator that a run is given up, which may be why it is."""
+_QUICK_DEATH_S = 5.0
+_MAX_QUICK_DEATHS = 5
+_MAX_SUPERVISOR_DEATHS = 5
+_USAGE_ERROR = 2
+_SURVIVORS_PAUSE_S = 1.0
+
+
+class RunError(EvopolicyError):
+    """The run could not be played to its end; its folder and the message tell how far it came."""
+
+
+class RunLifecycle:
+    """Plays one plan once."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        operations: Operations,
+        gateway: Credentials,
+        watch: Watch,
+        *,
+        name: str | None = None,
+        stays_open: bool = False,
+        on_agent_gone: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`gateway`: credentials of the gateway role, without a run's capability.
+
+        `name`: how the watch knows the run, its environment otherwise.
+        `stays_open`: when this is cancelled the run is left as it is, to be resumed.
+        `on_agent_gone` is called once the agent's side is over: what is left of the run needs no agent's place.
+        """
+        self._plan = plan
+        self._folder = plan.folder
+        self._operations = operations
+        self._credentials = gateway
+        self._watch = watch
+        self._name = name or plan.settings.env
+        self._stays_open = stays_open
+        self.run = ""
+        """The cluster's id of the run, once it is open."""
+        self._ready: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
+        self._spent = asyncio.Event()
+        self._closed = asyncio.Event()
+        self._cancelled = False
+        """Somebody else has ended the run at the coordinator."""
+        self._on_agent_gone = on_agent_gone
+        self._survivors: list[int] = []
+        """Processes of the agent that could not be ended."""
+        self._submits = child_messages.SubmitsSeen(asked=0, running=False)
+        """As the gateway told it last."""
+        self._held_before = 0.0
+        """`held_s` of the run when the agent supervisor was started."""
+        self._order: CloseRun | None = None
+        self._gateway: Child | None = None
+        self._supervisor: Child | None = None
+        self._stopwatch: Stopwatch
+        """From when it is played: the folder then is new, or holds what earlier commands took."""
+
+    @property
+    def agent_at_work(self) -> bool:
+        """The agent's side is open and nobody has asked to close it."""
+        return self._supervisor is not None and self._order is None and not self._closed.is_set()
+
+    async def play(self) -> RunRecord:
+        """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._play()
+
+    async def go_on(self) -> RunRecord:
+        """What the folder asks for: `play` where nothing was begun, `resume` where it was; a finished run's record."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._go_on()
+
+    async def resume(self) -> RunRecord:
+        """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
+        with alone(self._folder.lock, self._folder.root):
+            return await self._resume()
+
+    async def _play(self) -> RunRecord:
+        plan = self._plan
+        # Checking starts programs to try the jail, which a search for another run's orphans would take for strays.
+        async with child_process.starting():
+            plan.check_held()
+        await self._operations.drop(self._folder)
+        async with child_process.starting():
+            plan.claim()
+        self._folder.state.mkdir(mode=0o700)
+        key = uuid.uuid4().hex
+        save(self._folder.intended, IntendedRun(key=key, settings=plan.settings))
+        if plan.listener is not None:
+            save(self._folder.listener, plan.listener)
+        try:
+            run = await self._open(key)
+        except BaseException:
+            remove_tree(self._folder.root)
+            raise
+        return await self._played(run, agents_side=True)
+
+    async def _open(self, key: str) -> str:
+        created = await self._operations.create(self._plan.settings, key)
+        found = msgspec.structs.replace(self._credentials, token=created.capability)
+        credentials.write(found, self._folder.credentials)
+        save(self._folder.opened, OpenedRun(run=created.run))
+        self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
+        return created.run
+
+    async def _go_on(self) -> RunRecord:
+        folder = self._folder
+        if folder.run_json.exists():
+            # Killed between the two, the command has left the gateway's folder.
+            remove_tree(folder.state)
+            return decode_run_record(folder.run_json.read_bytes())
+        intended = self._plan.intended()
+        if intended is None:
+            return await self._play()
+        if not folder.opened.exists():
+            return await self._played(await self._open(intended.key), agents_side=True)
+        return await self._resume()
+
+    async def _resume(self) -> RunRecord:
+        run = saved(self._folder.opened, OpenedRun).run
+        capability = credentials.read(self._folder.credentials).token
+        found = msgspec.structs.replace(self._credentials, token=capability)
+        credentials.write(found, self._folder.credentials)
+        phase = await self._operations.phase(run)
+        if phase is None:
+            raise ConfigError(f"the cluster does not know run {run} of {self._folder.root} any more")
+        self._watch.note(self._name, f"goes on with run {run} in {self._folder.root}")
+        return await self._played(run, agents_side=phase == "open")
+
+    async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
+        self.run = run
+        self._operations.watched_by(run, (self._folder.lock, self._folder.supervisor_lock))
+        plan = self._plan
+        self._stopwatch = Stopwatch(self._folder.times)
+        try:
+            if agents_side:
+                await self._agents_side()
+            if self._cancelled:
+                await self._tell_gone(run)
+            self._on_agent_gone()
+            finished = await self._finish(run)
+        except BaseException as error:
+            if self._survivors:
+                self._tell_survivors()
+                how = f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {run}"
+                self._watch.note(self._name, how)
+            elif self._stays_open and isinstance(error, asyncio.CancelledError):
+                await self._tell_gone(run)
+            else:
+                await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
+            raise
+        return await record.write(self._folder, plan, finished, self._operations, self._stopwatch.times)
+
+    async def _agents_side(self) -> None:
+        """Until the run is closed."""
+        serving = asyncio.create_task(self._keep_gateway())
+        following = asyncio.create_task(self._follow())
+        keeping: asyncio.Task[AgentEnded] | None = None
+        try:
+            up: list[asyncio.Future[Any]] = [serving, self._ready]
+            await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
+            if serving.done():
+                serving.result()
+            if not self._ready.done():
+                return  # cancelled before it was served
+            self._stopwatch.opened()
+            keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
+            spent = asyncio.create_task(self._spent.wait())
+            going: list[asyncio.Future[Any]] = [serving, keeping, spent]
+            await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
+            spent.cancel()
+            if not serving.done() and not keeping.done():
+                await asyncio.wait(
+                    [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
+                )
+            if serving.done() and not self._closed.is_set():
+                serving.result()
+            if self._supervisor is not None and not keeping.done():
+                await self._supervisor.tell(child_messages.StopAgent())
+            ended = await keeping
+            await self._close(ended)
+            await serving
+        finally:
+            tasks = [task for task in (serving, following, keeping) if task is not None]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            for child in (self._supervisor, self._gateway):
+                if child is not None:
+                    await child.end(END_GRACE_S)
+            self._survivors = await child_rpc.end_orphans()
+            self._stopwatch.closed()
+
+    async def _close(self, ended: AgentEnded) -> None:
+        reason = "budget_spent" if self._spent.is_set() else ended.reason
+        reason = CANCELLED if self._cancelled else reason
+        how = f"agent ended: {reason.replace('_', ' ')}"
+        self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
+        if reason == "agent_failed":
+            for line in ended.said or ("nothing",):
+                self._watch.note(self._name, f"stderr: {line}")
+            self._watch.note(self._name, f"its whole log: {self._folder.agent_log}")
+        about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
+        self._order = CloseRun(reason=reason, agent=about)
+        if self._gateway is not None:
+            await self._gateway.tell(self._order)
+
+    async def _follow(self) -> None:
+        """Says what a run waits for that is not served yet; has the agent ended when the run is cancelled at the
+        coordinator, which its gateway may not hear of."""
+        waiting = Waiting()
+        async for progress in self._operations.wait(self.run):
+            if not self._ready.done() and waiting.worth_saying(progress.waits_for):
+                self._watch.note(self._name, f"waiting for {progress.waits_for}")
+            finished = progress.finished
+            if finished is not None and finished.status == CANCELLED:
+                self._cancelled = True
+                self._spent.set()
+
+    async def _keep_gateway(self) -> None:
+        """Runs the gateway, again when it dies, until it has closed the run."""
+        program = [
+            sys.executable,
+            "-P",
+            "-m",
+            "evopolicy_gateway.cli.serve",
+            str(self._folder.root),
+            "--controlled",
+        ]
+        quick_deaths = 0
+        while not self._closed.is_set():
+            started = time.monotonic()
+            self._stopwatch.gateway_begins()
+            self._gateway = await Child.start(program, self._folder.harness_log, talks=True)
+            async for event in self._gateway.events():
+                await self._on_gateway_event(event)
+            code = await self._gateway.ended()
+            if self._closed.is_set():
+                return
+            quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
+            if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
+                raise RunError(
+                    f"the gateway cannot serve (exit status {code}): {child_process.last_words(self._gateway.log)};"
+                    f" see {self._folder.harness_log}"
+                )
+            self._watch.note(self._name, f"the gateway ended with status {code}; starting it again")
+            await asyncio.sleep(0.1 * 2**quick_deaths)
+
+    async def _on_gateway_event(self, event: object) -> None:
+        if isinstance(event, Waits):
+            self._watch.held(self._name, event.waits_for)
+        elif isinstance(event, Ready):
+            self._stopwatch.permit_told(event.permit_s)
+            self._stopwatch.held_told(event.held_s)
+            if not self._ready.done():
+                for text in event.notes:
+                    self._watch.note(self._name, text)
+                self._tell_where(event)
+                self._ready.set_result(event)
+            if self._order is not None and self._gateway is not None:
+                await self._gateway.tell(self._order)
+        elif isinstance(event, Progress):
+            self._stopwatch.gateway_told(event.in_flight_s, event.feedback_s)
+            self._watch.progress(self._name, event)
+            await self._give_back(event.held_s)
+            await self._tell_submits(event)
+            self._cancelled = self._cancelled or event.cancelled
+            if event.spent:
+                self._spent.set()
+        elif isinstance(event, RunClosed):
+            self._closed.set()
+
+    async def _give_back(self, held_s: float) -> None:
+        """What the agent's submits waited for hidden episodes is given back to its clock."""
+        before, held = self._stopwatch.times.held_s, self._stopwatch.held_told(held_s)
+        if held > before and self._supervisor is not None:
+            await self._supervisor.tell(HeldTime(seconds=held - self._held_before))
+
+    async def _tell_submits(self, progress: Progress) -> None:
+        asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
+        self._submits = child_messages.SubmitsSeen(asked=asked, running=running)
+        if self._supervisor is not None:
+            await self._supervisor.tell(self._submits)
+
+    def _tell_where(self, ready: Ready) -> None:
+        """What the operator hands to a remote agent."""
+        if self._plan.listener is None:
+            if not host.boot_id():
+                why = f"{host.NO_BOOT_ID}; until then no hidden case that this run shares is played while its agent lives"
+                self._watch.note(self._name, why)
+            return
+        for text in (
+            said_of_place(self._plan.settings.agent_host, self._folder.root),
+            f"the agent is served at {ready.variables['EVOPOLICYGYM_SUBMIT_URL']}",
+            f"its bearer token is in {self._folder.bearer}; it finds it in {TOKEN_VARIABLE}",
+            f"its workspace is {self._folder.workspace}; the rules are in AGENTS.md there",
+            f"when it is done before its budget is spent: evopolicy finish {self._folder.root}",
+        ):
+            self._watch.note(self._name, text)
+
+    def _jail(self) -> JailOrder | None:
+        if self._plan.jail.mode == "none":
+            return None
+        sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
+        states = [str(Path(path).parent.resolve()) for kind, _, path in sockets if kind == "unixsock-stream"]
+        if self._credentials.tls is not None:
+            states.append(str(Path(self._credentials.tls.private_key).parent))
+        hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]
+        return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
+
+    async def _keep_agent(self, ready: Ready) -> AgentEnded:
+        """Plays the agent to its end, beginning again when its agent supervisor dies: that is our failure, and not the agent's.
+
+        An agent with a session goes on in it; any other program is started anew in its workspace.
+        """
+        for _ in range(_MAX_SUPERVISOR_DEATHS):
+            ended = await self._keep_agent_once(ready)
+            if ended is not None:
+                return ended
+            if self._spent.is_set():
+                break
+            self._watch.note(
+                self._name, "the agent's supervisor died; starting it again, and the agent with it"
+            )
+        plan = self._plan
+        known = harnesses.make(plan.agent, plan.started_in, plan.config).known()
+        return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
+
+    async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
+        """How the agent ended; None when its agent supervisor died."""
+        self._stopwatch.agent_begins()
+        self._held_before = self._stopwatch.times.held_s
+        left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
+        program = [sys.executable, "-P", "-m", "evopolicy_gateway.agent_supervisor.supervisor"]
+        self._supervisor = await Child.start(program, self._folder.harness_log, talks=True)
+        await self._supervisor.tell(
+            StartAgent(
+                agent=self._plan.agent,
+                workspace=str(self._folder.workspace),
+                agent_log=str(self._folder.agent_log),
+                urls=ready.variables,
+                variables=workspace.variables(self._folder),
+                started_in=str(self._plan.started_in),
+                wall_limit_s=left_s,
+                silence_s=self._plan.silence_s,
+                config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
+                session_file=str(self._folder.session),
+                lock=str(self._folder.supervisor_lock),
+                jail=self._jail(),
+            )
+        )
+        await self._supervisor.tell(self._submits)
+        ended: AgentEnded | None = None
+        async for event in self._supervisor.events():
+            if isinstance(event, AgentTurn):
+                self._watch.turn(self._name, event.turn, event.text)
+            elif isinstance(event, AgentDoing):
+                self._watch.doing(self._name, event)
+            elif isinstance(event, AgentTime):
+                self._stopwatch.agent_told(event.used_s)
+            elif isinstance(event, AgentSurvives):
+                self._survivors = list(event.pids)
+                self._tell_survivors()
+            elif isinstance(event, AgentEnded):
+                ended = event
+        await self._supervisor.ended()
+        # What an agent supervisor that died has left behind has become ours.
+        while left := await child_rpc.end_orphans():
+            if left != self._survivors:
+                self._survivors = left
+                self._tell_survivors()
+            await asyncio.sleep(_SURVIVORS_PAUSE_S)
+        self._survivors = []
+        return ended
+
+    def _tell_survivors(self) -> None:
+        pids = ", ".join(map(str, self._survivors))
+        self._watch.note(
+            self._name,
+            f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case that it shares is"
+            " played on this machine, before they are gone",
+        )
+
+    async def _finish(self, run: str) -> RunFinished:
+        async for progress in self._operations.wait(run):
+            self._watch.phase(self._name, progress)
+            if progress.finished is not None:
+                return progress.finished
+        raise AssertionError("waiting ends with the finished run")
+
+    async def _tell_gone(self, run: str) -> None:
+        """Tells the coordinator that the agent of a run that was not closed is gone; it needs another permit to go on."""
+        if self._plan.listener is not None:
+            return  # nobody here knows
+        with contextlib.suppress(EvopolicyError, TimeoutError):
+            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
+                # From here alone: the run may have been resumed elsewhere by the time that this arrives.
+                await self._operations.agent_gone(run, agent_place(self._folder).boot_id)
+
+    async def _give_up(self, run: str, why: str | None) -> None:
+        """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""
+        with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
+            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
+                await self._operations.cancel(run)
+                await self._tell_gone(run)
+                finished = await self._finish(run)
+                times = self._stopwatch.times
+                await record.write(self._folder, self._plan, finished, self._operations, times, why)

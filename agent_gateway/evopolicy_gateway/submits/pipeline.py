@@ -1,0 +1,525 @@
+"""The submit pipeline: one submit at a time, from a request's bytes to committed feedback, whatever dies on the way.
+
+Rules:
+- a request is checked before anything is read from `system/`; what breaks the format or the bounds costs nothing;
+- what passed is in the journal before it is sent, and is asked for again by its key after a restart;
+- a submit goes on when nobody waits for it any more; its answer is kept;
+- what cannot be explained ends the gateway process: the next one goes on from the journal.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from evopolicy_common.errors import ProtocolError, RefusedError, RequestError, StorageError
+from evopolicy_common.messages.gateway import (
+    CANCELLED,
+    EpisodeFeedback,
+    ResultsPage,
+    RunOpened,
+    RunState,
+    SubmitAccepted,
+    SubmitDone,
+)
+from evopolicy_common.records.blobs import BlobStore, digest_of
+from evopolicy_common.wire.refusals import RUN_OVER, Refusal
+from evopolicy_gateway.http.submit_request import Bounds, parse
+from evopolicy_gateway.run.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
+from evopolicy_gateway.submits import formatting, snapshots
+from evopolicy_gateway.submits.episode_files import episode_files, set_aside_files
+from evopolicy_gateway.submits.feedback import SubmitTree
+from evopolicy_gateway.submits.formatting import EpisodeScore
+from evopolicy_gateway.submits.journal import (
+    Accepted,
+    AnyEntry,
+    Closed,
+    Died,
+    Journal,
+    Refused,
+    Rejected,
+    Requested,
+    SetAside,
+    Settled,
+)
+from evopolicy_gateway.submits.tickets import ConflictError, Ticket
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+LINGER_S = 0.02
+LINGER_EPISODES = 8
+"""With at least so many to come, the next results are asked for a little later: of short episodes several come at once."""
+DISK_PAUSE_S = 2.0
+"""Between tries to write feedback while the disk refuses."""
+MAX_REJECTED_KEPT = 1000
+FETCHES_AT_ONCE = 4
+RUN_CLOSED = "run_closed"
+"""What the published protocol calls a submit's refusal after the last one."""
+MAX_DEATHS = 2
+"""So often a gateway may end over one submit, or over the files of one episode, before that is put aside."""
+_REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
+
+
+class SubmitPipeline:
+    """Takes submits for one run. Lives on one event loop."""
+
+    def __init__(
+        self,
+        client: CoordinatorClient,
+        run: RunOpened,
+        workspace: Path,
+        journal: Journal,
+        blobs: BlobStore,
+        on_change: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        """`on_change` is called whenever something that a watcher shows has changed; `clock` is Unix time."""
+        self.run = run
+        self.state: RunState = run.state
+        """As far as this gateway knows; `refresh` asks."""
+        self.closed = run.state.is_finalized
+        self.cancelled = run.state.cancelled
+        """The operator has ended the run."""
+        self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Fails with what this process cannot go on from."""
+        self.in_flight: Ticket | None = None
+        self.tickets: list[Ticket] = []
+        """Accepted submits by index, then perhaps one that is not yet."""
+        self.n_rejected = 0
+        self.in_flight_s = 0.0
+        """Seconds in which a submit was in flight, of this process."""
+        self.held_s = run.state.held_s
+        """Seconds for which submits of the run have waited because hidden episodes had the machines."""
+        self.feedback_s = 0.0
+        """Of these, from the last result's arrival to the committed feedback."""
+        self._client = client
+        self._workspace = workspace
+        self._journal = journal
+        self._blobs = blobs
+        self._on_change = on_change
+        self._clock = clock
+        self._task: asyncio.Task[None] | None = None
+        self._journal_lock = asyncio.Lock()
+        self._deaths: Counter[tuple[str, int | None]] = Counter()
+        """Gateways that ended over an episode of a submit, or (None) over the submit as a whole."""
+        self._write_down_deaths()
+        self._recover()
+
+    @property
+    def spent(self) -> bool:
+        """Whether no further submit can be taken, and none runs."""
+        too_little = self.state.remaining_budget < max(1, self.run.min_episodes_per_submit)
+        return self.in_flight is None and (too_little or self.closed)
+
+    @property
+    def last_warning(self) -> str | None:
+        """How the policy failed in the last submit that was answered; None when it did not."""
+        answered = (ticket for ticket in reversed(self.tickets) if ticket.status is not None)
+        last = next(answered, None)
+        return None if last is None else last.warning
+
+    def bounds(self) -> Bounds:
+        """What a submit may ask for now."""
+        return Bounds(
+            n_env_instances=self.run.n_env_instances,
+            min_episodes=self.run.min_episodes_per_submit,
+            max_episodes=self.run.max_episodes_per_submit,
+            remaining_budget=self.state.remaining_budget,
+        )
+
+    async def submit(self, body: bytes, client_key: str | None) -> Ticket:
+        """Takes a request, or finds the one that it repeats.
+
+        Raises RequestError (refused, nothing charged) and ConflictError (another submit runs, or the key was used for
+        another body).
+        """
+        body_digest = digest_of(body)
+        if client_key is not None:
+            for ticket in self.tickets:
+                if ticket.request.client_key == client_key:
+                    if ticket.request.body_digest != body_digest:
+                        raise ConflictError(
+                            ticket.index,
+                            f"this Idempotency-Key was used for {ticket.submit_id} with another body; use a new key",
+                        )
+                    return ticket
+        try:
+            if self.in_flight is not None:
+                raise ConflictError(
+                    self.in_flight.index,
+                    f"{self.in_flight.submit_id} is running; wait for it, or ask GET /submit/{self.in_flight.index}",
+                )
+            if self.spent:
+                raise self._refusal()
+            env_instances = parse(body, self.bounds())
+        except RequestError as error:
+            await self.note_rejected(error)
+            raise
+        ticket = Ticket(
+            Requested(
+                key=uuid.uuid4().hex,
+                client_key=client_key,
+                body_digest=body_digest,
+                env_instances=env_instances,
+                bundle=None,
+                bundle_error=None,
+            ),
+            len(self.tickets),
+            self.run.episode_budget,
+        )
+        # No await between the check above and this: two requests cannot both pass.
+        self._start(ticket, fresh=True)
+        return ticket
+
+    def find(self, name: str) -> Ticket | None:
+        """The submit of that index or folder name."""
+        return next(
+            (ticket for ticket in self.tickets if name in (str(ticket.index), ticket.submit_id)), None
+        )
+
+    async def note_rejected(self, error: RequestError) -> None:
+        """Keeps a refused request for `run.json`."""
+        self.n_rejected += 1
+        if self.n_rejected <= MAX_REJECTED_KEPT:
+            await self._note(
+                Rejected(
+                    status=error.status,
+                    message=error.message,
+                    at=self._clock(),
+                    after_submits=self.state.n_submits,
+                )
+            )
+
+    async def refresh(self) -> RunState:
+        """The state as the coordinator sees it, or as last known when it does not answer at once."""
+        try:
+            state = await self._client.state()
+        except RefusedError as error:
+            self._refused(error)
+            state = None
+        # While a submit is on its way, an answer may be older than what its acceptance told.
+        if state is not None and state.n_submits >= self.state.n_submits:
+            self.state = state
+            self.held_s = max(self.held_s, state.held_s)
+            self._close(state.is_finalized, state.cancelled)
+        return self.state
+
+    async def idle(self) -> None:
+        """Returns when no submit runs."""
+        while self._task is not None and not self._task.done():
+            await asyncio.wait([self._task])
+
+    async def stop(self) -> None:
+        """Leaves the submit in flight to the next gateway."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    def _write_down_deaths(self) -> None:
+        """Puts into the journal what the last process was killed over."""
+        left = self._journal.at_work
+        for key in dict.fromkeys(key for key, _ in left.died_over):
+            episodes = tuple(index for of, index in left.died_over if of == key)
+            log.warning("the last gateway ended over the files of an episode", submit=key, episodes=episodes)
+            died = Died(key=key, episodes=episodes)
+            self._journal.append(died)
+            self._count_deaths(died)
+        left.clear()
+
+    def _count_deaths(self, died: Died) -> None:
+        self._deaths.update((died.key, index) for index in died.episodes or (None,))
+
+    def _recover(self) -> None:
+        """Rebuilds the tickets from the journal and goes on with the one that has no end."""
+        by_key: dict[str, Ticket] = {}
+        for place, entry in zip(self._journal.places, self._journal.entries, strict=True):
+            if isinstance(entry, Requested):
+                by_key[entry.key] = ticket = Ticket(entry, len(self.tickets), self.run.episode_budget)
+                self.tickets.append(ticket)
+            elif isinstance(entry, Accepted):
+                by_key[entry.key].accept(entry)
+            elif isinstance(entry, Settled):
+                by_key[entry.key].settle(entry.status, entry.summary.encode(), self._summary_at(place))
+            elif isinstance(entry, Refused):
+                self.tickets.remove(by_key.pop(entry.key))
+            elif isinstance(entry, Rejected):
+                self.n_rejected += 1
+            elif isinstance(entry, Died):
+                self._count_deaths(entry)
+            elif isinstance(entry, SetAside):
+                ticket = by_key[entry.key]
+                ticket.fail(RequestError("gateway_failed", entry.message))
+                if ticket.accepted is None:
+                    self.tickets.remove(ticket)
+            elif isinstance(entry, Closed):
+                self.closed = True
+        self._journal.forget()
+        for ticket in list(self.tickets):
+            if not ticket.done.is_set():
+                self.tickets.remove(ticket)
+                self._start(ticket, fresh=False)
+
+    def _start(self, ticket: Ticket, *, fresh: bool) -> None:
+        self.in_flight = ticket
+        self.tickets.append(ticket)
+        self._task = asyncio.create_task(self._carry_out(ticket, fresh=fresh), name=ticket.submit_id)
+        self._on_change()
+
+    async def _carry_out(self, ticket: Ticket, *, fresh: bool) -> None:
+        started = time.monotonic()
+        try:
+            if fresh:
+                await self._snapshot(ticket)
+            await self._send(ticket)
+            await self._collect(ticket)
+        except RequestError as error:
+            self.tickets.remove(ticket)
+            ticket.fail(error)
+        except RefusedError as error:
+            if error.status in RUN_OVER:
+                self._refused(error)
+                ticket.fail(self._refusal(RUN_CLOSED if ticket.accepted is None else "closed"))
+            elif not await self._goes_on_without(ticket, error):
+                return
+        except Exception as error:
+            if not await self._goes_on_without(ticket, error):
+                return
+        self.in_flight_s += time.monotonic() - started
+        self.in_flight = None
+        self._on_change()
+
+    async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
+        """Whether the submit is put aside. The first time this gateway ends over it instead, for the next one to try."""
+        key = ticket.request.key
+        log.error("submit failed", submit=ticket.submit_id, exc_info=error)
+        self._deaths[key, None] += 1
+        await self._note(Died(key=key))
+        if self._deaths[key, None] < MAX_DEATHS:
+            if not self.fatal.done():
+                self.fatal.set_exception(error)
+            return False
+        charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
+        message = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
+        await self._note(SetAside(key=key, message=message))
+        if ticket.accepted is None:
+            self.tickets.remove(ticket)
+        ticket.fail(RequestError("gateway_failed", message))
+        return True
+
+    async def _snapshot(self, ticket: Ticket) -> None:
+        """Takes the bundle as it is now, and writes the request down."""
+        while True:
+            try:
+                taken = await asyncio.to_thread(snapshots.take, self._workspace / "system", self._blobs)
+                break
+            except StorageError as error:
+                log.error("cannot store the snapshot; trying again", error=str(error))
+                await asyncio.sleep(DISK_PAUSE_S)
+        ticket.attach(taken)
+        await self._note(ticket.request)
+
+    async def _send(self, ticket: Ticket) -> None:
+        """Uploads the bundle and has the submit accepted."""
+        request = ticket.request
+        if ticket.accepted is not None:
+            self._charged(ticket.accepted)
+            return
+        try:
+            reply = await self._upload_and_submit(request)
+        except RefusedError as error:
+            if error.status in RUN_OVER or error.status in _REQUEST_STATUSES:
+                await self._note(Refused(key=request.key, status=error.status, message=error.message))
+            if error.status in RUN_OVER:
+                self.tickets.remove(ticket)
+            if error.status in _REQUEST_STATUSES:
+                raise RequestError(error.status, error.message) from error
+            raise
+        accepted = Accepted(
+            key=request.key,
+            submit_index=reply.submit_index,
+            first_global_episode=reply.first_global_episode,
+            remaining_budget=reply.remaining_budget,
+        )
+        await self._note(accepted)
+        self._charged(accepted)
+        ticket.accept(accepted)
+        log.info("submit accepted", submit=ticket.submit_id, n_episodes=len(request.env_instances))
+        self._on_change()
+
+    async def _upload_and_submit(self, request: Requested) -> SubmitAccepted:
+        while True:
+            if request.bundle is not None:
+                data = await asyncio.to_thread(self._blobs.read, request.bundle)
+                await self._client.upload(request.bundle, data)
+            try:
+                return await self._client.submit(request)
+            except RefusedError as error:
+                if error.status != Refusal.MISSING_BUNDLE:
+                    raise
+                log.warning("the coordinator has lost the bundle; sending it again", bundle=request.bundle)
+            await asyncio.sleep(DISK_PAUSE_S)
+
+    def _charged(self, accepted: Accepted) -> None:
+        self.state = RunState(
+            remaining_budget=accepted.remaining_budget,
+            n_submits=accepted.submit_index + 1,
+            is_finalized=self.state.is_finalized,
+        )
+
+    async def _collect(self, ticket: Ticket) -> None:
+        """Writes the feedback tree from the results, again from the start when the disk refused."""
+        while True:
+            try:
+                status, summary = await self._write_feedback(ticket)
+                break
+            except (OSError, StorageError) as error:
+                # Not the error itself, which names paths: an agent reads this.
+                why = error.strerror if isinstance(error, OSError) else None
+                ticket.waits_for = f"the gateway cannot write feedback: {why or 'its disk refuses'}"
+                log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
+                self._on_change()
+                await asyncio.sleep(DISK_PAUSE_S)
+        place = await self._note(Settled(key=ticket.request.key, status=status, summary=summary.decode()))
+        ticket.settle(status, summary, self._summary_at(place))
+        log.info("submit committed", submit=ticket.submit_id, status=status)
+
+    async def _write_feedback(self, ticket: Ticket) -> tuple[str, bytes]:
+        """Status and summary of the committed folder."""
+        assert ticket.accepted is not None
+        index, first = ticket.accepted.submit_index, ticket.accepted.first_global_episode
+        tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
+        await asyncio.to_thread(tree.begin)
+        scores: dict[int, EpisodeScore] = {}
+        cursor, held_before = 0, self.held_s
+        done: SubmitDone | None = None
+        while done is None:
+            page = await self._client.results(
+                index, cursor, HELD_WAIT_S if ticket.waits_for else RESULTS_WAIT_S
+            )
+            cursor, done = page.cursor, page.done
+            await self._write_page(tree, ticket.request.key, page, first, scores)
+            self.held_s = max(self.held_s, page.held_s)
+            ticket.n_done, ticket.waits_for = len(scores), page.waits_for
+            ticket.held_s = self.held_s - held_before
+            self._on_change()
+            if done is None and len(ticket.request.env_instances) - len(scores) >= LINGER_EPISODES:
+                await asyncio.sleep(LINGER_S)
+        last_result = time.monotonic()
+        committed = await asyncio.to_thread(self._commit, tree, index, done, scores)
+        if done.status == CANCELLED:
+            self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
+            self._close(True, True)
+        self.feedback_s += time.monotonic() - last_result
+        return committed
+
+    async def _write_page(
+        self, tree: SubmitTree, key: str, page: ResultsPage, first: int, scores: dict[int, EpisodeScore]
+    ) -> None:
+        gate = asyncio.Semaphore(FETCHES_AT_ONCE)
+        wanted = [episode for episode in page.episodes if episode.index not in scores]
+        # What a gateway has ended over is written alone, so that no other episode is blamed for it.
+        suspects = [episode for episode in wanted if self._deaths[key, episode.index]]
+
+        async def write(episode: EpisodeFeedback) -> None:
+            async with gate:
+                files = await self._files_of(key, episode)
+                name = formatting.episode_name(first + episode.index, self.run.episode_budget)
+                await asyncio.to_thread(tree.put_episode, name, files)
+                scores[episode.index] = EpisodeScore(
+                    index=episode.index,
+                    episode_return=episode.episode_return,
+                    length=episode.length,
+                    failure=episode.failure,
+                    reward_components=episode.reward_components,
+                )
+
+        # All have ended before an error is raised: nothing may write on into a tree that is begun again.
+        writes = [write(episode) for episode in wanted if episode not in suspects]
+        for outcome in await asyncio.gather(*writes, return_exceptions=True):
+            if isinstance(outcome, BaseException):
+                raise outcome
+        for episode in suspects:
+            await write(episode)
+
+    async def _files_of(self, key: str, episode: EpisodeFeedback) -> dict[str, bytes]:
+        """An episode's files; without its trajectory where that cannot be had, or a gateway has ended over it before."""
+        why = f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
+        if self._deaths[key, episode.index] < MAX_DEATHS:
+            try:
+                trajectory = await self._client.fetch(episode.trajectory)
+                video = None if episode.video is None else await self._client.fetch(episode.video)
+                storage, at = self.run.env.obs_storage, self._clock()
+                with self._journal.at_work.on(key, episode.index):
+                    return await asyncio.to_thread(episode_files, episode, trajectory, video, storage, at=at)
+            except RefusedError as error:
+                if error.status != Refusal.UNKNOWN_BLOB:
+                    raise
+                why = "this episode's trajectory or video is not stored any more"
+            except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
+                log.error(
+                    "an episode's files cannot be made", submit=key, index=episode.index, exc_info=error
+                )
+                why = "this episode's trajectory cannot be written"
+        log.error("episode put aside", submit=key, index=episode.index, why=why)
+        return set_aside_files(episode, why, at=self._clock())
+
+    def _commit(
+        self, tree: SubmitTree, index: int, done: SubmitDone, scores: dict[int, EpisodeScore]
+    ) -> tuple[str, bytes]:
+        errors = None
+        if done.status != "ok":
+            errors = formatting.verdict_line(done.status, done.failure, done.completed_at)
+            for late in [i for i in scores if i >= done.n_kept]:
+                tree.drop_episode(
+                    formatting.episode_name(done.first_global_episode + late, self.run.episode_budget)
+                )
+        summary = formatting.summary_bytes(
+            self.run.env.env, index, done, list(scores.values()), self.run.observations
+        )
+        tree.commit(summary, errors)
+        return done.status, summary
+
+    def _refused(self, error: RefusedError) -> None:
+        if not self.closed:
+            log.warning("the coordinator takes no more of this run", status=error.status, why=error.message)
+        self._close(True, error.status == Refusal.RUN_CANCELLED)
+
+    def _close(self, closed: bool, cancelled: bool) -> None:
+        """Takes no more submits from now on, if `closed`; `cancelled`: because the operator has ended the run."""
+        if closed and not (self.closed and (self.cancelled or not cancelled)):
+            self.closed, self.cancelled = True, self.cancelled or cancelled
+            self._on_change()
+
+    def _refusal(self, status: str = RUN_CLOSED) -> RequestError:
+        """What a submit is answered once no more are taken."""
+        if self.cancelled:
+            return RequestError(CANCELLED, "the operator cancelled the run: no more submits are taken")
+        why = "the run is closed" if self.closed else "the episode budget is spent"
+        return RequestError(status, f"{why}: no more submits are taken")
+
+    def _summary_at(self, place: int) -> Callable[[], bytes]:
+        """Reads the summary that was written down there; not from the feedback, which is the agent's to lose."""
+
+        def load() -> bytes:
+            entry = self._journal.read(place)
+            assert isinstance(entry, Settled)
+            return entry.summary.encode()
+
+        return load
+
+    async def _note(self, entry: AnyEntry) -> int:
+        """Appends to the journal off the event loop, in order, and returns the place; waits while the disk refuses."""
+        async with self._journal_lock:
+            while True:
+                try:
+                    return await asyncio.to_thread(self._journal.append, entry)
+                except StorageError as error:
+                    log.error("cannot write the journal; trying again", error=str(error))
+                await asyncio.sleep(DISK_PAUSE_S)

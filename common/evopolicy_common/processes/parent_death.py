@@ -1,0 +1,47 @@
+"""Starts a program that ends when its parent does: `python -I -S parent_death.py PARENT_PID SIGNAL PROGRAM…`.
+
+Sets the parent-death signal, which survives exec, and becomes the program. A program of its own because code between fork
+and exec is not safe in a process with threads or a Zenoh session.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+_PR_SET_PDEATHSIG = 1
+
+
+def ending_with_parent(program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM) -> list[str]:
+    """The arguments that start `program` so that it ends with this process.
+
+    The child must be started from this process's main thread: the kernel means the parent's thread.
+    """
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(death_signal)), *program]
+
+
+def end_with_parent(death_signal: signal.Signals) -> None:
+    """The kernel sends this process `death_signal` when the thread that started it ends; also after an exec."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, death_signal, 0, 0, 0)
+
+
+def main(arguments: list[str]) -> None:
+    """Becomes the program; exit code 1 when the parent is gone already, 127 when there is no such program."""
+    parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
+    end_with_parent(death_signal)
+    if os.getppid() != parent:
+        # It died before we asked to be told.
+        print(f"not starting {program[0]}: process {parent}, which wanted it, is gone", file=sys.stderr)
+        raise SystemExit(1)
+    try:
+        os.execvp(program[0], program)
+    except OSError as error:
+        print(f"cannot start {program[0]}: {error.strerror}", file=sys.stderr)
+        raise SystemExit(127) from None
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,102 @@
+"""`evopolicy gc` and `evopolicy disk`: commands on a coordinator's state folder, running or not.
+
+Exit codes: 0 all well, 1 what is planned does not fit or the disk refused, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common import catalogue
+from evopolicy_common.cli import bytes_text, fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.terminal import say, say_json
+from evopolicy_common.wire.credentials import default_state_dir
+from evopolicy_coordinator.storage import disk_use
+
+gc_app = App(name="gc", help="Remove what finished runs left.")
+disk_app = App(
+    name="disk",
+    help="What a state folder holds and a sweep will need.",
+)
+
+StateOption = Annotated[
+    Path | None,
+    typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+DAY_S = 24 * 3600.0
+
+
+@gc_app.command(epilog="Example: evopolicy gc --state /var/lib/evopolicy --older-than 7 --dry-run")
+def collect(
+    state: StateOption = None,
+    older_than: Annotated[
+        float, typer.Option(min=0.0, help="Days since a run finished, before its episodes go.")
+    ] = 7.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go, remove nothing.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Removes the episodes and bundles of runs that finished long ago, and blobs that nothing names.
+
+    Run directories are not touched, and a run's outcome stays known. Safe beside a running coordinator.
+    """
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        if root.is_dir() and not dry_run:
+            check_writable(root, "--state", may_be_full=True)
+        done = disk_use.collect(root, older_than * DAY_S, dry_run=dry_run)
+    if as_json:
+        say_json(done, indent=False)
+        return
+    verb = "would remove" if dry_run else "removed"
+    say(
+        f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,} blobs:"
+        f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
+    )
+    if not dry_run and not done.shrunk:
+        say("a coordinator is running: the database keeps its size, and what comes next uses the space")
+
+
+@disk_app.command(epilog="Example: evopolicy disk --env core16 --budget 128 --runs 5")
+def disk(
+    state: StateOption = None,
+    env: Annotated[
+        list[str] | None, typer.Option(help="Planned: suite, suite id or glob; may be repeated.")
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option(min=1, help="Planned: train episodes of a run; default: the suite's.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="Planned: runs on each environment.")] = 1,
+    as_json: Json = False,
+) -> None:
+    """What the stored runs take by environment, and whether a planned sweep fits; its run directories come on top."""
+    with fail_on_our_errors():
+        root = state or default_state_dir()
+        used = disk_use.use(root)
+        planned = {
+            env_id: runs * (budget or catalogue.suite_of(env_id).budget)
+            for env_id in catalogue.resolve(env or [])
+        }
+        needed = disk_use.estimate(root, planned) if planned else None
+        directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
+    if as_json:
+        say_json({"environments": used, "planned": needed, "run_directories": directories}, indent=False)
+    else:
+        for each in used:
+            say(
+                f"{each.env:<32}{each.runs:>5} runs{each.train_episodes:>9,} episodes{bytes_text(each.bytes):>12}"
+                f"{bytes_text(each.bytes_per_episode):>12} an episode"
+            )
+        if needed is not None:
+            guessed = f"; guessed for want of runs: {', '.join(needed.guessed)}" if needed.guessed else ""
+            say(
+                f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{guessed}"
+            )
+            say(f"their run directories, wherever they are: at most {bytes_text(directories)}")
+    if needed is not None and not needed.fits:
+        raise typer.Exit(1)

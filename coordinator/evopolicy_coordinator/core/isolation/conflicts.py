@@ -1,0 +1,212 @@
+"""What keeps hidden jobs, train jobs and agents from a kernel.
+
+Rules that this module owns:
+- A hidden job is leased on a known kernel only, and only while no related run has a permit there or asks for one, and no
+  related train job is leased there; neither is granted while a related hidden job is there.
+- A kernel that is turned over to hidden jobs is closed to related permits that are asked for, and once no related permit
+  is left there to related train jobs. Whoever has a permit there goes on, as it must be able to end.
+- Nothing here is told to a gateway but that it waits for hidden cases.
+"""
+
+from __future__ import annotations
+
+from evopolicy_coordinator.core.model import (
+    EARLY_VALIDATION,
+    HIDDEN,
+    TRAIN,
+    Family,
+    JobGroup,
+    JobState,
+    Kernel,
+    Lease,
+    Worker,
+)
+from evopolicy_coordinator.core.reasons import Reason, because
+from evopolicy_coordinator.core.records import PermitRow
+from evopolicy_coordinator.core.state import State
+
+from . import kernels
+from .kernels import all_related, related
+
+NO_BOOT_ID = (
+    "the worker does not tell its kernel's boot id, so an agent may be on the same one; install the coordinator's version of"
+    " evopolicy there"
+)
+
+
+def concerns(state: State, priority: int, worker: Worker) -> bool:
+    """Whether `bar` may hold for any family."""
+    if priority == TRAIN:
+        kernel = worker.kernel
+        there = kernel.hidden or kernel.reversals or state.everywhere.hidden
+        return state.isolates and (bool(there) or kernel is state.everywhere)
+    return state.isolates and priority in HIDDEN
+
+
+def conflict(state: State, priority: int, family: Family | None, worker: Worker) -> bool:
+    """Whether a job of that priority and family must not be leased to a worker now."""
+    if not state.isolates:
+        return False
+    if priority == TRAIN:
+        return train_conflict(state, family, worker.kernel)
+    if priority not in HIDDEN:
+        return False
+    return hidden_conflict(state, family, worker.kernel) is not None or _train_waits(
+        state, priority, family, worker
+    )
+
+
+def _train_waits(state: State, priority: int, family: Family | None, worker: Worker) -> bool:
+    """Whether related train jobs wait for workers like this one: hidden jobs do not get in their way."""
+    assert family is not None
+    if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):
+        return False
+    busy = worker.profile.busy
+    return any(
+        lane in busy and each in lane.waiting[TRAIN] for each in family.relatives for lane in each.lanes
+    )
+
+
+def train_conflict(state: State, family: Family | None, kernel: Kernel) -> bool:
+    """Whether hidden jobs keep train jobs of a family from a kernel."""
+    if kernel is state.everywhere:
+        return any(
+            related(each.hidden, family) or reversed_there(state, each, family)
+            for each in state.kernels.values()
+        )
+    if related(kernel.hidden, family) or related(state.everywhere.hidden, family):
+        return True
+    return bool(kernel.reversals) and reversed_there(state, kernel, family)
+
+
+def reversed_there(state: State, kernel: Kernel, family: Family | None) -> bool:
+    """Whether the order is reversed there and train jobs of a family are held back for it."""
+    return related(kernel.reversals, family) is not None and not permits_there(state, kernel, family)
+
+
+def permits_there(state: State, kernel: Kernel, family: Family | None) -> dict[str, PermitRow] | None:
+    """Permits of the family's relatives that may be on a kernel."""
+    return related(kernel.permits, family) or related(state.everywhere.permits, family)
+
+
+def hidden_conflict(state: State, family: Family | None, kernel: Kernel) -> str | None:
+    """Why hidden jobs of a family must not be leased on a kernel: `kernel`, `agent`, `asked`, `train`; None: they may."""
+    if kernel is state.everywhere:
+        return "kernel"
+    if permits_there(state, kernel, family):
+        return "agent"
+    turned_over = related(kernel.reversals, family)
+    if not turned_over and (related(kernel.asks, family) or related(state.everywhere.asks, family)):
+        return "asked"
+    if related(kernel.train, family) or related(state.everywhere.train, family):
+        return "train"
+    return None
+
+
+def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | None:
+    """What a permit waits for; None when it may be granted."""
+    if not state.isolates:
+        return None
+    there = state.kernels.values() if kernel is state.everywhere else (kernel, state.everywhere)
+    if any(related(each.reversals, family) for each in there):
+        return because("scoring")
+    occupancies = [occupancy for each in there for occupancy in all_related(each.hidden, family)]
+    if not occupancies:
+        return None
+    if any(occupancy.lease is not None for occupancy in occupancies):
+        return because("being_put_off")
+    return because("to_report")
+
+
+def adoptable(state: State, job: JobState, worker: Worker) -> bool:
+    """Whether what a worker says to hold since before the core was loaded may go on."""
+    family, here = job.group.flow.family, (worker.kernel, state.everywhere)
+    if not state.isolates or not (job.group.hidden or job.priority == TRAIN):
+        return True
+    if job.priority == TRAIN:
+        there = [occupancy for each in here for occupancy in all_related(each.hidden, family)]
+    elif hidden_conflict(state, family, worker.kernel) in ("kernel", "agent", "asked"):
+        return False
+    else:
+        there = [occupancy for each in here for occupancy in all_related(each.train, family)]
+    # What this very worker may have played besides it tells now.
+    return all(occupancy.lease is None and occupancy.worker == worker.name for occupancy in there)
+
+
+def goes_first(lease: Lease) -> bool:
+    """Whether a hidden lease is on a kernel that is turned over to it."""
+    occupancy = lease.occupancy
+    return (
+        occupancy is not None
+        and lease.job.priority != EARLY_VALIDATION
+        and related(occupancy.kernel.reversals, occupancy.family) is not None
+    )
+
+
+def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lease]]]:
+    """The kernels that related hidden jobs keep a family's train jobs from, with what is to be stopped there; those
+    with least to stop first. Nothing is to be stopped where it was already, but for what has not been let go of."""
+    found = []
+    kernels: dict[Kernel, None] = {}
+    if state.isolates and family is not None:
+        kernels = {kernel: None for each in family.relatives for kernel in each.hidden_on}
+    for kernel in kernels:
+        occupancies = all_related(kernel.hidden, family)
+        if occupancies and not reversed_there(state, kernel, family):
+            found.append(
+                (
+                    kernel,
+                    [
+                        occupancy.lease
+                        for occupancy in occupancies
+                        if occupancy.lease is not None and occupancy.lease.live
+                    ],
+                )
+            )
+    return sorted(found, key=lambda each: len(each[1]))
+
+
+# ---- what is told ----
+
+
+def conflict_of_worker(state: State, worker: Worker) -> str:
+    """Why a worker plays no hidden episodes now; empty when it may."""
+    kernel = worker.kernel
+    if not state.isolates:
+        return ""
+    if kernel is state.everywhere:
+        return NO_BOOT_ID
+    rows = [
+        row
+        for each in (kernel, state.everywhere)
+        for there in each.permits.values()
+        for row in there.values()
+    ]
+    return f"the agent of {rows[0].run} may be alive there" if rows else ""
+
+
+def obstacle(state: State, group: JobGroup) -> Reason | None:
+    """What keeps an open group from all workers that could play it, None when nothing of this does.
+
+    Of a train group only that hidden cases do."""
+    lane, family = group.flow.lane, group.flow.family
+    if lane is None or not state.isolates or not (group.hidden or group.kind == "train"):
+        return None
+    there = kernels.serving(state, lane)
+    if not there:
+        return None
+    if group.kind == "train":
+        return because("scoring") if all(train_conflict(state, family, kernel) for kernel in there) else None
+    why = [hidden_conflict(state, family, kernel) for kernel in there]
+    if not all(why):
+        return None
+    for kernel in there:
+        permits = permits_there(state, kernel, family)
+        if permits is not None:
+            row = next(iter(permits.values()))
+            return because("agent_alive", run=row.run, place=row.host or row.boot_id)
+    if "asked" in why:
+        return because("agent_starting")
+    if "train" in why:
+        return because("related_train")
+    return because("unknown_kernel")

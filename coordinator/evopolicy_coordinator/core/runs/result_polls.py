@@ -1,0 +1,92 @@
+"""How a gateway reads the outcomes of a submit: long polls, answered when there is more than it has."""
+
+from __future__ import annotations
+
+from evopolicy_common.messages import gateway
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
+from evopolicy_coordinator.core.events import RequestId
+from evopolicy_coordinator.core.model import JobGroup
+from evopolicy_coordinator.core.reasons import Reason, because
+from evopolicy_coordinator.core.records import train_group
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.structures.polls import Poll
+
+from . import waits
+from .runs import held_s
+
+
+def results(state: State, event: events.Asked[gateway.ResultsRequest], step: Step) -> None:
+    """A gateway asks for outcomes: answered at once, or when there are more than it has."""
+    message = event.message
+    run = state.runs.get(message.run)
+    if run is None:
+        if message.run in state.capabilities:
+            step.add(
+                _page(event.request, message.run, message.submit_index, message.cursor, None, None, 0.0, step)
+            )
+        else:
+            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+        return
+    if not 0 <= message.submit_index < len(run.submits):
+        reason = because("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
+        step.refuse(event.request, Refusal.UNKNOWN_SUBMIT, reason)
+        return
+    target = train_group(run.id, message.submit_index)
+    poll = Poll(event.request, "results", target, message.cursor)
+    closed = run.submits[message.submit_index].status is not None
+    ready = closed or _released(state, target) > message.cursor
+    if ready or not state.polls.wait(poll, message.wait_s, step.now):
+        answer(state, poll, step)
+
+
+def _released(state: State, target: str) -> int:
+    """Episodes of an open submit that its gateway may see."""
+    group = state.groups[target]
+    return group.done if 0 in group.digests else 0
+
+
+def answer_polls(state: State, group: JobGroup, step: Step) -> None:
+    """There is something new for those who wait for a submit's results."""
+    for poll in state.polls.take_all(group.id):
+        answer(state, poll, step)
+
+
+def answer(state: State, poll: Poll, step: Step) -> None:
+    """Answer a poll with what there is."""
+    run = state.runs[poll.target.split("/")[0]]
+    index = int(poll.target.split("/")[1][1:])
+    row = run.submits[index]
+    waits_for = None if row.status is not None else waits.waits_for(state, state.groups[poll.target])
+    upto = row.released if row.status is not None else _released(state, poll.target)
+    held = held_s(state, run, step.now)
+    step.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, held, step))
+
+
+def _page(
+    request: RequestId,
+    run: str,
+    index: int,
+    cursor: int,
+    upto: int | None,
+    waits_for: Reason | None,
+    held: float,
+    step: Step,
+) -> ReadResults:
+    return ReadResults(
+        request=request,
+        run=run,
+        submit_index=index,
+        cursor=max(0, cursor),
+        upto=upto,
+        waits_for=waits_for,
+        held_s=held,
+        stimulus_id=step.stimulus_id,
+    )
+
+
+def finished_effect(request: RequestId, run: str, step: Step) -> ReadFinished:
+    """Have the shell answer with the finished run."""
+    return ReadFinished(request=request, run=run, stimulus_id=step.stimulus_id)

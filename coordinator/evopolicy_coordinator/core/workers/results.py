@@ -1,0 +1,184 @@
+"""Results that workers report: committed once, whatever is sent twice, late, or by whom it should not be.
+
+Rules that this module owns:
+- A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A verdict about a limit
+  counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
+  stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
+- A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
+- What the policy of an attempt that was given back had returned stands: no attempt after it throws the policy's dice again.
+  A worker that was silent for long is not believed that a limit ended it.
+- An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
+  name proves its grant. So is one of a worker that the job's group bars.
+- An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
+- What a policy can do to its slot is an outcome, and what it cannot is played again without a limit: `failed`, or `slot_died` in
+  the words of workers of earlier versions.
+"""
+
+from __future__ import annotations
+
+import math
+
+from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
+from evopolicy_common.messages.worker import JobResult
+from evopolicy_coordinator.core.leasing import fleet, groups, leases
+from evopolicy_coordinator.core.leasing.retry import JobFailure
+from evopolicy_coordinator.core.model import JobState, Lease, Worker, outcome_digest
+from evopolicy_coordinator.core.records import BegunRow, OutcomeRow
+from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.step import EpisodesDone, ResultsDiffered, ResultsPersisted, Step
+
+
+def take(state: State, news: ResultsPersisted, step: Step) -> None:
+    """Take in one result of a result report."""
+    worker, result = news.worker, news.result
+    job = state.jobs.get(result.job_id)
+    lease = worker.leases.get(result.lease_id)
+    granted = leases.granted(state, result.lease_id, result.job_id, result.attempt, worker)
+    if job is None or not granted:
+        _closed(state, worker, lease, result, step, granted=granted)
+        return
+    if job.group.excludes(worker):
+        step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
+        return
+    live = lease is not None and lease.live and job.lease is lease
+    counts = live or (lease is not None and lease.parting)
+    silent = lease is None or _silent(state, lease, step.now)
+    if result.kind != "done":
+        _goes_on(job, lease, result, step, silent=silent)
+    if lease is not None:
+        leases.release(state, worker, lease, step, f"reported: {result.kind}", sure=True)
+    if result.kind == "done":
+        _done(state, worker, job, result, step, live=live, silent=silent or not counts)
+    elif live:
+        if result.kind != "returned":
+            fleet.failed(state, worker, step)
+        failure: JobFailure = "returned" if result.kind == "returned" else "failed"
+        leases.give_back(state, job, failure, worker, step, ran=True, error=result.error)
+
+
+def _goes_on(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
+    """What the policy of an unfinished attempt has returned stands for the next one, unless that plays already."""
+    told = result.begun is not None and not (silent and result.limit_verdict)
+    if told and job.lease in (None, lease) and result.attempt > job.begun_attempt:
+        job.begun, job.begun_attempt = result.begun, result.attempt
+        group = job.group.id
+        step.persist(BegunRow(group=group, first=job.first, attempt=result.attempt, begun=result.begun))
+
+
+def _closed(
+    state: State, worker: Worker, lease: Lease | None, result: JobResult, step: Step, *, granted: bool
+) -> None:
+    """A result of a job that is done or was cancelled, or of a lease that this worker was not given."""
+    if lease is not None:
+        live = lease.live
+        leases.release(state, worker, lease, step, f"reported late: {result.kind}", sure=True)
+        if live:
+            error = f"its result is said to be of {result.job_id[:80]!r}, attempt {result.attempt}"
+            fleet.failed(state, worker, step)
+            leases.give_back(state, lease.job, "failed", worker, step, ran=True, error=error)
+    group = state.groups.get(result.job_id.rpartition("/")[0])
+    if group is None:
+        return
+    if not granted:
+        step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id[:200])
+        return
+    if result.kind != "done":
+        return
+    for outcome in result.episodes:
+        digest = group.digests.get(outcome.index)
+        if digest is not None and digest != outcome_digest(outcome) and not _limit_verdict(outcome):
+            step.log(
+                "warning",
+                "nondeterministic_result",
+                job=result.job_id,
+                worker=worker.name,
+                episode=outcome.index,
+                first=tuple(digest),
+                later=tuple(outcome_digest(outcome)),
+            )
+            step.tell(ResultsDiffered(group))
+
+
+def _silent(state: State, lease: Lease, now: float) -> bool:
+    """Whether the holder of a lease may have stood still during it."""
+    if lease.job.failures >= state.settings.doubts_max:
+        return False
+    unheard_s = now - lease.renewed
+    return lease.doubtful or lease.granted_at < state.stalled_at or unheard_s > state.settings.silence_s
+
+
+def _limit_verdict(outcome: EpisodeOutcome) -> bool:
+    failure = outcome.failure
+    return failure is not None and (failure.category in TIME_LIMITS or failure.limit is not None)
+
+
+def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
+    """Why the outcomes cannot be those of the job; None when they can."""
+    indexes = [outcome.index for outcome in episodes]
+    if indexes != list(range(job.first, job.first + job.n)):
+        return f"outcomes of episodes {indexes[:8]} for a job of {job.first} to {job.first + job.n - 1}"
+    for outcome in episodes:
+        numbers = [
+            outcome.episode_return,
+            outcome.wall_s,
+            outcome.policy_cpu_s,
+            *outcome.reward_components.values(),
+        ]
+        if outcome.failure is not None:
+            numbers += [outcome.failure.limit or 0.0, outcome.failure.used or 0.0]
+        if not all(math.isfinite(number) for number in numbers):
+            return f"episode {outcome.index} has a number that is not finite: {numbers}"
+        if outcome.length < 0:
+            return f"episode {outcome.index} has length {outcome.length}"
+    return None
+
+
+def _done(
+    state: State, worker: Worker, job: JobState, result: JobResult, step: Step, *, live: bool, silent: bool
+) -> None:
+    fault = _fault(job, result.episodes)
+    if fault is not None:
+        step.log("error", "result_refused", job=job.job_id, worker=worker.name, fault=fault)
+        if live:
+            fleet.failed(state, worker, step)
+            leases.give_back(state, job, "failed", worker, step, ran=True, error=fault)
+        return
+    if silent and any(_limit_verdict(outcome) for outcome in result.episodes):
+        state.trace.add(step.now, step.stimulus_id, result.lease_id, "late limit verdict, not counted")
+        if live:
+            leases.give_back(
+                state, job, "unlisted", worker, step, ran=True, error="limit verdict after a silence"
+            )
+        return
+    worker.failures = 0
+    commit(state, worker, job, result, step)
+
+
+def commit(state: State, worker: Worker, job: JobState, result: JobResult, step: Step) -> None:
+    """Make the outcomes durable and the job done."""
+    group = job.group
+    groups.close_job(state, job, step, "done by another attempt")
+    if job.begun is not None:
+        step.persist(BegunRow(group=group.id, first=job.first, attempt=result.attempt, begun=None))
+    for outcome in result.episodes:
+        row = OutcomeRow(
+            group=group.id,
+            index=outcome.index,
+            seq=group.done,
+            outcome=outcome,
+            job_id=job.job_id,
+            attempt=result.attempt,
+            worker=worker.name,
+            fingerprint_class=worker.profile.classes[group.flow.env],
+            at=step.now,
+        )
+        group.digests[outcome.index] = outcome_digest(outcome)
+        step.persist(row)
+        if group.kind != "audit":
+            group.flow.observe(outcome.wall_s)
+    state.trace.add(
+        step.now, step.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
+    )
+    if group.kind != "audit":
+        state.rate.count(len(result.episodes), step.now)
+    step.tell(EpisodesDone(group, worker, result.episodes))

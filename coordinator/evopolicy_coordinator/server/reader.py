@@ -1,0 +1,325 @@
+"""Answers that are read from the store or the blob folder, on threads of their own, and sent from there.
+
+Rules that this module owns:
+- A gateway's page is made of the train outcomes of its own run and of nothing else; what an `EpisodeOutcome` holds
+  beyond `EpisodeFeedback` (wall times, CPU) does not travel.
+- A page never grows past `MAX_PAGE_BYTES` (unless one episode does), so no reply holds up its lane for long.
+- The chunks of one blob are written by one thread, in order.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from zlib import crc32
+
+import structlog
+
+from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
+from evopolicy_common.messages.operator import (
+    EvaluationPage,
+    JournalPage,
+    JournalRequest,
+    OpeningRequest,
+    RecordedRequest,
+    RunOpening,
+    RunProgress,
+    Signed,
+    SignRequest,
+)
+from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.records.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.wire import codec
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.wire.transport import IncomingQuery
+from evopolicy_coordinator.core import records
+from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.core.events import AuditEvent
+from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.pki import identity
+from evopolicy_coordinator.server import auditing
+from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.storage.store import Reader
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+MAX_PAGE_BYTES = 256 << 10
+MAX_SEQ = 2**31 - 1
+_READERS = 2
+_BLOB_LANES = 4
+_NO_BYTES = BlobRef(digest=digest_of(b""), size=0, inline=b"")
+
+Answer = Callable[[Message | None], None]
+"""Sends the answer, from any thread; None ends the query without one, so that it is asked again."""
+
+
+class ServiceReader:
+    """Reads pages and blobs. Every method returns at once; the answer is given later, from a thread."""
+
+    def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
+        self._database = database
+        self._blobs = blobs
+        self._uploads = uploads
+        self._local = threading.local()
+        self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
+        self._audits = ThreadPoolExecutor(1, thread_name_prefix="audits")
+        self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
+
+    def page(self, effect: ReadResults | ReadEvaluation | ReadFinished, answer: Answer) -> None:
+        """Answers a read that the core asked for."""
+        self._pages.submit(self._answer, lambda: self._page(effect), answer)
+
+    def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+        """Reads and compares recordings, one audit after another; `tell` is called from the thread."""
+        self._audits.submit(self._audit, effect, tell)
+
+    def put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int, answer: Answer) -> None:
+        """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check.
+
+        With `run`, whose gateway it is, what others have stored is not told: all bytes are wanted, and noted then.
+        """
+        self._lane(message.digest).submit(
+            self._answer, lambda: self._put(sender, run, message, max_bytes), answer
+        )
+
+    def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
+        """Sends one chunk of a blob; with `run`, only of one that this run's train feedback names."""
+        self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
+
+    def recorded(self, message: RecordedRequest, answer: Answer) -> None:
+        """Sends stored outcomes of a finished run."""
+        self._pages.submit(self._answer, lambda: self._recorded(message), answer)
+
+    def published(self, message: JournalRequest | OpeningRequest | SignRequest, answer: Answer) -> None:
+        """Sends what is published of runs whose cases are disclosed, or signs it."""
+        work = {JournalRequest: self._journal, OpeningRequest: self._opening, SignRequest: self._sign}
+        self._pages.submit(self._answer, lambda: work[type(message)](message), answer)  # type: ignore[operator]
+
+    def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:
+        """The epochs of finished runs that are to be published, each once. Reads the database; RefusedError otherwise."""
+        found: dict[str, None] = {}
+        for run in runs:
+            row = self.finished_run(run)
+            if row is None:
+                raise RefusedError(Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
+            if row.committed is None:
+                raise RefusedError(
+                    Refusal.BAD_REQUEST,
+                    f"run {run} was opened before this coordinator kept a journal: its cases were never committed to, which"
+                    " cannot be done afterwards, so it cannot be published",
+                )
+            found[row.epoch] = None
+        return tuple(found)
+
+    def finished_run(self, run: str) -> RunRow | None:
+        """A finished run as it was created; None for any other run. Reads the database.
+
+        RefusedError when the row cannot be read.
+        """
+        try:
+            return self._reader.run(run) if run and self._reader.finished(run) is not None else None
+        except DamagedStoreError as error:
+            raise damaged(error) from error
+
+    def close(self) -> None:
+        for pool in (self._pages, self._audits, *self._lanes):
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _lane(self, digest: str) -> ThreadPoolExecutor:
+        return self._lanes[crc32(digest.encode()) % _BLOB_LANES]
+
+    def _answer(self, work: Callable[[], Message], answer: Answer) -> None:
+        try:
+            answer(work())
+        except DamagedStoreError as error:
+            refused = damaged(error)
+            answer(Refused(status=refused.status, message=refused.message))
+        except StorageError as error:
+            # Ours to mend: whoever asked asks again.
+            log.error("cannot answer from the store", error=str(error))
+            answer(None)
+        except Exception:
+            log.exception("cannot answer")
+            answer(None)
+
+    def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+        try:
+            tell(auditing.carry_out(effect, self._reader, self._blobs))
+        except Exception:
+            # The audit stays open, and is given up in time.
+            log.exception("cannot audit", audit=effect.audit)
+
+    @property
+    def _reader(self) -> Reader:
+        if not hasattr(self._local, "reader"):
+            self._local.reader = Reader(self._database)
+        reader: Reader = self._local.reader
+        return reader
+
+    def _page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Message:
+        if isinstance(effect, ReadResults):
+            return self._results(effect)
+        if isinstance(effect, ReadEvaluation):
+            return self._evaluation(effect)
+        finished = self._reader.finished(effect.run)
+        if finished is None:
+            return Refused(status=Refusal.UNKNOWN_RUN, message=f"run {effect.run!r} has no outcome")
+        done = len(finished.heldout_returns)
+        return RunProgress(phase="finished", done=done, total=done, finished=finished)
+
+    def _results(self, effect: ReadResults) -> Message:
+        row = self._reader.submit(effect.run, effect.submit_index)
+        if row is None:
+            return Refused(
+                status=Refusal.UNKNOWN_SUBMIT, message=f"this run has no submit {effect.submit_index}"
+            )
+        # The row may have moved on since the core asked: an end is told with all that belongs before it.
+        upto = row.released if effect.upto is None or row.status is not None else effect.upto
+        group = records.train_group(effect.run, effect.submit_index)
+        page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
+        return ResultsPage(
+            cursor=page.cursor,
+            episodes=tuple(feedback(found.outcome) for found in page.rows),
+            done=records.submit_done(row) if page.cursor >= upto else None,
+            waits_for=words(effect.waits_for),
+            held_s=effect.held_s,
+        )
+
+    def _evaluation(self, effect: ReadEvaluation) -> Message:
+        group = records.evaluation_group(effect.evaluation)
+        page = self._reader.outcomes(group, effect.cursor, effect.upto, MAX_PAGE_BYTES)
+        return EvaluationPage(
+            cursor=page.cursor,
+            total=effect.total,
+            outcomes=tuple(found.outcome for found in page.rows),
+            finished=effect.finished and page.cursor >= effect.upto,
+            waits_for=words(effect.waits_for),
+        )
+
+    def _recorded(self, message: RecordedRequest) -> Message:
+        run = message.run
+        if self._reader.finished(run) is None:
+            return Refused(status=Refusal.UNKNOWN_RUN, message=f"there is no finished run {run[:64]!r} here")
+        name = {
+            "train": records.train_group,
+            "validation": records.validation_group,
+            "heldout": records.heldout_group,
+        }[message.split]
+        group = records.random_group(run) if message.submit_index < 0 else name(run, message.submit_index)
+        cursor = min(max(0, message.cursor), MAX_SEQ)
+        page = self._reader.outcomes(group, cursor, MAX_SEQ, MAX_PAGE_BYTES)
+        return EvaluationPage(
+            cursor=page.cursor,
+            total=page.cursor,
+            outcomes=tuple(found.outcome for found in page.rows),
+            finished=not page.rows,
+        )
+
+    def _journal(self, message: JournalRequest) -> Message:
+        cursor = min(max(0, message.cursor), MAX_SEQ)
+        rows = self._reader.journal(cursor, MAX_PAGE_BYTES)
+        after = rows[-1].seq + 1 if rows else cursor
+        return JournalPage(cursor=after, entries=tuple(row.entry for row in rows), finished=not rows)
+
+    def _opening(self, message: OpeningRequest) -> Message:
+        row = self.finished_run(message.run)
+        opening = self._reader.document(message.run, "opening")
+        result = self._reader.document(message.run, "result")
+        if row is None or opening is None or result is None:
+            text = f"there is no finished run {message.run[:64]!r} here that was committed to"
+            return Refused(status=Refusal.UNKNOWN_RUN, message=text)
+        if row.epoch not in self._reader.revealed():
+            text = f"the cases of run {row.run} are not disclosed; publish it first"
+            return Refused(status=Refusal.BAD_REQUEST, message=text)
+        return RunOpening(salt=row.salt, opening=opening, result=result)
+
+    def _sign(self, message: SignRequest) -> Message:
+        if not is_digest(message.digest):
+            return Refused(
+                status=Refusal.BAD_REQUEST, message=f"{message.digest[:80]!r} is no SHA-256 digest"
+            )
+        key, signature = identity.sign(self._database.parent, message.digest)
+        return Signed(key=key, signature=signature)
+
+    def _put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int) -> Message:
+        if not is_digest(message.digest):
+            return Refused(status=Refusal.BAD_BLOB, message=f"{message.digest[:80]!r} is no SHA-256 digest")
+        if not 0 <= message.size <= max_bytes:
+            return Refused(
+                status=Refusal.BAD_BLOB, message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
+            )
+        on_whole = None
+        if run is not None and not self._uploads.has_sent(run, message.digest):
+            on_whole = partial(self._uploads.note, run, message.digest)
+        try:
+            have = self._blobs.append_chunk(
+                sender, message.digest, message.size, message.offset, message.data, on_whole
+            )
+        except StorageError as error:
+            if error.__cause__ is not None:  # the disk's fault, not the sender's
+                raise
+            return Refused(status=Refusal.BAD_BLOB, message=str(error))
+        return BlobAck(have=have)
+
+    def _get(self, run: str | None, message: BlobGet) -> Message:
+        known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
+        if not known or not self._blobs.has(message.digest):
+            return Refused(status=Refusal.UNKNOWN_BLOB, message=f"no blob {message.digest[:80]!r} here")
+        size = self._blobs.size(message.digest)
+        return BlobChunk(
+            size=size, data=self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
+        )
+
+
+def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
+    """What an agent may see of a train episode."""
+    return EpisodeFeedback(
+        index=outcome.index,
+        episode_return=outcome.episode_return,
+        length=outcome.length,
+        failure=outcome.failure,
+        reward_components=outcome.reward_components,
+        trajectory=outcome.trajectory or _NO_BYTES,
+        video=outcome.video,
+        stdout=outcome.stdout,
+        stderr=outcome.stderr,
+    )
+
+
+def damaged(error: DamagedStoreError) -> RefusedError:
+    """What whoever asks for a row that cannot be read is told: asking again does not help. The log names the row."""
+    log.error("what is stored cannot be read", error=str(error))
+    text = "what the coordinator has stored of this cannot be read; its log names the row and the remedy"
+    return RefusedError(Refusal.DAMAGED, text)
+
+
+def lane_of(asker: str) -> int:
+    """Answers to one asker go in order."""
+    return crc32(asker.encode())
+
+
+def answer_bytes(message: Message) -> bytes:
+    """The bytes of an answer; of a refusal where they would be more than can be sent, lest it be asked for again for ever."""
+    try:
+        return codec.encode(message)
+    except ProtocolError as error:
+        log.error("an answer is too large", error=str(error))
+        return codec.encode(Refused(status=Refusal.TOO_LARGE, message=str(error)))
+
+
+def answer_to(query: IncomingQuery, asker: str) -> Answer:
+    """Answers the query, or ends it without an answer."""
+
+    def answer(message: Message | None) -> None:
+        if message is None:
+            query.drop()
+        else:
+            query.reply(answer_bytes(message), lane_of(asker))
+
+    return answer

@@ -1,0 +1,124 @@
+"""The core's reasons in words: what operators, gateways and, through them, agents read.
+
+Rule that this module owns: nothing of audits and of hidden results reaches an agent; of what keeps a submit waiting it is told no
+more than that hidden cases of another run do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import msgspec
+
+from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunState, StateReply
+from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.messages.worker import Message, Refused
+from evopolicy_coordinator.core.effects import Refuse, Reply
+from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
+from evopolicy_coordinator.core.reasons import Code, Reason
+
+
+def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...]) -> str:
+    wanted = f"a worker that offers {env} with sandbox tier {tier}"
+    if same_versions:
+        wanted += ", of the same versions as the run began with"
+    # Nothing of audits reaches an agent.
+    states = sorted("out of service" if state == "quarantined" else state for state in away)
+    return f"{wanted}: those that do are {' or '.join(states)}" if states else wanted
+
+
+def _agent_alive(run: str, place: str) -> str:
+    where = f"on {place}" if place else "on any machine"
+    return (
+        f"the agent of {run} to end, which may be alive {where}; if it is not, resume that run, or say"
+        f" `evopolicy runs agent-gone {run}`"
+    )
+
+
+def _forger(worker: str, why: str, forger: str) -> str:
+    same = "" if forger == worker else f" (as {forger!r} of the same machine)"
+    return f"worker {worker!r} gets no more work here: {why}{same}"
+
+
+def _unknown_class(name: str, offered: tuple[str, ...]) -> str:
+    return f"no worker of class {name!r} can play it; there are {', '.join(offered) or 'none'}"
+
+
+TEXTS: Mapping[Code, str | Callable[..., str]] = {
+    "unknown_run": "there is no run {run!r}",
+    "no_unfinished_run": "there is no unfinished run {run!r}",
+    "unknown_evaluation": "there is no evaluation {evaluation!r}",
+    "run_cancelled": "run {run!r} was cancelled",
+    "cancelled_by_operator": "run {run!r} was cancelled by the operator",
+    "run_finished": "run {run!r} is finished",
+    "run_closed": "run {run!r} is closed",
+    "run_takes_no_more": "run {run!r} is closed and takes no more submits",
+    "run_exists": "there is a run {run!r} already",
+    "budget_below_one": "a budget of {budget} episodes; at least 1 is needed",
+    "submit_bounds": "a submit of {least} to {most} episodes; wanted is 1 ≤ minimum ≤ maximum",
+    "minimum_over_budget": "a submit takes at least {least} episodes, the budget is {budget}",
+    "no_cases": "the {split} split has no cases",
+    "evaluation_without_cases": "an evaluation needs at least one case",
+    "epoch_revealed": "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, say"
+    " `evopolicy-coordinator epoch new` with its --state, and start it again (with --data: give it other cases)",
+    "epoch_in_use": "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
+    " its end, or cancel it",
+    "busy": "submit {submit} is still running; one runs at a time",
+    "key_used": "key {key!r} was used for submit {submit} with another request",
+    "no_bundle": "a submit names a bundle, or says why there is none",
+    "unknown_submit": "run {run!r} has {n} submits, none of index {submit}",
+    "unknown_case": "env_instances names {case}; train cases are 0 to {last}",
+    "too_few": "{n} episodes asked for; a submit takes at least {least}",
+    "too_many": "{n} episodes asked for; a submit takes at most {most}",
+    "over_budget": "{n} episodes asked for; {left} of the budget remain",
+    "no_worker_yet": "the run waits for {waits_for}",
+    "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",
+    "name_taken": "a worker of another machine is called {worker!r}; choose another --name",
+    "unknown_session": "session of worker {worker!r} is not known here; register again",
+    "forger": _forger,
+    "quarantined": "{worker} is quarantined: {why}",
+    "unknown_class": _unknown_class,
+    "workers": _workers,
+    "scoring": "hidden cases of another run are being scored",
+    "being_put_off": "hidden cases on this machine to be put off",
+    "to_report": "workers of this machine to report that they play no hidden cases",
+    "agent_alive": _agent_alive,
+    "agent_starting": "an agent that is about to start there",
+    "related_train": "train episodes of runs with the same hidden cases to end",
+    "unknown_kernel": f"a worker that tells its kernel's boot id: {NO_BOOT_ID}",
+    "hand_back": "workers to hand back what they were told to stop",
+    "adoption": "workers to report after a restart",
+    "own_fault": "another try after a fault of ours",
+    "bench": "workers whose jobs kept failing to be tried again",
+    "free_slot": FREE_SLOT,
+    "audits": "{n} audits of its episodes on other workers",
+}
+"""By code: a text with the names of what the reason is about, or a function of them."""
+
+
+def words(reason: Reason | None) -> str:
+    """A reason in words; empty for none."""
+    if reason is None:
+        return ""
+    text = TEXTS[reason.code]
+    about = {name: words(each) if isinstance(each, Reason) else each for name, each in reason.about.items()}
+    return text.format(**about) if isinstance(text, str) else text(**about)
+
+
+def message(effect: Reply | Refuse) -> Message:
+    """What goes to the asker: the effect's message, with its reason in words."""
+    if isinstance(effect, Refuse):
+        return Refused(status=effect.status, message=words(effect.reason))
+    told = effect.message
+    if effect.waits_for is None:
+        return told
+    text = words(effect.waits_for)
+    if isinstance(told, RunOpened | StateReply):
+        return msgspec.structs.replace(told, state=_with(told.state, text))
+    assert isinstance(told, Permit | RunProgress)
+    return msgspec.structs.replace(told, waits_for=text)
+
+
+def _with(state: RunState, text: str) -> RunState:
+    assert state.in_flight is not None
+    return msgspec.structs.replace(state, in_flight=msgspec.structs.replace(state.in_flight, waits_for=text))

@@ -1,0 +1,96 @@
+"""The session that other machines reach over TLS, beside the one for this machine.
+
+Rules:
+- It has its own passwords and access rules: what lets a process of this machine in is worth nothing here, and the other
+  way round.
+- Zenoh reads passwords, rules and certificates when a session is opened. So whenever a machine is issued or revoked, this
+  session is closed, which cuts every link, and opened anew; who may still come in is back by itself within a second. No
+  request is lost by it: all of ours are asked again.
+- A session that cannot be opened again (its port is not free yet) is tried again until it can.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+
+import structlog
+
+from evopolicy_common.errors import ConfigError, TransportError
+from evopolicy_common.wire import keys, transport
+from evopolicy_common.wire.transport import IncomingQuery, Server
+from evopolicy_coordinator.pki.machines import Machines
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+LOOK_S = 0.5
+"""How often it looks whether a machine was issued or revoked."""
+_PAUSE_S = 0.25
+
+
+def declare_all(server: Server, cluster: str, on_liveliness: Callable[[str, bool], None]) -> None:
+    """What a coordinator's session answers and watches."""
+    server.declare((keys.worker_expr(cluster), keys.gateway_expr(cluster), keys.operator_expr(cluster)))
+    server.watch_liveliness(keys.liveliness_expr(cluster), on_liveliness)
+
+
+@contextlib.asynccontextmanager
+async def remote_listener(
+    cluster: str,
+    listen: tuple[str, ...],
+    machines: Machines,
+    on_queries: Callable[[list[IncomingQuery]], None],
+    on_liveliness: Callable[[str, bool], None],
+) -> AsyncIterator[None]:
+    """Listens on these `tls/` endpoints inside the `async with`; on none, it does nothing.
+
+    Raises ConfigError before `certs init`, TransportError when an endpoint cannot be listened on.
+    """
+    if not listen:
+        yield
+        return
+    opened = asyncio.get_running_loop().create_future()
+    keeping = asyncio.create_task(_keep(cluster, listen, machines, on_queries, on_liveliness, opened))
+    try:
+        await opened
+        yield
+    finally:
+        keeping.cancel()
+        with contextlib.suppress(asyncio.CancelledError, TransportError, ConfigError):
+            await keeping
+
+
+async def _keep(
+    cluster: str,
+    listen: tuple[str, ...],
+    machines: Machines,
+    on_queries: Callable[[list[IncomingQuery]], None],
+    on_liveliness: Callable[[str, bool], None],
+    opened: asyncio.Future[None],
+) -> None:
+    while True:
+        try:
+            seen = machines.stamp()
+            tls = machines.tls
+            if tls is None:
+                raise ConfigError(
+                    f"--listen {listen[0]}: no certificates yet; make them: evopolicy-coordinator certs init"
+                )
+            machines.write_passwords()
+            listed = [(machine.role, machine.identity) for machine in machines.admitted()]
+            config = transport.tls_server_config(cluster, listen, machines.passwords, listed, tls)
+            async with transport.serve(config, on_queries) as server:
+                declare_all(server, cluster, on_liveliness)
+                if opened.done():
+                    log.info("machines changed; listening again", machines=len(listed))
+                else:
+                    opened.set_result(None)
+                while machines.stamp() == seen:  # noqa: ASYNC110 - another process changes the file
+                    await asyncio.sleep(LOOK_S)
+        except Exception as error:
+            if not opened.done():
+                opened.set_exception(error)
+                return
+            log.error("cannot listen for other machines; trying again", why=str(error))
+            await asyncio.sleep(_PAUSE_S)

@@ -1,0 +1,494 @@
+"""From bytes on a key to an event for the core, or to a refusal: decoding and the check of every token.
+
+Rules that this module owns:
+- A message is served only on the very key that its kind belongs on (a gateway's only under its own run), so that what
+  Zenoh's access control grants is what is granted.
+- Tokens are compared in constant time. A wrong capability and an unknown run are answered alike.
+- Whatever is refused here has changed nothing.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import msgspec
+from msgspec.structs import replace
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
+from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages.environment import Split, StepLimit
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
+from evopolicy_common.records.blobs import BlobStore, is_digest
+from evopolicy_common.records.journal import SALT_BYTES
+from evopolicy_common.wire import codec, keys
+from evopolicy_common.wire.credentials import Role
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.events import AnyEvent
+from evopolicy_coordinator.core.records import EvaluationRow, RunRow
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.request_checks import (
+    MAX_COUNT,
+    MAX_EPISODES_PER_SUBMIT,
+    bounded_agent,
+    check_begun,
+    check_counts,
+    check_idempotency_key,
+    check_inline,
+    check_job,
+    check_key,
+    check_limits,
+    check_place,
+    check_registration,
+    check_token,
+    finite_cursor,
+    finite_wait,
+)
+from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.splits import SPLITS, SplitSource
+from evopolicy_coordinator.storage.state_folder import Identity
+from evopolicy_coordinator.storage.store import stored_blobs
+
+_VERBS: dict[type[Message], str] = {
+    worker.Register: "register",
+    worker.LeaseRequest: "lease",
+    worker.Heartbeat: "beat",
+    worker.ReportResults: "done",
+    BlobPut: "blob",
+    BlobGet: "blob",
+    gateway.OpenRun: "open",
+    gateway.RequestPermit: "permit",
+    gateway.StateRequest: "state",
+    gateway.Submit: "submit",
+    gateway.ResultsRequest: "results",
+    gateway.CloseRun: "close",
+}
+
+
+class Rights(Protocol):
+    """What the core knows of who may do what."""
+
+    def capability(self, run: str) -> str | None:
+        """The token of a run's gateway; None for an unknown run."""
+
+
+class Parsed(msgspec.Struct, frozen=True):
+    """A request whose speaker is known and allowed to ask it."""
+
+    room: str
+    """`work`, `gw`, `ops`."""
+    asker: str
+    """The worker's or run's name; `operator`."""
+    message: Message
+
+
+class RequestParser:
+    """Reads requests. Holds no state of its own."""
+
+    def __init__(
+        self,
+        identity: Identity,
+        blobs: BlobStore,
+        source: SplitSource,
+        uploads: Uploads,
+        *,
+        allowed_imports: tuple[str, ...],
+        denied_imports: tuple[str, ...],
+        machines: Machines | None = None,
+    ) -> None:
+        """`machines`: those that hold tokens of their own, beside the state folder's; None: no others."""
+        self._identity = identity
+        self._blobs = blobs
+        self._source = source
+        self._uploads = uploads
+        self._allowed_imports = allowed_imports
+        self._denied_imports = denied_imports
+        self._machines = machines
+        self._prefix = keys.worker_key(identity.cluster, "")[: -len("work/")]
+
+    def parse(self, key: str, payload: bytes, rights: Rights) -> Parsed:
+        """The request in `payload`; RefusedError for a wrong token or key, ProtocolError for what is no message."""
+        room, _, tail = key.removeprefix(self._prefix).partition("/")
+        if room == "work":
+            return self._parse_worker(tail, payload)
+        if room == "gw":
+            return self._parse_gateway(tail, payload, rights)
+        if room == "ops":
+            message = codec.decode(codec.operator_requests, payload)
+            self._check_token("operator", self._identity.operator_token, message.token)
+            return Parsed("ops", "operator", message)
+        raise RefusedError(Refusal.WRONG_KEY, f"nothing is asked on {key}")
+
+    def _parse_worker(self, tail: str, payload: bytes) -> Parsed:
+        message = codec.decode(codec.worker_requests, payload)
+        check_key(tail, _VERBS[type(message)])
+        if isinstance(message, worker.Register):
+            self._check_token("worker", self._identity.worker_token, message.token)
+            check_registration(message)
+        else:
+            self._check_session(message.token if isinstance(message, BlobPut | BlobGet) else message.session)
+        # Everyone else names a session, which the core knows or refuses.
+        name = message.sender if isinstance(message, BlobPut | BlobGet) else message.worker
+        return Parsed("work", name, message)
+
+    def _parse_gateway(self, tail: str, payload: bytes, rights: Rights) -> Parsed:
+        message = codec.decode(codec.gateway_requests, payload)
+        run = message.sender if isinstance(message, BlobPut | BlobGet) else message.run
+        check_key(tail, f"{run}/{_VERBS[type(message)]}")
+        capability = rights.capability(run)
+        check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
+        return Parsed("gw", run, message)
+
+    def _check_token(self, role: Role, local: str, given: str) -> None:
+        """Whether it is this machine's token for the role, or an admitted other machine's."""
+        if self._machines is None or self._machines.holder(role, given) is None:
+            check_token(local, given)
+
+    def _check_session(self, session: str) -> None:
+        if self._machines is not None and self._machines.is_shut_out(session):
+            raise RefusedError(
+                Refusal.REVOKED,
+                "this machine was revoked, or issued again; ask the cluster's operator for a new folder",
+            )
+
+    def is_gateways(self, key: str) -> bool:
+        """Whether gateways ask on this key: what is answered there, an agent may come to see."""
+        return key.startswith(f"{self._prefix}gw/")
+
+    def asks_for_change(self, key: str, payload: bytes) -> bool:
+        """Whether the request would make something new (a run, a submit, an evaluation); its token is not looked at."""
+        room = key.removeprefix(self._prefix).partition("/")[0]
+        try:
+            if room == "gw":
+                return isinstance(codec.decode(codec.gateway_requests, payload), gateway.Submit)
+            wanted = operator.CreateRun | operator.Evaluate | operator.Disclose
+            return room == "ops" and isinstance(codec.decode(codec.operator_requests, payload), wanted)
+        except ProtocolError:
+            return False
+
+    @staticmethod
+    def reads_files(message: Message) -> bool:
+        """Whether `event` reads splits or blobs for it."""
+        if isinstance(message, worker.ReportResults):
+            return any(result.packed is not None for result in message.results)
+        return isinstance(message, operator.CreateRun | operator.Evaluate | operator.Disclose)
+
+    def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
+        """The event that the request is for the core; RefusedError when it cannot be served as it is.
+
+        Not for blob and status requests. What `reads_files` belongs on a thread.
+        """
+        message = parsed.message
+        if isinstance(message, _WITH_CURSOR):
+            message = replace(message, cursor=finite_cursor(message.cursor))
+        if isinstance(message, _WITH_WAIT):
+            message = replace(message, wait_s=finite_wait(message.wait_s))
+        make = _EVENTS.get(type(message))
+        if make is not None:
+            return make(self, message, request, stimulus_id)
+        checked = _CHECKS[type(message)](self, message)
+        return events.Asked(stimulus_id=stimulus_id, request=request, message=checked)
+
+    def _as_it_is(self, m: Message) -> Message:
+        return m
+
+    # Workers.
+
+    def _registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
+        machines = self._machines
+        holder = None if machines is None else machines.holder("worker", m.token)
+        return events.WorkerRegistered(
+            stimulus_id=stimulus,
+            request=request,
+            message=m,
+            session=secrets.token_urlsafe(16) if machines is None else machines.session_for(m.token),
+            machine="" if holder is None else holder.name,
+        )
+
+    def _checked_results(self, m: worker.ReportResults) -> worker.ReportResults:
+        results = tuple(map(self._unpacked, m.results))
+        for result in results:
+            check_begun(result.begun)
+            if result.begun is not None and result.begun.inline is None:
+                self._check_stored(result.begun)
+            for outcome in result.episodes:
+                for ref in (outcome.trajectory, outcome.video):
+                    check_inline(ref)
+                for ref in stored_blobs(outcome):
+                    self._check_stored(ref)
+        return replace(m, results=results)
+
+    def _unpacked(self, result: worker.JobResult) -> worker.JobResult:
+        """The result with its outcomes, where these came as a blob."""
+        if result.packed is None:
+            return result
+        self._check_stored(result.packed)
+        try:
+            outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
+        except ProtocolError as error:
+            raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
+        return replace(result, episodes=outcomes, packed=None)
+
+    def _check_stored(self, ref: BlobRef) -> None:
+        if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
+            raise RefusedError(Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here")
+
+    # Gateways.
+
+    def _checked_permit(self, m: gateway.RequestPermit) -> gateway.RequestPermit:
+        check_place(m.boot_id, m.machine_id, m.host)
+        return m
+
+    def _checked_submit(self, m: gateway.Submit) -> gateway.Submit:
+        check_idempotency_key(m.key)
+        self._check_bundle(m.bundle, m.run)
+        if (m.bundle is None) == (m.bundle_error is None):
+            raise RefusedError(Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
+        return m
+
+    def _checked_poll(self, m: gateway.ResultsRequest) -> gateway.ResultsRequest:
+        if not 0 <= m.submit_index <= MAX_COUNT:
+            raise RefusedError(Refusal.UNKNOWN_SUBMIT, f"this run has no submit {m.submit_index}")
+        return m
+
+    def _checked_close(self, m: gateway.CloseRun) -> gateway.CloseRun:
+        return replace(m, agent=bounded_agent(m.agent))
+
+    # Operators.
+
+    def _run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
+        check_idempotency_key(m.key)
+        wanted = m.settings
+        check_limits(wanted.limits)
+        try:
+            suite = catalogue.suite_of(wanted.env)
+            budget = suite.budget if wanted.budget is None else wanted.budget
+            least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
+            most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
+            check_counts(budget, least, most, wanted.n_validation, wanted.n_heldout)
+            self._check_profile(wanted)
+            cases = self._source.splits(
+                suite.name,
+                wanted.env,
+                self._counts(suite, wanted.n_validation, wanted.n_heldout),
+                own=m.key if wanted.hidden_cases == "per_run" else "",
+            )
+        except ConfigError as error:
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
+        if wanted.profile == "published":
+            self._check_published(len(cases.train))
+        if wanted.policy_scope == "submit":
+            check_job((*cases.train, *cases.validation, *cases.heldout), most)
+        row = RunRow(
+            run=f"r-{secrets.token_hex(8)}",
+            key=m.key,
+            capability=secrets.token_urlsafe(32),
+            secret=secrets.token_bytes(32),
+            settings=wanted,
+            budget=budget,
+            min_episodes_per_submit=least,
+            max_episodes_per_submit=most,
+            train=cases.train,
+            validation=cases.validation,
+            heldout=cases.heldout,
+            split_hashes=cases.hashes(),
+            split_secret=cases.secret,
+            epoch=cases.epoch,
+            salt=secrets.token_bytes(SALT_BYTES),
+            allowed_imports=self._allowed_imports,
+            denied_imports=self._denied_imports,
+            max_steps=_max_steps(wanted.env, wanted.step_limit),
+        )
+        return events.RunCreated(stimulus_id=stimulus, request=request, message=m, row=row)
+
+    def evaluation_requested(
+        self, m: operator.Evaluate, request: int, stimulus: str, of: RunRow | None = None
+    ) -> AnyEvent:
+        """`of`: the finished run that it plays again: its policy seeds, and its cases where they came from a secret."""
+        check_idempotency_key(m.key)
+        self._check_bundle(m.bundle)
+        check_limits(m.limits)
+        try:
+            suite = catalogue.suite_of(m.env)
+            run = _derived(of)
+            cases = (
+                self._source.splits(suite.name, m.env, self._counts(suite, None, None)).cases(m.split)
+                if run is None
+                else {"train": run.train, "validation": run.validation, "heldout": run.heldout}[m.split]
+            )
+        except ConfigError as error:
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
+        ids = tuple(range(len(cases))) if m.cases is None else m.cases
+        if len(ids) > MAX_EPISODES_PER_SUBMIT:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"{len(ids):,} cases; {MAX_EPISODES_PER_SUBMIT:,} are played at once at most",
+            )
+        self._check_again(m, len(ids))
+        wrong = next((case_id for case_id in ids if not 0 <= case_id < len(cases)), None)
+        if wrong is not None or not ids:
+            raise RefusedError(
+                Refusal.INVALID_ENV_INSTANCE,
+                f"case {wrong} of {m.env}: there are 0 to {len(cases) - 1}"
+                if ids
+                else "no cases are asked for",
+            )
+        row = EvaluationRow(
+            evaluation=f"e-{secrets.token_hex(8)}",
+            key=m.key,
+            env=m.env,
+            bundle=m.bundle,
+            split=m.split,
+            case_ids=ids,
+            cases=tuple(cases[case_id] for case_id in ids),
+            secret=secrets.token_bytes(32) if of is None else of.secret,
+            record=m.record,
+            tier=m.sandbox_tier,
+            limits=m.limits,
+            replays=m.replays,
+            as_in=m.as_in,
+            max_steps=_max_steps(m.env, m.step_limit),
+        )
+        return events.EvaluationRequested(stimulus_id=stimulus, request=request, message=m, row=row)
+
+    def _check_profile(self, wanted: operator.RunSettings) -> None:
+        """ConfigError where a run of profile `published` has other settings, or would play other than case files."""
+        if wanted.profile == "own":
+            return
+        if differences := operator.off_profile(wanted):
+            raise ConfigError(f"a run of profile published cannot have {differences}")
+        if not self._source.from_files:
+            raise ConfigError(
+                "profile published plays the published case files, and this coordinator derives its cases from a secret:"
+                " start it with --data FOLDER, the folder data/main-128 of the published software"
+            )
+
+    def _check_published(self, n_train: int) -> None:
+        if n_train != operator.PUBLISHED_TRAIN:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"the published train splits have {operator.PUBLISHED_TRAIN:,} cases each, the one in this coordinator's"
+                f" --data has {n_train:,}; give it data/main-128 of the published software, or leave out the profile",
+            )
+
+    def split_hashes(self, m: operator.DescribeEnvironment, of: RunRow | None = None) -> dict[str, str]:
+        """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits.
+
+        `of`: the finished run that is asked about: its own where its cases came from a secret.
+        """
+        if (run := _derived(of)) is not None:
+            return run.split_hashes
+        try:
+            suite = catalogue.suite_of(m.env)
+            return self._source.splits(
+                suite.name, m.env, self._counts(suite, m.n_validation, m.n_heldout)
+            ).hashes()
+        except ConfigError as error:
+            raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
+
+    def _checked_repin(self, m: operator.RepinRun) -> operator.RepinRun:
+        if not m.reason.strip():
+            raise RefusedError(Refusal.BAD_MESSAGE, "an override of a run's fingerprint class needs a reason")
+        return m
+
+    def _counts(
+        self, suite: catalogue.Suite, n_validation: int | None, n_heldout: int | None
+    ) -> dict[Split, int]:
+        """How many cases of each split a run has: of files all, unless it asks for fewer."""
+        if min(_or(n_validation, 1), _or(n_heldout, 1)) < 1:
+            raise ConfigError("a run needs at least one validation and one held-out case")
+        asked: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
+        usual: dict[Split, int] = {
+            "train": suite.n_train,
+            "validation": suite.n_validation,
+            "heldout": suite.n_heldout,
+        }
+        if self._source.from_files:
+            return {split: n for split, n in asked.items() if n is not None}
+        return {split: _or(asked[split], n) for split, n in usual.items()}
+
+    def _check_again(self, m: operator.Evaluate, n: int) -> None:
+        """Whether what is to be played again is told without contradiction."""
+        if m.replays and (m.bundle is not None or len(m.replays) != n):
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, f"{len(m.replays)} recordings for {n} cases, or a bundle beside them"
+            )
+        for ref in m.replays:
+            if not (is_digest(ref.digest) and self._blobs.has(ref.digest)):
+                raise RefusedError(
+                    Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here; upload it first"
+                )
+        place = m.as_in
+        if place is None:
+            return
+        whole = len(place.env_instances)
+        fits = len(place.indexes) == n and all(0 <= index < whole for index in place.indexes)
+        if not fits or not 1 <= place.modulo <= MAX_COUNT or not -1 <= place.submit_index <= MAX_COUNT:
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, f"{n} cases do not fit the list of {whole} they are said to be of"
+            )
+        if place.policy_scope == "submit" and m.bundle is not None and place.indexes != tuple(range(whole)):
+            raise RefusedError(
+                Refusal.BAD_MESSAGE, "with policy scope submit only whole submits are played again"
+            )
+
+    def _check_bundle(self, digest: str | None, run: str | None = None) -> None:
+        """Whether it is stored; with `run`, also whether that run's gateway has brought it."""
+        brought = digest is None or run is None or self._uploads.has_sent(run, digest)
+        if digest is not None and not (brought and is_digest(digest) and self._blobs.has(digest)):
+            raise RefusedError(
+                Refusal.MISSING_BUNDLE, f"bundle {digest[:64]!r} is not stored here; upload it first"
+            )
+
+
+_WITH_CURSOR = (gateway.ResultsRequest, operator.EvaluationPoll)
+_WITH_WAIT = (
+    worker.LeaseRequest,
+    worker.Heartbeat,
+    gateway.RequestPermit,
+    gateway.ResultsRequest,
+    operator.WaitRun,
+    operator.EvaluationPoll,
+)
+_CHECKS: dict[type[Message], Callable[[RequestParser, Any], Message]] = {
+    worker.LeaseRequest: RequestParser._as_it_is,
+    worker.Heartbeat: RequestParser._as_it_is,
+    worker.ReportResults: RequestParser._checked_results,
+    gateway.OpenRun: RequestParser._as_it_is,
+    gateway.StateRequest: RequestParser._as_it_is,
+    gateway.RequestPermit: RequestParser._checked_permit,
+    gateway.Submit: RequestParser._checked_submit,
+    gateway.ResultsRequest: RequestParser._checked_poll,
+    gateway.CloseRun: RequestParser._checked_close,
+    operator.WaitRun: RequestParser._as_it_is,
+    operator.EvaluationPoll: RequestParser._as_it_is,
+    operator.CancelRun: RequestParser._as_it_is,
+    operator.AgentGone: RequestParser._as_it_is,
+    operator.RepinRun: RequestParser._checked_repin,
+    operator.SetWorker: RequestParser._as_it_is,
+}
+"""What is checked of a request before an event carries it."""
+_EVENTS: dict[type[Message], Callable[[RequestParser, Any, int, str], AnyEvent]] = {
+    worker.Register: RequestParser._registered,
+    operator.CreateRun: RequestParser._run_created,
+    operator.Evaluate: RequestParser.evaluation_requested,
+}
+"""Requests that the shell adds something to: ids, secrets, cases."""
+
+
+def _derived(run: RunRow | None) -> RunRow | None:
+    """The run, where its cases came from a secret: its coordinator may have another now (see `splits.secret_of`)."""
+    return run if run is not None and run.split_hashes.keys() == set(SPLITS) else None
+
+
+def _or(value: int | None, otherwise: int) -> int:
+    return otherwise if value is None else value
+
+
+def _max_steps(env: str, step_limit: StepLimit) -> int:
+    """Steps after which an episode is cut; 0: only its environment ends it."""
+    return (catalogue.entry(env).published_steps or 0) if step_limit == "published" else 0

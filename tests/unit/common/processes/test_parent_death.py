@@ -1,0 +1,52 @@
+"""Programs end with the process that started them."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+from own_processes import alive
+
+from evopolicy_common.processes import parent_death
+
+
+def test_a_leashed_program_ends_with_its_parent() -> None:
+    parent = """
+import subprocess, sys, time
+from evopolicy_common.processes.parent_death import ending_with_parent
+child = subprocess.Popen(ending_with_parent([sys.executable, "-c", "print('up', flush=True); import time; time.sleep(1000)"]))
+print(child.pid, flush=True)
+time.sleep(1000)
+"""
+    process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = sorted(process.stdout.readline().strip() for _ in range(2))
+    child = int(said[0])
+    assert said[1] == "up"
+    assert alive(child)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    deadline = time.monotonic() + 20
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not alive(child)
+
+
+def test_a_leash_whose_holder_is_gone_starts_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, parent_death.__file__, "1", "9", "/bin/echo", "started"],
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, b"")
+
+
+def test_a_program_that_is_not_there_is_told_in_one_line() -> None:
+    done = subprocess.run(
+        parent_death.ending_with_parent(["/no/such/program"]), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 127
+    assert done.stderr == "cannot start /no/such/program: No such file or directory\n"

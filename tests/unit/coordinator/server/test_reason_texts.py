@@ -1,0 +1,73 @@
+"""The core's codes and the shell's words for them belong together."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import string
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import evopolicy_coordinator.core
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.worker import Refused
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.effects import Refuse, Reply
+from evopolicy_coordinator.core.reasons import Code, because
+from evopolicy_coordinator.server.reason_texts import TEXTS, message, words
+
+CORE = Path(evopolicy_coordinator.core.__file__).parent
+
+
+def given() -> list[tuple[str, set[str]]]:
+    """Codes that the core's rules give, each with the names of what it is about."""
+    found = []
+    for path in sorted(CORE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "because":
+                about = {keyword.arg or "" for keyword in node.keywords}
+                found += [
+                    (each.value, about)
+                    for each in ast.walk(node.args[0])
+                    if isinstance(each, ast.Constant) and each.value in get_args(Code)
+                ]
+    return found
+
+
+def test_every_code_has_words_and_is_given_somewhere() -> None:
+    assert set(TEXTS) == set(get_args(Code)) == {code for code, _ in given()}
+
+
+@pytest.mark.parametrize(("code", "about"), given())
+def test_words_name_exactly_what_a_reason_is_about(code: Code, about: set[str]) -> None:
+    text = TEXTS[code]
+    if isinstance(text, str):
+        wanted = {name for _, name, _, _ in string.Formatter().parse(text) if name}
+    else:
+        wanted = set(inspect.signature(text).parameters)
+    assert about == wanted
+
+
+def test_a_reason_about_another_is_put_into_one_sentence() -> None:
+    missing = because("workers", env="gym/x", tier="bwrap", same_versions=True, away=("lost", "quarantined"))
+    assert words(because("no_worker_yet", waits_for=missing)) == (
+        "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the same versions as the run began with:"
+        " those that do are lost or out of service"
+    )
+
+
+def test_a_refusal_is_answered_with_its_status_and_words() -> None:
+    told = message(Refuse(request=1, status=Refusal.BUSY, reason=because("busy", submit=3)))
+    assert told == Refused(status=Refusal.BUSY, message="submit 3 is still running; one runs at a time")
+
+
+def test_what_an_open_submit_waits_for_stands_in_the_state_of_its_run() -> None:
+    in_flight = gateway.SubmitInFlight(submit_index=0, n_episodes=2, n_done=0)
+    state = gateway.RunState(remaining_budget=1, n_submits=1, is_finalized=False, in_flight=in_flight)
+    told = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))
+    assert isinstance(told, gateway.StateReply)
+    assert told.state.in_flight is not None
+    assert told.state.in_flight.waits_for == "hidden cases of another run are being scored"
+    assert told.state.in_flight.n_episodes == 2

@@ -1,0 +1,355 @@
+"""The intake: which requests become events, and why the others do not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from store_rows import blob
+
+from evopolicy_common.errors import ProtocolError, RefusedError
+from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.worker import Message
+from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire import codec, keys
+from evopolicy_coordinator.server import request_checks
+from evopolicy_coordinator.server.request_parser import RequestParser
+from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.splits import SplitSource
+from evopolicy_coordinator.storage.state_folder import ROLES, Identity
+
+IDENTITY = Identity(
+    cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
+)
+
+
+class OneRun:
+    """Rights of a coordinator that has the run `r`."""
+
+    def capability(self, run: str) -> str | None:
+        return "capable" if run == "r" else None
+
+
+@pytest.fixture
+def blobs(tmp_path: Path) -> BlobStore:
+    return BlobStore(tmp_path)
+
+
+@pytest.fixture
+def uploads() -> Uploads:
+    return Uploads()
+
+
+@pytest.fixture
+def parser(blobs: BlobStore, uploads: Uploads) -> RequestParser:
+    return make_parser(blobs, uploads)
+
+
+def make_parser(blobs: BlobStore, uploads: Uploads | None = None) -> RequestParser:
+    source = SplitSource(data=None, secret=b"s" * 32)
+    return RequestParser(
+        *(IDENTITY, blobs, source, uploads or Uploads()),
+        allowed_imports=("numpy",),
+        denied_imports=("gymnasium",),
+    )
+
+
+def event(parser: RequestParser, key: str, message: Message) -> Any:
+    return parser.event(parser.parse(key, codec.encode(message), OneRun()), 7, "stimulus")
+
+
+def refused(parser: RequestParser, key: str, message: Message) -> RefusedError:
+    with pytest.raises(RefusedError) as caught:
+        event(parser, key, message)
+    return caught.value
+
+
+def submit(**changes: Any) -> gateway.Submit:
+    values = {"run": "r", "token": "capable", "key": "k", "env_instances": (0,), "bundle": None, **changes}
+    return gateway.Submit(**values)
+
+
+def create(**settings: Any) -> operator.CreateRun:
+    values = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", **settings}
+    return operator.CreateRun(token="operate", key="k", settings=RunSettings(**values))
+
+
+def evaluate(**changes: Any) -> operator.Evaluate:
+    values = {
+        "token": "operate",
+        "key": "k",
+        "env": "toy/line",
+        "bundle": None,
+        "split": "train",
+        "cases": None,
+    }
+    return operator.Evaluate(**{**values, **changes})
+
+
+SUBMIT = keys.gateway_key("c", "r", "submit")
+OPS = keys.operator_key("c", "any")
+
+
+def test_run_takes_its_numbers_and_cases_from_its_suite(parser: RequestParser) -> None:
+    made = event(parser, OPS, create())
+    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (
+        128,
+        1,
+        128,
+    )
+    assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (64, 16, 32)
+    assert made.row.split_secret
+    assert len(made.row.secret) == 32
+    assert keys.valid_name(made.row.run)
+    assert (made.row.allowed_imports, made.row.denied_imports) == (("numpy",), ("gymnasium",))
+    other = event(parser, OPS, create())
+    assert (other.row.train, other.row.split_hashes) == (made.row.train, made.row.split_hashes)
+    assert made.row.run != other.row.run
+    assert made.row.capability != other.row.capability
+    assert made.row.secret != other.row.secret
+
+
+def test_run_may_ask_for_other_numbers(parser: RequestParser) -> None:
+    made = event(parser, OPS, create(budget=8, n_validation=3, n_heldout=4, min_episodes_per_submit=2))
+    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (8, 2, 8)
+    usual = event(parser, OPS, create())
+    assert made.row.validation == usual.row.validation[:3]
+    assert made.row.heldout == usual.row.heldout[:4]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"env": "toy/lime"}, "toy/line"),
+        ({"budget": 0}, "budget 0"),
+        ({"budget": -1}, "budget -1"),
+        ({"budget": 4, "min_episodes_per_submit": 5}, "5 to 4"),
+        ({"min_episodes_per_submit": 0}, "0 to 128"),
+        ({"n_heldout": 0}, "at least one"),
+        ({"budget": 20_001}, "20,000"),
+        ({"budget": 20_000, "max_episodes_per_submit": 10_001}, "10,000"),
+        ({"n_heldout": 10_001}, "10,000"),
+        ({"n_validation": 10_001}, "10,000"),
+        ({"limits": ResourceLimits(act_wall_s=-1.0)}, "limit act_wall_s is -1.0"),
+        ({"limits": ResourceLimits(memory_bytes=0)}, "limit memory_bytes is 0"),
+        ({"limits": ResourceLimits(submit_wall_s=1e300)}, "limit submit_wall_s is 1e+300"),
+        ({"limits": ResourceLimits(output_bytes=65537)}, "at most 65,536"),
+        ({"limits": ResourceLimits(action_bytes=1 << 30)}, "at most 1,048,576"),
+        ({"limits": ResourceLimits(memory_bytes=1 << 60)}, "limit memory_bytes"),
+    ],
+)
+def test_run_with_impossible_settings_is_refused(
+    parser: RequestParser, settings: dict[str, Any], message: str
+) -> None:
+    error = refused(parser, OPS, create(**settings))
+    assert error.status == "invalid_settings"
+    assert message in error.message
+
+
+def test_what_an_agent_is_said_to_have_done_is_bounded_and_closes_its_run_all_the_same(
+    parser: RequestParser,
+) -> None:
+    key = keys.gateway_key("c", "r", "close")
+    for facts in ({"turns": 3}, {"turns": 3, "notes": ["x" * 1000] * 300}):
+        made = event(
+            parser, key, gateway.CloseRun(run="r", token="capable", reason="agent_stopped", agent=facts)
+        )
+        assert made.message.agent == (
+            facts if len(facts) == 1 else {"left_out": "300,917 bytes; 262,144 are the limit"}
+        )
+
+
+def test_a_submits_episodes_fit_into_one_lease_with_policy_scope_submit() -> None:
+    cases = [Case(seed=k, options={"map": "x" * 4000}) for k in range(5)]
+    request_checks.check_job(cases, 1000)
+    with pytest.raises(RefusedError, match="4000 episodes"):
+        request_checks.check_job(cases, 4000)
+
+
+def test_evaluation_plays_the_cases_named(parser: RequestParser) -> None:
+    made = event(parser, OPS, evaluate(cases=(5, 0, 5)))
+    run = event(parser, OPS, create())
+    assert made.row.cases == (run.row.train[5], run.row.train[0], run.row.train[5])
+    assert len(event(parser, OPS, evaluate(split="heldout")).row.cases) == 32
+    for cases in ((64,), (-1,), ()):
+        assert refused(parser, OPS, evaluate(cases=cases)).status == "invalid_env_instance"
+
+
+def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
+    parser: RequestParser, blobs: BlobStore, uploads: Uploads
+) -> None:
+    failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
+    assert event(parser, SUBMIT, submit(bundle_error=failure)).message.bundle_error == failure
+    assert refused(parser, SUBMIT, submit(bundle="a" * 64)).status == "missing_bundle"
+    assert refused(parser, SUBMIT, submit(bundle="../../identity.json")).status == "missing_bundle"
+    stored = blobs.put(b"bundle")
+    # Stored by another run, it is as if it were not here.
+    uploads.note("another", stored)
+    assert refused(parser, SUBMIT, submit(bundle=stored)).status == "missing_bundle"
+    uploads.note("r", stored)
+    assert event(parser, SUBMIT, submit(bundle=stored)).message.bundle == stored
+    assert refused(parser, SUBMIT, submit()).status == "bad_message"
+    assert refused(parser, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"
+
+
+def test_override_of_a_runs_class_needs_a_reason(parser: RequestParser) -> None:
+    values = {"token": "operate", "run": "r", "fingerprint_class": "c"}
+    assert event(parser, OPS, operator.RepinRun(**values, reason="gone")).message.reason == "gone"
+    assert refused(parser, OPS, operator.RepinRun(**values, reason=" ")).status == "bad_message"
+
+
+@pytest.mark.parametrize("key", ["", "k" * 201])
+def test_idempotency_key_has_a_length(parser: RequestParser, key: str) -> None:
+    failure = PolicyFailure(category="missing_policy", step_index=None, message="")
+    assert refused(parser, SUBMIT, submit(key=key, bundle_error=failure)).status == "bad_message"
+
+
+def hand_in(**blobs_of_outcome: BlobRef) -> worker.ReportResults:
+    outcome = EpisodeOutcome(
+        index=0, episode_return=1.0, length=1, terminated=True, truncated=False, **blobs_of_outcome
+    )
+    result = worker.JobResult(lease_id="l", job_id="j", attempt=1, kind="done", episodes=(outcome,))
+    return worker.ReportResults(worker="w", session="s", results=(result,))
+
+
+def test_results_must_hold_or_have_stored_the_blobs_they_name(
+    parser: RequestParser, blobs: BlobStore
+) -> None:
+    key = keys.worker_key("c", "done")
+    data = b"trajectory"
+    assert event(parser, key, hand_in(trajectory=blob(data))).message == hand_in(trajectory=blob(data))
+    named = blob(data, inline=False)
+    assert refused(parser, key, hand_in(trajectory=named)).status == "missing_blob"
+    blobs.put(data)
+    assert event(parser, key, hand_in(trajectory=named)).message == hand_in(trajectory=named)
+    wrong = BlobRef(digest=named.digest, size=len(data), inline=b"trajectorY")
+    assert refused(parser, key, hand_in(video=wrong)).status == "bad_blob"
+    assert refused(parser, key, hand_in(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({"token": "guess"}, "bad_token"),
+        ({"token": "operate"}, "bad_token"),
+        ({"protocol": codec.WIRE_VERSION + 1}, "wrong_protocol"),
+        ({"worker": "a/b"}, "bad_name"),
+        ({"worker": ""}, "bad_name"),
+        ({"slots": 0}, "bad_message"),
+    ],
+)
+def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str, Any], status: str) -> None:
+    values: dict[str, Any] = {
+        "worker": "w",
+        "token": "join",
+        "protocol": codec.WIRE_VERSION,
+        "slots": 1,
+        "tiers": (),
+        "environments": (),
+        "fingerprint": worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
+    }
+    key = keys.worker_key("c", "register")
+    made = event(parser, key, worker.Register(**values))
+    assert len(made.session) >= 16
+    assert refused(parser, key, worker.Register(**{**values, **changes})).status == status
+
+
+@given(wait=st.floats(allow_nan=False, allow_infinity=False), cursor=st.integers(-(2**63), 2**63 - 1))
+def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
+    tmp_path_factory: pytest.TempPathFactory, wait: float, cursor: int
+) -> None:
+    parser = make_parser(BlobStore(tmp_path_factory.getbasetemp()))
+    message = gateway.ResultsRequest(run="r", token="capable", submit_index=0, cursor=cursor, wait_s=wait)
+    made = event(parser, keys.gateway_key("c", "r", "results"), message)
+    assert 0 <= made.message.wait_s <= 60
+    assert 0 <= made.message.cursor < 2**31
+
+
+@pytest.mark.parametrize("index", [-1, 2**31, 2**63 - 1])
+def test_submit_index_that_cannot_be_is_unknown(parser: RequestParser, index: int) -> None:
+    message = gateway.ResultsRequest(run="r", token="capable", submit_index=index, cursor=0, wait_s=0)
+    assert refused(parser, keys.gateway_key("c", "r", "results"), message).status == "unknown_submit"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "evopolicy/v1/other/ops/status",
+        "evopolicy/v1/c/else/status",
+        keys.worker_key("c", "done"),
+        keys.gateway_key("c", "r", "state"),
+        keys.gateway_key("c", "*", "submit"),
+        keys.gateway_key("c", "**", ""),
+        "",
+    ],
+)
+def test_message_on_a_wrong_key_is_refused(parser: RequestParser, key: str) -> None:
+    with pytest.raises((RefusedError, ProtocolError)):
+        parser.parse(key, codec.encode(submit()), OneRun())
+
+
+@given(payload=st.binary(max_size=200), room=st.sampled_from(["work/lease", "gw/r/submit", "ops/any"]))
+def test_any_bytes_are_refused_without_a_stumble(
+    tmp_path_factory: pytest.TempPathFactory, payload: bytes, room: str
+) -> None:
+    parser = make_parser(BlobStore(tmp_path_factory.getbasetemp()))
+    with pytest.raises((RefusedError, ProtocolError)):
+        parser.parse(f"evopolicy/v1/c/{room}", payload, OneRun())
+
+
+def test_only_what_makes_something_new_asks_for_change(parser: RequestParser) -> None:
+    assert parser.asks_for_change(SUBMIT, codec.encode(submit()))
+    assert parser.asks_for_change(OPS, codec.encode(create()))
+    assert parser.asks_for_change(OPS, codec.encode(evaluate()))
+    assert not parser.asks_for_change(OPS, codec.encode(operator.StatusRequest(token="")))
+    assert not parser.asks_for_change(SUBMIT, b"junk")
+    assert not parser.asks_for_change(keys.worker_key("c", "done"), codec.encode(hand_in()))
+
+
+MINIGRID = "gymnasium/MiniGrid-DoorKey-16x16-v0"
+
+
+def test_episodes_are_cut_where_the_published_software_cuts_them_if_asked(parser: RequestParser) -> None:
+    assert event(parser, OPS, create(env=MINIGRID, step_limit="published")).row.max_steps == 1000
+    assert event(parser, OPS, create(env=MINIGRID, step_limit="natural")).row.max_steps == 0
+    assert event(parser, OPS, create(env="gym/acrobot", step_limit="published")).row.max_steps == 0
+    assert event(parser, OPS, evaluate(env=MINIGRID, step_limit="published")).row.max_steps == 1000
+    assert event(parser, OPS, evaluate(env=MINIGRID)).row.max_steps == 0
+
+
+def published_tree(root: Path, n_train: int) -> Path:
+    """Case files as the published software has them."""
+    folder = root / "toy" / "line"
+    folder.mkdir(parents=True)
+    numbers = iter(range(10**6))
+    for split, n in (("train", n_train), ("valid", 64), ("heldout", 256)):
+        cases = [{"seed": next(numbers)} for _ in range(n)]
+        document = {"env": "toy/line", "split": split, "cases": cases}
+        (folder / f"{split}.json").write_text(json.dumps(document))
+    return root
+
+
+def test_profile_published_plays_the_published_files_by_the_published_rules_or_not_at_all(
+    blobs: BlobStore, tmp_path: Path
+) -> None:
+    def at(data: Path | None) -> RequestParser:
+        source = SplitSource(data=data, secret=b"s" * 32)
+        return RequestParser(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())
+
+    published = {**operator.PUBLISHED, "profile": "published"}
+    whole = at(published_tree(tmp_path / "whole", 1024))
+    made = event(whole, OPS, create(**published, n_validation=16, n_heldout=32))
+    assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (1024, 16, 32)
+    assert not made.row.split_secret
+    assert "start it with --data" in refused(at(None), OPS, create(**published)).message
+    short = at(published_tree(tmp_path / "short", 64))
+    assert "1,024 cases each" in refused(short, OPS, create(**published)).message
+    for name, value in (("observations", "arrays"), ("finish", "early"), ("simulation", "allowed")):
+        assert f"{name} {value} (not" in refused(whole, OPS, create(**(published | {name: value}))).message

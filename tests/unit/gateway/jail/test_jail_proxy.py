@@ -1,0 +1,130 @@
+"""The proxy of a jail: which requests lead out."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import Any
+
+import pytest
+
+from evopolicy_gateway.jail import proxy
+from evopolicy_gateway.jail.proxy import JailProxy
+from evopolicy_gateway.jail.settings import Host
+
+
+async def ask(request: bytes, hosts: frozenset[Host] = frozenset(), *, then: bytes = b"") -> bytes:
+    """What the proxy answers, its listening socket handed over as a jail does it."""
+    opened = JailProxy({}, hosts)
+    here, there = socket.socketpair()
+    listening = socket.create_server(("127.0.0.1", 0))
+    socket.send_fds(there, [b"."], [listening.fileno()])
+    await opened.serve(here)
+    reader, writer = await asyncio.open_connection(*listening.getsockname())
+    try:
+        writer.write(request + then)
+        writer.write_eof()
+        return await asyncio.wait_for(reader.read(), 30)
+    finally:
+        writer.close()
+        await opened.close()
+        for sock in (here, there, listening):
+            sock.close()
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [
+        ("GET http://example.org/ HTTP/1.1", b"405"),
+        ("CONNECT example.org:443", b"405"),
+        ("CONNECT example.org:80 HTTP/1.1", b"403"),
+        ("CONNECT example.org:4_43 HTTP/1.1", b"403"),
+        ("CONNECT evil.example.org:443 HTTP/1.1", b"403"),
+        ("CONNECT example.org.evil:443 HTTP/1.1", b"403"),
+        ("CONNECT example.org HTTP/1.1", b"403"),
+        ("CONNECT 127.0.0.1:443 HTTP/1.1", b"403"),
+    ],
+)
+def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
+    hosts = frozenset({("example.org", 443)})
+    answer = asyncio.run(ask(request_line.encode() + b"\r\n\r\n", hosts))
+    assert answer.split()[1] == status
+
+
+def test_a_named_host_gets_the_bytes_and_answers() -> None:
+    async def main() -> bytes:
+        async def shout(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write((await reader.read()).upper())
+            await writer.drain()
+            writer.close()
+
+        server = await asyncio.start_server(shout, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        async with server:
+            request = f"CONNECT LocalHost:{port} HTTP/1.1\r\nhost: x\r\n\r\n".encode()
+            return await ask(request, frozenset({("localhost", port)}), then=b"psst")
+
+    answer = asyncio.run(main())
+    assert answer.startswith(b"HTTP/1.1 200")
+    assert answer.endswith(b"\r\n\r\nPSST")
+
+
+def test_a_named_host_that_is_away_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    answer = asyncio.run(
+        ask(f"CONNECT localhost:{port} HTTP/1.1\r\n\r\n".encode(), frozenset({("localhost", port)}))
+    )
+    assert answer.split()[1] == b"502"
+
+
+def test_a_head_without_end_is_cut() -> None:
+    assert asyncio.run(ask(b"x" * 100_000)) == b""
+
+
+def test_a_program_that_ended_before_it_handed_out_its_sockets_opens_no_door() -> None:
+    async def main() -> None:
+        opened = JailProxy({}, frozenset())
+        here, there = socket.socketpair()
+        there.close()
+        await asyncio.wait_for(opened.serve(here), 30)
+        await opened.close()
+        here.close()
+
+    asyncio.run(main())
+
+
+def test_a_jailed_program_that_asks_for_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proxy, "_HEAD_TIMEOUT_S", 0.2)
+
+    async def main() -> bytes:
+        found = JailProxy({}, frozenset())
+        here, there = socket.socketpair()
+        listening = socket.create_server(("127.0.0.1", 0))
+        socket.send_fds(there, [b"."], [listening.fileno()])
+        await found.serve(here)
+        reader, writer = await asyncio.open_connection(*listening.getsockname())
+        try:
+            return await asyncio.wait_for(reader.read(), 30)
+        finally:
+            writer.close()
+            await found.close()
+            for sock in (here, there, listening):
+                sock.close()
+
+    assert asyncio.run(main()) == b""
+
+
+def test_a_named_host_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proxy, "_CONNECT_TIMEOUT_S", 0.2)
+    connect = asyncio.open_connection
+
+    async def to_nowhere(host: str, port: int, *more: Any) -> Any:
+        if host == "example.org":
+            await asyncio.sleep(1000)
+        return await connect(host, port, *more)
+
+    monkeypatch.setattr(asyncio, "open_connection", to_nowhere)
+    request = b"CONNECT example.org:443 HTTP/1.1\r\n\r\n"
+    answer = asyncio.run(ask(request, frozenset({("example.org", 443)})))
+    assert answer.split()[1] == b"502"
