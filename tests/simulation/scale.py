@@ -203,7 +203,7 @@ class Load:
             )
         )
 
-    def _hand_in(self, worker: int, lease: wire.Lease) -> None:
+    def _report_results(self, worker: int, lease: wire.Lease) -> None:
         self._held[worker].pop(lease.lease_id, None)
         outcomes = tuple(
             EpisodeOutcome(
@@ -278,7 +278,7 @@ class Load:
                 self._take(effects)
             if playing and playing[0][0] <= self.now:
                 _, worker, lease = playing.popleft()
-                self._hand_in(worker, lease)
+                self._report_results(worker, lease)
                 if self._measure and marks and self.done >= marks[0]:
                     marks.pop(0)
                     gc.collect()

@@ -182,7 +182,7 @@ class SimWorker(Asker):
                 self._beat()
                 self._look_at_silence()
             self._poll()
-            self._hand_in()
+            self._report_results()
 
         self.ask(wire.Register, fields, registered)
 
@@ -300,9 +300,9 @@ class SimWorker(Asker):
                 begun=begun,
             )
         )
-        self._hand_in()
+        self._report_results()
 
-    def _hand_in(self) -> None:
+    def _report_results(self) -> None:
         if self.handing or not self.outbox or not self.session:
             return
         self.handing = True
@@ -314,7 +314,7 @@ class SimWorker(Asker):
             if self._lost_session(message):
                 return
             self.outbox = [each for each in self.outbox if each not in batch]
-            self._hand_in()
+            self._report_results()
             self._poll()
 
         self.ask(wire.ReportResults, fields, answered)

@@ -61,8 +61,8 @@ class Fleet:
         self.sessions[name] = session
         self.rig.beat(session)
 
-    def hand_in(self, name: str, lease: wire.Lease) -> Any:
-        return self.rig.hand_in(self.sessions[name], self.done(name, lease))
+    def report_results(self, name: str, lease: wire.Lease) -> Any:
+        return self.rig.report_results(self.sessions[name], self.done(name, lease))
 
     def done(self, name: str, lease: wire.Lease) -> wire.JobResult:
         self.played.append((name, lease.job.job_id))
@@ -81,7 +81,7 @@ class Fleet:
             if name in self.rig.core.state.quarantined:
                 continue
             for lease in self.rig.poll(self.sessions[name]) or ():
-                self.hand_in(name, lease)
+                self.report_results(name, lease)
                 n += 1
         return n + self.shell()
 

@@ -155,7 +155,7 @@ class InstantWorker:
         request = worker.LeaseRequest(worker=self.name, session=self.session, n=n, wait_s=wait_s)
         return (await self.ask.until_answered("lease", request, worker.Leases, wait_s=wait_s)).leases
 
-    async def hand_in(self, results: tuple[worker.JobResult, ...]) -> None:
+    async def report_results(self, results: tuple[worker.JobResult, ...]) -> None:
         message = worker.ReportResults(worker=self.name, session=self.session, results=results)
         await self.ask.until_answered("done", message, worker.ResultsReported)
 
@@ -181,7 +181,7 @@ class InstantWorker:
                 await self.hold.wait()
                 await asyncio.sleep(self.pause_s)
                 if leases:
-                    await self.hand_in(tuple(self.result(lease) for lease in leases))
+                    await self.report_results(tuple(self.result(lease) for lease in leases))
                 leases = ()
             except RefusedError as error:
                 if error.status != "unknown_worker":

@@ -316,7 +316,7 @@ class Rig:
             )
         )
 
-    def hand_in(self, session: str, *results: wire.JobResult) -> Any:
+    def report_results(self, session: str, *results: wire.JobResult) -> Any:
         return self.tell(
             asked(
                 wire.ReportResults,
@@ -331,7 +331,7 @@ class Rig:
         self, session: str, *leases: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None
     ) -> Any:
         """Hand in outcomes of leases."""
-        return self.hand_in(session, *(done(lease, value, failure) for lease in leases))
+        return self.report_results(session, *(done(lease, value, failure) for lease in leases))
 
     def results(self, submit_index: int = 0, cursor: int = 0, wait_s: float = 0.0, run: str = "r1") -> Any:
         return self.tell(
@@ -356,7 +356,7 @@ class Rig:
             if not leases:
                 return n
             n += len(leases)
-            self.hand_in(session, *(done(lease, values(lease.job)) for lease in leases))
+            self.report_results(session, *(done(lease, values(lease.job)) for lease in leases))
         raise AssertionError("there is no end to the work")
 
     # ---- looking ----

@@ -373,7 +373,7 @@ class Double:
             if any(spec.case.seed >= HIDDEN_FROM for lease in found.values() for spec in lease.job.episodes):
                 while self.scoring.is_set():
                     await asyncio.sleep(0.01)
-                await self._hand_in(list(found.values()))
+                await self._report_results(list(found.values()))
             elif not self.submits or len(found) == len(self.submits[-1].env_instances):
                 await self._play(found)
 
@@ -381,13 +381,13 @@ class Double:
         """Hands a submit's episodes in, one after another."""
         order = self.order(len(found))
         for index in order:
-            await self._hand_in([found[index]])
+            await self._report_results([found[index]])
         if len(order) < len(found):
             self.world.service._unix_offset += SUBMIT_WALL_S + 1.0
             self.world.service._on_timer()
             self._held.clear()
 
-    async def _hand_in(self, leases: list[worker.Lease]) -> None:
+    async def _report_results(self, leases: list[worker.Lease]) -> None:
         for lease in leases:
             episodes = tuple(outcome(spec, self.failures.get(spec.index)) for spec in lease.job.episodes)
             for each in episodes:

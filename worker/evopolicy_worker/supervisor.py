@@ -154,9 +154,9 @@ class Supervisor:
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
         # The result report task outlives the others: what was played is reported before the worker goes.
-        hand_in = asyncio.create_task(self._outbox.run())
-        hand_in.add_done_callback(self._hand_in_ended)
-        working = asyncio.create_task(self._work_and_hand_in())
+        report_results = asyncio.create_task(self._outbox.run())
+        report_results.add_done_callback(self._report_ended)
+        working = asyncio.create_task(self._work_and_report())
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
             if self._failed.done():
@@ -164,17 +164,17 @@ class Supervisor:
             await working
         finally:
             self._heartbeat.stop()
-            for task in (working, hand_in):
+            for task in (working, report_results):
                 task.cancel()
-            await asyncio.gather(working, hand_in, return_exceptions=True)
+            await asyncio.gather(working, report_results, return_exceptions=True)
             self._failed.cancel()
 
-    async def _work_and_hand_in(self) -> None:
+    async def _work_and_report(self) -> None:
         await self._work()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
 
-    def _hand_in_ended(self, task: asyncio.Task[None]) -> None:
+    def _report_ended(self, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()
         if error is not None:
             self._fail("reporting", error)

@@ -68,11 +68,11 @@ PLACES = {
         "Make and check the split files of environments (hidden cases: keep them from agents).",
     ),
     "disk": Place(
-        f"{_COORDINATOR}.upkeep:disk_app",
+        f"{_COORDINATOR}.gc:disk_app",
         "What the stored runs take by environment, and whether a planned sweep fits; its run directories come on top.",
     ),
     "gc": Place(
-        f"{_COORDINATOR}.upkeep:gc_app",
+        f"{_COORDINATOR}.gc:gc_app",
         "Removes the episodes and bundles of runs that finished long ago, and blobs that nothing names.",
     ),
 }

@@ -7,7 +7,7 @@
 
 No clock, RNG, disk, log or await in here: `now` and randomness come in, ordered effects and the next deadline go out.
 
-Where to begin: `transcripts/submit.txt` and `transcripts/hand_in.txt` show what the core is told, which rules act and what
+Where to begin: `transcripts/submit.txt` and `transcripts/result_report.txt` show what the core is told, which rules act and what
 it asks of its shell. Then `machine`, whose tables say who takes which event, news and deadline; `model` and `state`, what the
 rules work on; and the rules, each folder building on those before it: `isolation` (who may be on which kernel), `leasing` (from
 the queue to a worker and back), `agents` (permits, and who goes first), `workers` (what workers ask), `runs`.

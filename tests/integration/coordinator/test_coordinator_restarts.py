@@ -121,11 +121,11 @@ def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -
                 leases = await worker.lease(2)
                 results = tuple(worker.result(lease) for lease in leases)
                 assert len(results) == 2
-                await worker.hand_in(results)
+                await worker.report_results(results)
                 holder[0].kill()
                 holder[0] = Coordinator(tmp_path / "state")
                 await worker.register()
-                await worker.hand_in(results)
+                await worker.report_results(results)
                 episodes, _ = await gateway.results(0)
                 assert sorted(episode.index for episode in episodes) == [0, 1]
 

@@ -241,11 +241,11 @@ def test_gateway_fetches_blobs_that_its_own_train_feedback_names_and_no_others(
                 assert refused.value.status == "unknown_blob"
                 result = instant.result(lease)
                 with pytest.raises(RefusedError) as refused:
-                    await instant.hand_in((result,))
+                    await instant.report_results((result,))
                 assert refused.value.status == "missing_blob"
                 ((digest, data),) = stored.items()
                 await instant.ask.upload(instant.name, instant.session, digest, data)
-                await instant.hand_in((result,))
+                await instant.report_results((result,))
                 ((episode,), _) = await owner.results(0)
                 assert episode.trajectory.digest == digest
                 assert await owner.ask.download(owner.run, owner.token, digest) == data

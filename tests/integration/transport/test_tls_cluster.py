@@ -121,7 +121,7 @@ def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
                 assert await refusal(way_round.lease(1, 0.0)) == "revoked"
                 assert await refusal(way_round.register(of(cheat).token)) == "bad_token"
                 results = tuple(way_round.result(lease) for lease in leases)
-                assert await refusal(way_round.hand_in(results)) == "revoked"
+                assert await refusal(way_round.report_results(results)) == "revoked"
                 upload = way_round.ask.upload("cheat", revoked.session, "0" * 64, b"blob")
                 assert await refusal(upload) == "revoked"
             async with joined(honest, "honest") as worker, at_work(worker):

@@ -135,7 +135,7 @@ def test_train_jobs_go_before_audits_and_stop_them() -> None:
     fleet.join("w2", slots=2)
     taken = fleet.rig.poll(fleet.sessions["w2"], 1)
     while taken and "audit" not in taken[0].job.job_id:
-        fleet.hand_in("w2", *taken)
+        fleet.report_results("w2", *taken)
         taken = fleet.rig.poll(fleet.sessions["w2"], 1)
     assert taken, "an audit is what there is to do"
     (more,) = fleet.rig.poll(fleet.sessions["w2"], 1)
@@ -144,7 +144,7 @@ def test_train_jobs_go_before_audits_and_stop_them() -> None:
     reply = fleet.rig.beat(fleet.sessions["w2"], *taken, more)
     assert set(reply.cancelled) == {taken[0].lease_id, more.lease_id}
     for lease in (*taken, more):
-        fleet.rig.hand_in(fleet.sessions["w2"], result(lease, "returned"))
+        fleet.rig.report_results(fleet.sessions["w2"], result(lease, "returned"))
     got = fleet.rig.poll(fleet.sessions["w2"], 2)
     assert ["train" in lease.job.job_id and "audit" not in lease.job.job_id for lease in got] == [True, True]
 
@@ -197,7 +197,7 @@ def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() ->
     forged = wire.JobResult(
         lease_id=claimed.lease_id, job_id=job.job_id, attempt=1, kind="done", episodes=(outcome_of(0),)
     )
-    fleet.rig.hand_in(fleet.sessions["w1"], forged)
+    fleet.rig.report_results(fleet.sessions["w1"], forged)
     assert job.job_id in fleet.rig.core.state.jobs, "it is still to be played"
 
 

@@ -240,7 +240,7 @@ def test_a_restart_at_any_step_changes_nothing_of_the_result(stops: list[int]) -
                 rig.beat(session)
                 leases = rig.poll(session, 2)
                 idle = 0 if leases else idle + 1
-                rig.hand_in(
+                rig.report_results(
                     session,
                     *(done(each, float(len(each.job.job_id)) + value_of(each.job)) for each in leases),
                 )
@@ -343,7 +343,7 @@ def test_a_run_that_must_spend_its_budget_and_has_not_is_an_error_without_hidden
     rig.close()
     leases = rig.poll(session, n=4)
     assert {split_of(lease.job) for lease in leases} <= {"train", "validation"}
-    rig.hand_in(session, *(done(lease) for lease in leases))
+    rig.report_results(session, *(done(lease) for lease in leases))
     assert not rig.poll(session, n=4)
     finished = rig.finished()
     assert (finished.status, finished.final_score, finished.random_heldout_returns) == ("error", None, ())
@@ -377,7 +377,7 @@ def test_every_episode_of_a_run_is_cut_where_its_policy_is_told() -> None:
         while leases := rig.poll(session, n=4):
             for lease in leases:
                 kinds[split_of(lease.job)] = (lease.job.max_steps, lease.job.env_meta["max_episode_steps"])
-            rig.hand_in(session, *(done(lease) for lease in leases))
+            rig.report_results(session, *(done(lease) for lease in leases))
     assert len(kinds) >= 3
     assert set(kinds.values()) == {(7, 7)}
     rig.create("r2")

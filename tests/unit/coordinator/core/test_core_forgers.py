@@ -38,11 +38,11 @@ def test_what_a_forger_holds_when_it_is_named_is_played_by_others() -> None:
     fleet = Fleet(w1=0.0, w2=5.0, w3=0.0)
     fleet.train(0, 1, 2, 3, 4, 5)
     held = fleet.rig.poll(fleet.sessions["w2"], 1)
-    fleet.hand_in("w2", *held)
+    fleet.report_results("w2", *held)
     kept = fleet.rig.poll(fleet.sessions["w2"], 1)
     while "w2" not in fleet.rig.core.state.quarantined:
         assert fleet.turn("w1", "w3")
-    late = fleet.rig.hand_in(fleet.sessions["w2"], fleet.done("w2", kept[0]))
+    late = fleet.rig.report_results(fleet.sessions["w2"], fleet.done("w2", kept[0]))
     assert isinstance(late, wire.Refused)
     fleet.work_off()
     job = kept[0].job
@@ -109,7 +109,7 @@ def test_a_recording_that_is_none_is_in_dispute() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
     fleet.train(0)
     (lease,) = fleet.rig.poll(fleet.sessions["w1"], 1)
-    fleet.hand_in("w1", lease)
+    fleet.report_results("w1", lease)
     (effect,) = fleet.rig.audits
     fleet.rig.audits = []
     fleet.rig.tell(

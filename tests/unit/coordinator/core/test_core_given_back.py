@@ -27,7 +27,7 @@ def playing(rig: Rig, *, n_valid: int = 1) -> tuple[str, wire.Lease]:
 
 
 def given_back(rig: Rig, session: str, lease: wire.Lease, begun: BlobRef | None, **more: bool) -> None:
-    rig.hand_in(session, result(lease, "returned", begun=begun, **more))
+    rig.report_results(session, result(lease, "returned", begun=begun, **more))
 
 
 def the_hidden_one(rig: Rig, session: str) -> wire.Lease:
@@ -59,7 +59,7 @@ def test_a_job_that_a_submit_stops_goes_on_from_what_its_policy_had_returned(res
         lease = the_hidden_one(rig, session)
         assert lease.job.begun == begun
         assert rig.core.state.jobs[lease.job.job_id].names_blob(begun.digest)
-    rig.hand_in(session, done(lease))
+    rig.report_results(session, done(lease))
     assert rig.row(BegunRow, "r1/s0/validation", 0).begun is None
 
 
@@ -141,7 +141,7 @@ def test_a_worker_that_was_silent_for_long_is_not_believed_that_a_limit_ended_th
 def test_what_a_worker_in_trouble_can_still_tell_stands_too() -> None:
     rig = Rig()
     session, lease = playing(rig)
-    rig.hand_in(session, result(lease, "failed", begun=BEGUN))
+    rig.report_results(session, result(lease, "failed", begun=BEGUN))
     rig.pass_time(10.0)
     assert [each.job.begun for each in rig.poll(session)] == [BEGUN]
 
@@ -151,7 +151,7 @@ def test_a_job_that_was_done_when_it_was_stopped_is_done() -> None:
     session, lease = playing(rig)
     rig.create("r2", agent=None)
     rig.permit("r2", HERE, wait_s=20.0)
-    rig.hand_in(session, done(lease, failure="act_timeout"))
+    rig.report_results(session, done(lease, failure="act_timeout"))
     assert lease.job.job_id not in rig.core.state.jobs
 
 

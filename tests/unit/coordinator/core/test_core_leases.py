@@ -95,7 +95,7 @@ def test_a_limit_verdict_after_a_silence_is_played_again() -> None:
     rig.beat(session, lease)
     used = PolicyFailure(category="oom", step_index=3, message="", limit=1.0, used=2.0)
     episode = outcome_of(0)
-    rig.hand_in(
+    rig.report_results(
         session,
         result(lease, "done", episodes=(wire.EpisodeOutcome(**{**fields(episode), "failure": used}),)),
     )
@@ -137,7 +137,7 @@ def test_an_attempt_that_another_worker_was_given_is_ignored() -> None:
     assert rig.core.state.groups[GROUP].done == 0
     forged = result(lease, "done", episodes=(outcome_of(0),))
     invented = wire.JobResult(**{**fields(forged), "attempt": 7, "lease_id": f"{GROUP}/0#7"})
-    rig.hand_in(second, invented)
+    rig.report_results(second, invented)
     assert rig.core.state.groups[GROUP].done == 0
 
 
@@ -259,13 +259,13 @@ def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emp
     assert rig.core.state.workers["w1"].state == "lost"
     assert rig.poll(second, 2) == []  # it is emptied for the suspect
     assert set(rig.beat(second, *hidden).cancelled) == {each.lease_id for each in hidden}
-    rig.hand_in(second, *(result(each, "returned") for each in hidden))
+    rig.report_results(second, *(result(each, "returned") for each in hidden))
     assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
 
 
 def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_the_operator() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
-    rig.hand_in(first, result(lease, "failed", error="disk full"))
+    rig.report_results(first, result(lease, "failed", error="disk full"))
     rig.pass_time(1.0)
     assert rig.poll(first) == []
     assert len(rig.poll(second)) == 1
@@ -276,7 +276,7 @@ def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_
 def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
     rig, (first,), lease = one_job("w1")
     for _ in range(3):
-        rig.hand_in(first, result(lease, "failed"))
+        rig.report_results(first, result(lease, "failed"))
         rig.pass_time(3.0)
         rig.beat(first)
         got = rig.poll(first)
@@ -294,7 +294,7 @@ def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
 
 def test_a_job_given_back_is_no_failure() -> None:
     rig, (first,), lease = one_job("w1")
-    rig.hand_in(first, result(lease, "returned"))
+    rig.report_results(first, result(lease, "returned"))
     (again,) = rig.poll(first)
     assert again.attempt == 2
     assert rig.core.state.runs["r1"].state.infrastructure_retries == 0
@@ -347,7 +347,7 @@ def test_what_was_never_granted_is_neither_taken_nor_adopted_after_a_restart() -
         )
     ]
     for forged in made_up:
-        rig.hand_in(thief, done(forged, value=99.0))
+        rig.report_results(thief, done(forged, value=99.0))
         assert rig.beat(thief, forged).cancelled == (forged.lease_id,)
     assert (OutcomeRow, GROUP, 0) not in rig.rows
     session = rig.register("w1")
@@ -360,14 +360,14 @@ def test_a_result_of_a_lease_that_was_never_granted_accuses_no_run_of_nondetermi
     rig, (first,), lease = one_job("w1")
     other = rig.register("w2")
     rig.play(first, lease, value=6.0)
-    rig.hand_in(other, done(lease, value=7.0))
+    rig.report_results(other, done(lease, value=7.0))
     assert rig.core.state.runs["r1"].state.nondeterministic_results == 0
 
 
 def test_a_result_of_another_job_under_ones_own_lease_gives_the_leased_job_back() -> None:
     rig, (first,), lease = one_job("w1")
     wrong = msgspec.structs.replace(result(lease, "done"), job_id=f"{GROUP}/7")
-    rig.hand_in(first, wrong)
+    rig.report_results(first, wrong)
     rig.pass_time(10.0)
     (again,) = rig.poll(first)
     assert again.job == lease.job
@@ -386,7 +386,7 @@ def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest()
         rig.pass_time(2.0)
     assert rig.core.state.jobs[lease.job.job_id].lease is not None
     assert rig.core.state.jobs[other.job.job_id].lease is None
-    assert rig.hand_in(first, done(lease)).status == "unknown_worker"
+    assert rig.report_results(first, done(lease)).status == "unknown_worker"
 
 
 def test_a_held_back_heartbeat_is_answered_at_once_when_a_lease_is_to_stop() -> None:

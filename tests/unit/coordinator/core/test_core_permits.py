@@ -100,7 +100,7 @@ def test_an_agent_whose_permit_was_ended_by_mistake_stops_hidden_jobs_when_it_as
     assert hidden
     assert not rig.permit("r1", HERE).granted
     assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
-    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
     assert rig.permit("r1", HERE).granted
 
 
@@ -142,7 +142,7 @@ def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_l
     request = rig._requests
     assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
     assert request not in rig.replies
-    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
     assert rig.replies[request] == gateway.Permit(granted=True)
     jobs = [rig.core.state.jobs[lease.job.job_id] for lease in hidden]
     assert [(job.preemptions, job.failures) for job in jobs] == [(0, 0)] * len(jobs)
@@ -164,7 +164,7 @@ def test_a_permit_that_is_not_granted_in_time_says_what_it_waits_for_and_bars_hi
     rig.beat(session, *leases)
     assert rig.replies[request].granted is False
     assert "hidden" in rig.replies[request].waits_for
-    rig.hand_in(session, *(result(lease, "returned") for lease in leases))
+    rig.report_results(session, *(result(lease, "returned") for lease in leases))
     assert rig.permit("r1", HERE).granted
 
 
@@ -175,7 +175,7 @@ def test_a_request_that_is_never_sent_again_is_forgotten() -> None:
     leases = rig.poll(session, 8)
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
-    rig.hand_in(session, *(result(lease, "returned") for lease in leases[:0]))
+    rig.report_results(session, *(result(lease, "returned") for lease in leases[:0]))
     rig.pass_time(11.0)
     rig.beat(session)
     assert splits(rig.poll(session, 8)) >= {"validation"}
@@ -366,7 +366,7 @@ def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> N
         return rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1"))
 
     assert speak().status == Refusal.UNAVAILABLE
-    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
     assert not hasattr(speak(), "status")
     assert rig.status().runs[1].agent_host == "everywhere"
 
@@ -437,7 +437,7 @@ def test_closed_runs_and_cancelled_ones_get_no_permit() -> None:
     request = rig._requests
     rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
     assert rig.replies[request].status == Refusal.RUN_CANCELLED
-    rig.hand_in(session, *(result(lease, "returned") for lease in leases))
+    rig.report_results(session, *(result(lease, "returned") for lease in leases))
     assert splits(rig.poll(session, 8)) == {"random", "validation"}
 
 

@@ -86,7 +86,7 @@ def test_before_that_a_new_agent_stops_hidden_cases_as_often_as_it_takes() -> No
         assert held
         assert not rig.permit(run, HERE).granted
         for lease in held:
-            rig.hand_in(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip
+            rig.report_results(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip
         assert rig.permit(run, HERE).granted
         rig.close(run)
         rig.poll(session, 8)

@@ -138,7 +138,7 @@ def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_bac
     rig.submit(5, key="k1")
     assert rig.replies[request].cancelled == (hidden.lease_id,)
     assert rig.poll(session, 1) == []  # while it may still be played there
-    rig.hand_in(session, result(hidden, "returned"))
+    rig.report_results(session, result(hidden, "returned"))
     (train,) = rig.poll(session, 1)
     assert split_of(train.job) == "train"
     rig.play(session, train)
@@ -155,7 +155,7 @@ def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
     request = rig._requests
     rig.submit(3, 4, key="k1")
     assert set(rig.replies[request].cancelled) == {lease.lease_id for lease in hidden}
-    rig.hand_in(session, *(result(lease, "returned") for lease in hidden))
+    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
     assert [split_of(lease.job) for lease in rig.poll(session, 2)] == ["train", "train"]
 
 
@@ -172,7 +172,7 @@ def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the
     rig.submit(5, key="k1")
     stopped = rig.replies[request].cancelled
     assert set(stopped) == {lease.lease_id for lease in hidden}
-    rig.hand_in(session, *(result(lease, "returned", episodes=()) for lease in hidden))
+    rig.report_results(session, *(result(lease, "returned", episodes=()) for lease in hidden))
     assert split_of(rig.poll(session, 2)[0].job) == "train"
 
 
@@ -184,7 +184,7 @@ def test_a_train_job_stops_hidden_ones_on_the_worker_it_failed_on_once_it_may_go
     rig.submit(5, 6, key="k1")
     (failed,) = rig.poll(session, 1)
     (busy,) = rig.poll(other, 1)
-    rig.hand_in(session, result(failed, "failed", episodes=()))
+    rig.report_results(session, result(failed, "failed", episodes=()))
     (hidden,) = rig.poll(session, 1)
     assert [split_of(lease.job) for lease in (failed, busy, hidden)] == ["train", "train", "validation"]
     rig.pass_time(4.0)
@@ -224,7 +224,7 @@ def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> No
         rig.submit(0, run="r2", key=f"x{index}", bundle=f"{index}" * 64)
         reply = rig.beat(session, hidden)
         stopped += bool(reply.cancelled)
-        rig.hand_in(session, result(hidden, "returned" if reply.cancelled else "done", episodes=()))
+        rig.report_results(session, result(hidden, "returned" if reply.cancelled else "done", episodes=()))
         while hidden is not None:
             hidden = next(iter(rig.poll(session, 1)), None)
             if hidden is None or hidden.job.job_id.startswith("r1/"):
@@ -430,7 +430,7 @@ def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> Non
     session = rig.register()
     rig.create()
     rig.submit(0)
-    rig.hand_in(session, result(rig.poll(session)[0], "failed", error="no space left on device"))
+    rig.report_results(session, result(rig.poll(session)[0], "failed", error="no space left on device"))
     rig.pass_time(1.0)
     (stall,) = rig.status().stalls
     assert "wait for another try after a fault of ours" in stall

@@ -129,7 +129,7 @@ def test_a_slot_that_died_under_a_worker_of_an_earlier_version_is_played_again()
         session = rig.register(slots=8)
         (lease,) = rig.poll(session, 1, wait_s=1.0)
         assert lease.attempt == attempt + 1
-        rig.hand_in(session, result(lease, "slot_died", error="oops"))
+        rig.report_results(session, result(lease, "slot_died", error="oops"))
         assert rig.row(SubmitRow, "r1", 0).status is None
     rig.pass_time(60.0)
     session = rig.register(slots=8)
@@ -157,7 +157,7 @@ def test_scope_submit_is_one_job_and_hidden_cases_come_in_chunks_of_the_same_len
     (lease,) = rig.poll(session, 8)
     assert [spec.case.seed for spec in lease.job.episodes] == [4, 4, 9]
     assert len({spec.policy_seed for spec in lease.job.episodes}) == 3
-    rig.hand_in(session, done(lease))
+    rig.report_results(session, done(lease))
     hidden = rig.poll(session, 8)
     assert [[spec.episode_index for spec in each.job.episodes] for each in hidden] == [[0, 1, 2], [0, 1]]
     assert {each.job.record for each in hidden} == {"actions"}
@@ -181,7 +181,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
             rig.pass_time(10.0)
             rig.beat(session)
         (lease,) = rig.poll(session, 1, wait_s=0.5)
-        rig.hand_in(session, result(lease, "done", episodes=episodes))
+        rig.report_results(session, result(lease, "done", episodes=episodes))
         assert rig.core.state.groups["r1/s0/train"].done == 0
     assert rig.core.state.runs["r1"].state.infrastructure_retries == len(bad)
 

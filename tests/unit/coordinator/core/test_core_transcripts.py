@@ -74,7 +74,7 @@ class Transcript(Rig):
             "lease-poll": self._lease_poll,
             "submit": self._submit,
             "results-poll": self._results_poll,
-            "hand-in": self._hand_in,
+            "hand-in": self._report_results,
             "pass": lambda seconds: self.pass_time(float(seconds)),
         }
         doing[verb](*plain, **options)
@@ -106,7 +106,7 @@ class Transcript(Rig):
         self._asks(f"{run}'s results poll")
         self.results(cursor=int(cursor), wait_s=float(wait_s), run=run)
 
-    def _hand_in(self, worker: str, *jobs: str, value: str) -> None:
+    def _report_results(self, worker: str, *jobs: str, value: str) -> None:
         self._asks(f"{worker}'s hand-in")
         self.play(self._sessions[worker], *(self._leases[job] for job in jobs), value=float(value))
 
@@ -171,5 +171,5 @@ def test_a_transcript_tells_what_the_core_does(
         assert now == text, "if this is meant, run pytest with --rewrite-transcripts"
 
 
-def test_there_are_transcripts_of_a_submit_and_of_a_hand_in() -> None:
-    assert {"submit", "hand_in"} <= {path.stem for path in FOLDER.glob("*.txt")}
+def test_there_are_transcripts_of_a_submit_and_of_a_result_report() -> None:
+    assert {"submit", "result_report"} <= {path.stem for path in FOLDER.glob("*.txt")}

@@ -211,7 +211,7 @@ def test_idempotency_key_has_a_length(parser: RequestParser, key: str) -> None:
     assert refused(parser, SUBMIT, submit(key=key, bundle_error=failure)).status == "bad_message"
 
 
-def hand_in(**blobs_of_outcome: BlobRef) -> worker.ReportResults:
+def report_results(**blobs_of_outcome: BlobRef) -> worker.ReportResults:
     outcome = EpisodeOutcome(
         index=0, episode_return=1.0, length=1, terminated=True, truncated=False, **blobs_of_outcome
     )
@@ -224,14 +224,16 @@ def test_results_must_hold_or_have_stored_the_blobs_they_name(
 ) -> None:
     key = keys.worker_key("c", "done")
     data = b"trajectory"
-    assert event(parser, key, hand_in(trajectory=blob(data))).message == hand_in(trajectory=blob(data))
+    assert event(parser, key, report_results(trajectory=blob(data))).message == report_results(
+        trajectory=blob(data)
+    )
     named = blob(data, inline=False)
-    assert refused(parser, key, hand_in(trajectory=named)).status == "missing_blob"
+    assert refused(parser, key, report_results(trajectory=named)).status == "missing_blob"
     blobs.put(data)
-    assert event(parser, key, hand_in(trajectory=named)).message == hand_in(trajectory=named)
+    assert event(parser, key, report_results(trajectory=named)).message == report_results(trajectory=named)
     wrong = BlobRef(digest=named.digest, size=len(data), inline=b"trajectorY")
-    assert refused(parser, key, hand_in(video=wrong)).status == "bad_blob"
-    assert refused(parser, key, hand_in(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
+    assert refused(parser, key, report_results(video=wrong)).status == "bad_blob"
+    assert refused(parser, key, report_results(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
 
 
 @pytest.mark.parametrize(
@@ -310,7 +312,7 @@ def test_only_what_makes_something_new_asks_for_change(parser: RequestParser) ->
     assert parser.asks_for_change(OPS, codec.encode(evaluate()))
     assert not parser.asks_for_change(OPS, codec.encode(operator.StatusRequest(token="")))
     assert not parser.asks_for_change(SUBMIT, b"junk")
-    assert not parser.asks_for_change(keys.worker_key("c", "done"), codec.encode(hand_in()))
+    assert not parser.asks_for_change(keys.worker_key("c", "done"), codec.encode(report_results()))
 
 
 MINIGRID = "gymnasium/MiniGrid-DoorKey-16x16-v0"

@@ -316,17 +316,17 @@ def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> No
     reader.close()
 
 
-def test_upkeep_of_what_is_no_state_folder_makes_nothing(tmp_path: Path) -> None:
-    for upkeep_of in (
+def test_disk_use_of_what_is_no_state_folder_makes_nothing(tmp_path: Path) -> None:
+    for disk_use_of in (
         lambda: disk_use.collect(tmp_path / "nowhere", 0.0),
         lambda: disk_use.use(tmp_path / "nowhere"),
     ):
         with pytest.raises(ConfigError, match="no coordinator's state folder"):
-            upkeep_of()
+            disk_use_of()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_upkeep_names_the_row_that_it_cannot_read(store: Store, path: Path) -> None:
+def test_disk_use_names_the_row_that_it_cannot_read(store: Store, path: Path) -> None:
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
     with pytest.raises(DamagedStoreError, match=f"{path}: table submits, row"):
