@@ -9,15 +9,17 @@ import contextlib
 import logging
 import signal
 import sys
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Coroutine, Iterator, MutableMapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO, cast
+from typing import Annotated, Any, NoReturn, TextIO, TypeVar, cast
 
 import typer
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
 from evopolicy_common.terminal import harmless, one_line, say
+
+T = TypeVar("T")
 
 Connect = Annotated[
     list[str] | None,
@@ -140,6 +142,16 @@ def fail_on_our_errors() -> Iterator[None]:
         )
     except KeyboardInterrupt:
         fail("interrupted", 130)
+
+
+def run_to_end(work: Coroutine[Any, Any, T]) -> T:
+    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
+    import asyncio
+
+    try:
+        return asyncio.run(work)
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
 
 
 def end_on_sigterm() -> None:

@@ -36,6 +36,11 @@ def one_line(text: str) -> str:
     return harmless(text.replace("\n", " ").replace("\t", " "))
 
 
+def number(value: float | None) -> str:
+    """For a table: four digits, or a dash for None."""
+    return "–" if value is None else f"{value:.4g}"
+
+
 def _shown(found: re.Match[str]) -> str:
     # Surrogates, which no stream can encode, are not printable either.
     return found[0] if found[0].isprintable() else "\N{REPLACEMENT CHARACTER}"

@@ -16,7 +16,7 @@ def finished(**fields: Any) -> RunFinished:
         "settings": SETTINGS,
         "status": "completed",
         "error": None,
-        "close_reason": "budget_spent",
+        "closed_reason": "budget_spent",
         "agent": {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None},
         "final_score": 2.0,
         "best_submit_index": 1,

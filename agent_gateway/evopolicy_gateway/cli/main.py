@@ -56,7 +56,6 @@ PLACES = {
     "status": Place(f"{_COORDINATOR}.status:status_app", "What a cluster is doing."),
     "workers": Place(f"{_COORDINATOR}.status:workers_app", "Take workers out of service and back."),
     "runs": Place(f"{_COORDINATOR}.status:runs_app", "An operator's word on runs."),
-    "web": Place(f"{_COORDINATOR}.web:app", "Show sweeps, runs and the cluster in a browser, live."),
     "report": Place(
         f"{_COORDINATOR}.report:app", "Turn run directories into a leaderboard, figures and diagnostics."
     ),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import typer
@@ -14,7 +14,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import Profile
-from evopolicy_common.messages.operator import PUBLISHED
+from evopolicy_common.messages.operator import PUBLISHED, RunSettings
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
 
@@ -134,6 +134,32 @@ def settings_of(profile: str | None, **told: str | None) -> dict[str, str]:
     return usual | {name: value for name, value in told.items() if value is not None} | {"profile": chosen}
 
 
+def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSettings:
+    """Of one run. `given`: the options of `run` or a suite's table, which have the same names; None for what was not told.
+
+    ConfigError naming what is wrong.
+    """
+    told = ("policy_scope", "observations", "simulation", "finish", "step_limit")
+    chosen: dict[str, Any] = settings_of(
+        given.profile,
+        hidden_cases=hidden_cases_of(given.hidden_cases),
+        **{name: getattr(given, name) for name in told},
+    )
+    return RunSettings(
+        budget=given.budget,
+        min_episodes_per_submit=given.min_episodes,
+        max_episodes_per_submit=given.max_episodes,
+        n_validation=given.validation,
+        n_heldout=given.heldout,
+        sandbox_tier=given.tier or "bwrap",
+        video=given.video or "off",
+        replays=given.replays,
+        limits=limits,
+        **chosen,
+        **named,
+    )
+
+
 def state_of(state: Path | None, *, fresh: bool) -> Path | None:
     """The state folder of a local cluster; None for one that is thrown away. ConfigError for both options."""
     if fresh and state is not None:
@@ -156,23 +182,34 @@ def one_environment(env: str) -> str:
 
 def limits_of(texts: Sequence[str]) -> ResourceLimits:
     """`NAME=VALUE` texts over the usual limits."""
-    usual = ResourceLimits()
-    values: dict[str, float | int] = {}
+    values: dict[str, float] = {}
     for text in texts:
         name, equals, value = text.partition("=")
-        known = ", ".join(usual.__struct_fields__)
-        if not equals or name not in usual.__struct_fields__:
-            raise ConfigError(f"--limit {text!r}: say it as NAME=VALUE; names are {known}")
+        if not equals:
+            raise ConfigError(f"--limit {text!r}: say it as NAME=VALUE")
         try:
-            number = float(value)
+            values[name] = float(value)
         except ValueError:
             raise ConfigError(f"--limit {text!r}: {value!r} is no number") from None
+    return limits_from(values, "--limit ")
+
+
+def limits_from(values: Mapping[str, float], said: str) -> ResourceLimits:
+    """Limits by their names over the usual ones. ConfigError for one that cannot be; `said`: how an error begins."""
+    usual = ResourceLimits()
+    typed: dict[str, float | int] = {}
+    for name, number in values.items():
+        what = f"{said}{name}={number:g}"
+        if name not in usual.__struct_fields__:
+            raise ConfigError(
+                f"{what}: there is no such limit; there are {', '.join(usual.__struct_fields__)}"
+            )
         if not 0 < number < float("inf"):
-            raise ConfigError(f"--limit {text!r}: a limit is a finite number above zero")
+            raise ConfigError(f"{what}: a limit is a finite number above zero")
         if number > (most := LARGEST_LIMITS.get(name, LARGEST_LIMIT)):
-            raise ConfigError(f"--limit {text!r}: {name} can be {most:,} at most")
-        values[name] = int(number) if isinstance(getattr(usual, name), int) else number
-    return msgspec.structs.replace(usual, **values)
+            raise ConfigError(f"{what}: {name} can be {most:,} at most")
+        typed[name] = int(number) if isinstance(getattr(usual, name), int) else number
+    return msgspec.structs.replace(usual, **typed)
 
 
 def cases_of(text: str) -> tuple[int, ...]:

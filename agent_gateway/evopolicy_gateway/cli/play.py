@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Coroutine
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors, run_to_end
 from evopolicy_common.commands import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
@@ -25,12 +23,11 @@ from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunO
 from evopolicy_gateway.http import listener
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import trials
-from evopolicy_gateway.operator.runs import Cluster, ends_of, exit_code, play_all
-from evopolicy_gateway.operator.runs import report as report_runs
+from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run.layout import folder_of
 from evopolicy_gateway.run.plan import Plan
-
-T = TypeVar("T")
+from evopolicy_gateway.suite import runs as plain_runs
+from evopolicy_gateway.suite.ends import exit_code
 
 app = App()
 
@@ -168,7 +165,7 @@ def try_policy(
         )
         where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
         where = msgspec.structs.replace(where, unjailed=tier == "none")
-        _exit(_run(trials.try_policy(trial, where, as_json=as_json)))
+        _exit(run_to_end(trials.try_policy(trial, where, as_json=as_json)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
@@ -190,7 +187,7 @@ def play_random(
     with fail_on_our_errors():
         chosen = None if cases is None else options.cases_of(cases)
         where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)
-        _exit(_run(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+        _exit(run_to_end(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
 
 
 def _tell_left_out(wanted: bool) -> None:
@@ -246,6 +243,7 @@ def _plans(
     where, agent_host = served.listener(), served.host_of(given.agent)
     plans = [
         Plan(
+            name=env_id,
             settings=given.settings(env_id, exp_id, agent_host),
             agent=given.agent,
             runs=given.runs,
@@ -266,12 +264,12 @@ def _plans(
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
     console = terminal(stderr=as_json)
-    results = _run(play_all(plans, where, parallel, console))
+    played = run_to_end(plain_runs.play(plans, where, parallel, console))
     if as_json:
-        say_json(results)
+        say_json(plain_runs.documents(played))
     else:
-        report_runs(results, plans[0].runs, console)
-    _exit(exit_code(ends_of(results)))
+        plain_runs.report(played, plans[0].runs, console)
+    _exit(exit_code(plans, played.index))
 
 
 def _trial_cluster(
@@ -285,14 +283,6 @@ def _trial_cluster(
 def _unjailed(plans: list[Plan]) -> bool:
     """Whether an agent, or a policy that nothing locks in, could read what this user can."""
     return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
-
-
-def _run(work: Coroutine[Any, Any, T]) -> T:
-    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
-    try:
-        return asyncio.run(work)
-    except asyncio.CancelledError:
-        raise KeyboardInterrupt from None
 
 
 def _exit(code: int) -> None:

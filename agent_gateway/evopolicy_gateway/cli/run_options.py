@@ -25,14 +25,12 @@ from evopolicy_gateway.cli.options import (
     Limits,
     ProfileOption,
     TierName,
-    hidden_cases_of,
     limits_of,
-    settings_of,
+    run_settings,
 )
 from evopolicy_gateway.http.listener import Listener, agent_host_of, listener_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
-
-WALL_S = 12 * 3600.0
+from evopolicy_gateway.run.plan import WALL_S
 
 Several = list[str] | None
 """An option that may be repeated."""
@@ -161,31 +159,9 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     def settings(self, env: str, exp_id: str, agent_host: str = "") -> RunSettings:
         """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
         entry = self.entry or harnesses.entry_name(self.agent)
-        return RunSettings(
-            env=env,
-            entry=entry,
-            model=self.model or entry,
-            exp_id=exp_id,
-            repeat=self.repeat,
-            budget=self.budget,
-            min_episodes_per_submit=self.min_episodes,
-            max_episodes_per_submit=self.max_episodes,
-            n_validation=self.validation,
-            n_heldout=self.heldout,
-            agent_host=agent_host,
-            **settings_of(
-                self.profile,
-                hidden_cases=hidden_cases_of(self.hidden_cases),
-                policy_scope=self.policy_scope,
-                observations=self.observations,
-                simulation=self.simulation,
-                finish=self.finish,
-                step_limit=self.step_limit,
-            ),  # type: ignore[arg-type]
-            sandbox_tier=self.tier,
-            video=self.video,
-            replays=self.replays,
-            limits=limits_of(self.limit or ()),
+        named = {"env": env, "entry": entry, "model": self.model or entry, "exp_id": exp_id}
+        return run_settings(
+            self, limits_of(self.limit or ()), repeat=self.repeat, agent_host=agent_host, **named
         )
 
 

@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail, fail_on_our_errors
+from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail, fail_on_our_errors, run_to_end
 from evopolicy_common.commands import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError
@@ -23,14 +23,16 @@ from evopolicy_common.processes.preflight import check_installed, check_loopback
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.records.suite_folder import INDEX
 from evopolicy_gateway.cli import options
+from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.operator.locks import alone
-from evopolicy_gateway.operator.runs import Cluster, End, connected, exit_code, next_step
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
+from evopolicy_gateway.suite.claimed import ClaimedSweep, look
 from evopolicy_gateway.suite.decisions import Changed, Decision
-from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun
-from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
+from evopolicy_gateway.suite.ends import exit_code, next_step
+from evopolicy_gateway.suite.suite_file import SuiteFile
+from evopolicy_gateway.suite.suite_index import FINISHED, Index
 from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
-from evopolicy_gateway.suite.sweep import Sweep, look
 
 app = App()
 
@@ -39,7 +41,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     """What the command was asked for."""
 
     suite: SuiteFile
-    runs: tuple[SuiteRun, ...]
+    runs: tuple[Plan, ...]
     root: Path
     where: Cluster
     changed: Changed
@@ -97,8 +99,8 @@ def suite(
             chosen = options.settings_of(profile)["profile"]
             defaults = msgspec.structs.replace(wanted.defaults, profile=chosen)
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
-        expanded = suite_file.expand(wanted, Path.cwd(), tuple(only or ()))
         root = (runs or Path("runs") / wanted.name).absolute()
+        expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
             where = Cluster(
@@ -119,8 +121,8 @@ def suite(
             as_json=as_json,
         )
         try:
-            code = asyncio.run(_suite(order))
-        except (asyncio.CancelledError, KeyboardInterrupt):
+            code = run_to_end(_suite(order))
+        except KeyboardInterrupt:
             fail("interrupted; the same command goes on where the sweep was", 130)
     if code:
         raise typer.Exit(code)
@@ -136,19 +138,15 @@ async def _suite(order: Order) -> int:
         env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
         tiers = {run.settings.sandbox_tier for run in order.runs}
         async with connected(order.where, env_ids, tiers) as (operations, gateway, failed):
-            started_in = Path.cwd()
             decided = [
-                decisions.decide(
-                    run, await look(run, order.root, started_in, index, operations), order.changed
-                )
-                for run in order.runs
+                decisions.decide(run, await look(run, index, operations), order.changed) for run in order.runs
             ]
             _tell(order, index, decided, console)
             decisions.check_changes(decided, order.changed)
             if order.dry_run:
                 return 0
             begun = [one.run for one in decided if one.kind in ("new", "resume", "restart")]
-            suite_file.check_agents_start(begun, started_in)
+            suite_file.check_agents_start(begun)
             for one in decided:
                 if one.kind == "keep":
                     _keep(order, index, one)
@@ -159,7 +157,7 @@ async def _suite(order: Order) -> int:
                 for one in decided:
                     if one.kind == "keep":
                         view.kept(one.run.name, index.runs.get(one.run.name))
-                sweep = Sweep(order.suite, order.root, started_in, index, operations, gateway, view)
+                sweep = ClaimedSweep(order.suite, order.root, index, operations, gateway, view)
                 await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
     entries = [index.runs[name] for name in names if name in index.runs]
     if not order.as_json:
@@ -169,20 +167,13 @@ async def _suite(order: Order) -> int:
         console.print(f"index: {order.root / INDEX}", soft_wrap=True)
         if any(entry.state == "completed" for entry in entries):
             console.print(next_step(order.root), soft_wrap=True)
-    return exit_code([_end(order, index.runs.get(name), name) for name in names])
-
-
-def _end(order: Order, entry: Entry | None, name: str) -> End:
-    if entry is None:
-        return End(name, "error", "", "it was not begun", "")
-    where = str(order.root / entry.directory) if entry.directory else ""
-    return End(name, entry.state, entry.closed_reason, entry.error, where)
+    return exit_code(order.runs, index)
 
 
 def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal) -> None:
     known = {run.name for run in order.runs}
     # Runs that --only leaves out are still the file's.
-    in_file = {run.name for run in suite_file.expand(order.suite, Path.cwd())}
+    in_file = {run.name for run in suite_file.expand(order.suite, order.root, Path.cwd())}
     left_alone = [name for name in index.runs if name not in known and name not in in_file]
     for line in decisions.told(decided, left_alone):
         console.print(line, soft_wrap=True)
@@ -204,11 +195,11 @@ def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal
 def _keep(order: Order, index: Index, decision: Decision) -> None:
     """Brings the index in line with a finished run's own record."""
     run = decision.run
-    folder = run.folder(order.root)
+    path = run.folder.run_json
     entry = index.runs.get(run.name)
-    if folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
-        record = decode_run_record(folder.run_json.read_bytes())
+    if path.exists() and (entry is None or entry.state not in FINISHED):
+        record = decode_run_record(path.read_bytes())
         known = {"digest": run.digest, "settings": msgspec.to_builtins(run.defining)}
         if entry is not None:
             known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}
-        index.runs[run.name] = suite_index.entry_of(run, record, order.root, folder.root, **known)
+        index.runs[run.name] = suite_index.entry_of(run, record, **known)

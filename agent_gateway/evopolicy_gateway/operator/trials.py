@@ -23,8 +23,8 @@ from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records import bundles
 from evopolicy_common.records.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say_json
+from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.operator.runs import Cluster, connected
 from evopolicy_gateway.submits.episode_files import trajectory_files
 from evopolicy_gateway.submits.formatting import cut_text
 

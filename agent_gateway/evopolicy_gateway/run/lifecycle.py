@@ -82,13 +82,11 @@ class RunLifecycle:
         gateway: Credentials,
         watch: Watch,
         *,
-        name: str | None = None,
         stays_open: bool = False,
         on_agent_gone: Callable[[], None] = lambda: None,
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
-        `name`: how the watch knows the run, its environment otherwise.
         `stays_open`: when this is cancelled the run is left as it is, to be resumed.
         `on_agent_gone` is called once the agent's side is over: what is left of the run needs no agent's place.
         """
@@ -97,7 +95,7 @@ class RunLifecycle:
         self._operations = operations
         self._credentials = gateway
         self._watch = watch
-        self._name = name or plan.settings.env
+        self._name = plan.name or plan.settings.env
         self._stays_open = stays_open
         self.run = ""
         """The cluster's id of the run, once it is open."""
@@ -134,11 +132,6 @@ class RunLifecycle:
         with alone(self._folder.lock, self._folder.root):
             return await self._go_on()
 
-    async def resume(self) -> RunRecord:
-        """Goes on with a run that its folder holds open, its processes gone; as `play` otherwise."""
-        with alone(self._folder.lock, self._folder.root):
-            return await self._resume()
-
     async def _play(self) -> RunRecord:
         plan = self._plan
         # Checking starts programs to try the jail, which a search for another run's orphans would take for strays.
@@ -173,12 +166,12 @@ class RunLifecycle:
             # Killed between the two, the command has left the gateway's folder.
             remove_tree(folder.state)
             return decode_run_record(folder.run_json.read_bytes())
+        if folder.opened.exists():
+            return await self._resume()
         intended = self._plan.intended()
         if intended is None:
             return await self._play()
-        if not folder.opened.exists():
-            return await self._played(await self._open(intended.key), agents_side=True)
-        return await self._resume()
+        return await self._played(await self._open(intended.key), agents_side=True)
 
     async def _resume(self) -> RunRecord:
         run = saved(self._folder.opened, OpenedRun).run

@@ -221,7 +221,7 @@ def _outcome(finished: RunFinished, code: Mapping[int, CodeMetrics]) -> Outcome:
         )
         if reference
         else None,
-        closed_reason=finished.close_reason,
+        closed_reason=finished.closed_reason,
         budget_used=finished.budget_used,
         auxiliary=auxiliary,
     )

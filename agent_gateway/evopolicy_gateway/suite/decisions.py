@@ -19,7 +19,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.suite.suite_file import SuiteRun
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 
 Kind = Literal["keep", "new", "resume", "finish", "restart"]
@@ -53,7 +53,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 class Decision(msgspec.Struct, frozen=True, kw_only=True):
     """For one run."""
 
-    run: SuiteRun
+    run: Plan
     kind: Kind
     attempt: int
     why: str = ""
@@ -61,7 +61,7 @@ class Decision(msgspec.Struct, frozen=True, kw_only=True):
     """The file has other settings for it than it was played with."""
 
 
-def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision:
+def decide(run: Plan, found: Found, changed: Changed = "refuse") -> Decision:
     """What becomes of a run."""
     entry = found.entry
     attempt = 1 if entry is None else entry.attempt
@@ -92,7 +92,7 @@ def decide(run: SuiteRun, found: Found, changed: Changed = "refuse") -> Decision
     return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
 
 
-def side_by_side(waiting: Sequence[Decision], under_way: Iterable[SuiteRun]) -> list[Decision]:
+def side_by_side(waiting: Sequence[Decision], under_way: Iterable[Plan]) -> list[Decision]:
     """The order in which waiting runs are best begun: those first that share hidden cases with the fewest runs under way.
 
     Otherwise as they stand. `under_way`: runs whose agent is at work or whose hidden cases are being played.
@@ -101,7 +101,7 @@ def side_by_side(waiting: Sequence[Decision], under_way: Iterable[SuiteRun]) -> 
     return sorted(waiting, key=lambda one: shared[_hidden_cases(one.run)])
 
 
-def _hidden_cases(run: SuiteRun) -> str:
+def _hidden_cases(run: Plan) -> str:
     """Equal for runs that share hidden cases."""
     return run.settings.env if run.settings.hidden_cases == "shared" else run.name
 

@@ -7,11 +7,10 @@ the agent's `[agents.run]`, then in `[defaults]`; what is nowhere is the environ
 from __future__ import annotations
 
 import fnmatch
-import hashlib
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -19,23 +18,17 @@ from msgspec import Meta
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
-from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, VideoOption
-from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.wire import keys
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
-from evopolicy_gateway.cli.options import hidden_cases_of, settings_of
+from evopolicy_gateway.cli.options import limits_from, run_settings
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.run.layout import RunFolder, run_folder
+from evopolicy_gateway.run.plan import WALL_S, Plan
 
 Positive = Annotated[int, Meta(ge=1)]
-WALL_S = 12 * 3600.0
-_OPERATIONAL = frozenset(
-    ("retries", "backoff_s", "silence_s", "pause_s", "max_pause_s", "pass_environment", "prices")
-)
-"""Settings of a coding agent that change nothing of what a run measures."""
 
 
 class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -123,60 +116,6 @@ class SuiteFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     overrides: tuple[Override, ...] = ()
 
 
-class SuiteRun(msgspec.Struct, frozen=True, kw_only=True):
-    """One run of a sweep, as the file wants it."""
-
-    name: str
-    """`agent/environment/repeat`."""
-    agent: str
-    provider: str
-    harness: str
-    """As `--agent` takes it."""
-    config: AgentConfig | None
-    settings: RunSettings
-    wall_s: float
-    silence_s: float = SILENCE_S
-    parallel: int | None
-    """Runs of its agent at once."""
-    jail: JailSettings = JailSettings()
-
-    @property
-    def defining(self) -> dict[str, Any]:
-        """Everything that makes it this run and no other; the attempt and operational settings do not.
-
-        What is as usual is left out, so that a setting which a later version adds makes no other run of it.
-        """
-        config = None
-        if self.config is not None:
-            told = _unusual(msgspec.to_builtins(self.config), msgspec.to_builtins(AgentConfig(harness="")))
-            config = {name: value for name, value in told.items() if name not in _OPERATIONAL}
-        settings = self.settings
-        # Without a published limit both kinds are the same.
-        both = catalogue.entry(settings.env).published_steps is not None
-        limit: StepLimit = "natural" if both else settings.step_limit
-        usual = RunSettings(env="", entry="", model="", exp_id="", attempt=settings.attempt, step_limit=limit)
-        told = _unusual(msgspec.to_builtins(settings), msgspec.to_builtins(usual))
-        told.pop("replays", None)  # recorded once all is over, it changes nothing of the run
-        found = {"agent": self.harness, "config": config, "settings": told, "agent_wall_s": self.wall_s}
-        if self.silence_s != SILENCE_S:
-            found["agent_silence_s"] = self.silence_s
-        # What a jail shows (`read`) is where programs lie, which differs from host to host.
-        reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
-        if reached or self.jail.mode != JailSettings().mode:
-            found["jail"] = {"mode": self.jail.mode, **reached}
-        return found
-
-    @property
-    def digest(self) -> str:
-        """Of all that defines it."""
-        return hashlib.sha256(msgspec.json.encode(list(self.defining.values()), order="sorted")).hexdigest()[
-            :16
-        ]
-
-    def folder(self, root: Path) -> RunFolder:
-        return run_folder(root, self.settings.entry, self.settings.env, self.settings.exp_id)
-
-
 def find(name: str) -> tuple[Path | None, bytes]:
     """The bytes of a suite's file: a path, or the name of a shipped one such as `core16.toml`."""
     path = Path(name)
@@ -204,8 +143,8 @@ def read(name: str) -> SuiteFile:
     return suite
 
 
-def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> list[SuiteRun]:
-    """The runs in the order in which they are begun. `only`: globs of run names.
+def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...] = ()) -> list[Plan]:
+    """The runs in the order in which they are begun. `root`: the sweep's folder. `only`: globs of run names.
 
     Environments come before agents, so that a sweep that is stopped early compares its agents on some environments rather
     than having one agent on all. ConfigError for what cannot be a run.
@@ -214,7 +153,7 @@ def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> li
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise ConfigError(f"agents of one name: {', '.join(doubled)}")
-    runs: list[SuiteRun] = []
+    runs: list[Plan] = []
     chosen = {
         agent.name: catalogue.resolve(agent.environments or suite.environments) for agent in suite.agents
     }
@@ -228,25 +167,25 @@ def expand(suite: SuiteFile, started_in: Path, only: tuple[str, ...] = ()) -> li
             for agent in suite.agents:
                 table = tables.get((agent.name, env))
                 if table is not None and repeat < (table.repeats or 1):
-                    runs.append(_run(suite, agent, env, repeat, table))
+                    runs.append(_plan(suite, agent, env, repeat, table, root, started_in))
     if only:
         runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
         if not runs:
             raise ConfigError(f"--only {' '.join(only)} fits no run of the suite")
-    taking_part = {run.agent for run in runs}
+    taking_part = {run.entry for run in runs}
     for agent in suite.agents:
         if agent.name in taking_part:
             _check_agent(agent, started_in)
     return runs
 
 
-def check_agents_start(runs: Iterable[SuiteRun], started_in: Path) -> None:
+def check_agents_start(runs: Iterable[Plan]) -> None:
     """ConfigError where an agent of these runs cannot be started on this machine, such as a CLI that is missing."""
-    for run in {run.agent: run for run in runs}.values():
+    for run in {run.entry: run for run in runs}.values():
         try:
-            harnesses.make(run.harness, started_in, run.config).check()
+            harnesses.make(run.agent, run.started_in, run.config).check()
         except ConfigError as error:
-            raise ConfigError(f"agent {run.agent!r}: {error}") from error
+            raise ConfigError(f"agent {run.entry!r}: {error}") from error
 
 
 def _check_agent(agent: AgentTable, started_in: Path) -> None:
@@ -282,70 +221,32 @@ def _resolved(name: str) -> list[str]:
         return []
 
 
-def _run(suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunTable) -> SuiteRun:
+def _plan(
+    suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunTable, root: Path, started_in: Path
+) -> Plan:
     if (agent.config is None) == (not agent.agent):
         raise ConfigError(f"agent {agent.name!r} needs either `agent` or `[agents.config]`")
     harness = agent.agent or agent.config.harness if agent.config else agent.agent
     model = agent.config.model if agent.config is not None else None
-    settings = RunSettings(
+    settings = run_settings(
+        table,
+        limits_from(table.limits or {}, "limits."),
         env=env,
         entry=agent.name,
         model=model or agent.name,
         exp_id=f"{suite.name}-{repeat}",
         repeat=repeat,
-        budget=table.budget,
-        min_episodes_per_submit=table.min_episodes,
-        max_episodes_per_submit=table.max_episodes,
-        n_validation=table.validation,
-        n_heldout=table.heldout,
-        **settings_of(
-            table.profile,
-            hidden_cases=hidden_cases_of(table.hidden_cases),
-            policy_scope=table.policy_scope,
-            observations=table.observations,
-            simulation=table.simulation,
-            finish=table.finish,
-            step_limit=table.step_limit,
-        ),  # type: ignore[arg-type]
-        sandbox_tier=table.tier or "bwrap",
-        video=table.video or "off",
-        replays=table.replays,
-        limits=_limits(table.limits or {}),
         notes={"suite": suite.name},
     )
-    return SuiteRun(
+    return Plan(
         name=f"{agent.name}/{env}/{repeat}",
-        agent=agent.name,
-        provider=agent.config.provider_name if agent.config is not None else harness.partition(":")[0],
-        harness=harness,
-        config=agent.config,
         settings=settings,
-        wall_s=table.agent_wall_s or WALL_S,
+        agent=harness,
+        runs=root,
+        started_in=started_in,
+        wall_limit_s=table.agent_wall_s or WALL_S,
         silence_s=table.agent_silence_s or SILENCE_S,
+        config=agent.config,
         parallel=agent.parallel,
         jail=agent.jail,
     )
-
-
-def _unusual(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
-    """What differs from the usual, inner tables too."""
-    found = {name: value for name, value in told.items() if name not in usual or value != usual[name]}
-    return {
-        name: _unusual(value, usual[name])
-        if isinstance(value, dict) and isinstance(usual.get(name), dict)
-        else value
-        for name, value in found.items()
-    }
-
-
-def _limits(told: dict[str, float]) -> ResourceLimits:
-    usual = ResourceLimits()
-    for name, value in told.items():
-        if name not in usual.__struct_fields__ or not 0 < value < float("inf"):
-            raise ConfigError(
-                f"limits.{name} = {value}: limits above zero are {', '.join(usual.__struct_fields__)}"
-            )
-    typed = {
-        name: int(value) if isinstance(getattr(usual, name), int) else value for name, value in told.items()
-    }
-    return msgspec.structs.replace(usual, **typed)

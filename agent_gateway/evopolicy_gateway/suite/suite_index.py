@@ -12,18 +12,19 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.usage import tokens_in
-from evopolicy_gateway.suite.suite_file import SuiteRun
+from evopolicy_gateway.run.plan import Plan
 
 SCHEMA_VERSION = 1
 
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
 
-State = Literal["pending", "running", "completed", "no_ok_submit", "error", "cancelled"]
+State = Literal["pending", "running"] | RunEnd
 FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
 
@@ -96,28 +97,33 @@ def state_of(record: RunRecord) -> State:
     return "error" if record.outcome.agent_never_played else record.outcome.status
 
 
-def entry_of(suite_run: SuiteRun, record: RunRecord, root: Path, directory: Path, **more: Any) -> Entry:
+def directory_of(run: Plan) -> str:
+    """A run's folder as the index tells it."""
+    return str(run.folder.root.relative_to(run.runs.absolute()))
+
+
+def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     """What the index tells of a finished run."""
     outcome = record.outcome
-    reference = outcome.random_reference
+    state = state_of(record)
     return Entry(
-        name=suite_run.name,
-        agent=suite_run.agent,
-        env=suite_run.settings.env,
-        repeat=suite_run.settings.repeat,
-        state=state_of(record),
+        name=plan.name,
+        agent=plan.entry,
+        env=plan.settings.env,
+        repeat=plan.settings.repeat,
+        state=state,
         attempt=record.attempt,
-        directory=str(directory.relative_to(root.absolute())),
+        directory=directory_of(plan),
         score=outcome.score,
-        random=None if reference is None else reference.mean_return,
+        random=outcome.random_score,
         n_submits=len(outcome.val_scores or ()),
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
         tokens=None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens),
-        error=outcome.error or (_NO_RUN if state_of(record) == "error" else None),
+        error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
-        **more,
+        **{"digest": plan.digest, **more},
     )
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
-from evopolicy_common.terminal import say_json
+from evopolicy_common.terminal import number, say_json
 from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.operator.watch import PHASES, Row, View
@@ -143,13 +143,13 @@ class SuiteView(View[SuiteRow]):
             return "begins" + (f", attempt {told['attempt']}" if told["attempt"] > 1 else "")
         if kind == "finished":
             if told["state"] == "completed":
-                return f"completed, score {_number(told['score'])} (random {_number(told['random'])})"
+                return f"completed, score {number(told['score'])} (random {number(told['random'])})"
             if told["state"] == "cancelled":
                 return str(told["error"] or "cancelled")
             why = f": {told['error']}" if told["error"] else ""
             return str(told["state"]).replace("_", " ") + why
         if kind == "submit":
-            mean = "" if told["mean"] is None else f", mean return {_number(told['mean'])}"
+            mean = "" if told["mean"] is None else f", mean return {number(told['mean'])}"
             return f"{told['submit']} {told['status']}{mean}; {told['budget_left']} episodes left"
         if kind == "paused":
             return f"{told['provider']} is away, waits {told['seconds']} s ({told['why']})"
@@ -202,8 +202,8 @@ def results_table(entries: list[Entry]) -> Table:
             Text(entry.name),
             entry.state.replace("_", " ")
             + (f" on {entry.host}" if entry.host and not entry.directory else ""),
-            _number(entry.score),
-            _number(entry.random),
+            number(entry.score),
+            number(entry.random),
             str(entry.budget_used),
             _short(tokens) if tokens else "",
         )
@@ -227,7 +227,7 @@ def _cells(row: SuiteRow) -> tuple[str, ...]:
     elif row.state == "running" and progress is not None and progress.submit_id is not None:
         state = f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes}"
     if row.entry is not None and row.entry.score is not None:
-        state = f"score {_number(row.entry.score)} (random {_number(row.entry.random)})"
+        state = f"score {number(row.entry.score)} (random {number(row.entry.random)})"
     used = submits = ""
     if progress is not None:
         used = f"{progress.episode_budget - progress.remaining_budget}/{progress.episode_budget}"
@@ -237,7 +237,7 @@ def _cells(row: SuiteRow) -> tuple[str, ...]:
     return (
         used,
         submits,
-        "" if progress is None else _number(progress.best_mean),
+        "" if progress is None else number(progress.best_mean),
         _short(tokens) if tokens else "",
         state,
         f"waiting for {row.waits_for}" if row.state == "running" and row.waits_for else row.action,
@@ -257,7 +257,3 @@ def _short(number: int) -> str:
 def _duration(seconds: float) -> str:
     minutes = round(seconds / 60)
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{max(1, minutes)} min"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"

@@ -112,14 +112,18 @@ class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
     """Token of this run's gateway."""
 
 
+RunEnd = Literal["completed", "no_ok_submit", "error", "cancelled"]
+"""`cancelled`: the operator ended the run; `error`: it could not be played to its end."""
+
+
 class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """A finalised run as the coordinator knows it: the source of `run.json`."""
 
     run: Word
     settings: RunSettings
-    status: Literal["completed", "no_ok_submit", "error", "cancelled"]
+    status: RunEnd
     error: Text | None
-    close_reason: Text
+    closed_reason: Text = msgspec.field(name="close_reason")
     agent: Plain
     final_score: Number | None
     """Held-out mean return of the selected checkpoint."""

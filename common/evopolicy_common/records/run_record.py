@@ -19,7 +19,7 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope, 
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.journal import Committed
-from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation
+from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation, RunEnd
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 RECORD_VERSION = 2
@@ -27,9 +27,6 @@ RECORD_VERSION = 2
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
-
-RunStatus = Literal["completed", "no_ok_submit", "error", "cancelled"]
-"""`cancelled`: the operator ended the run; `error`: it could not be played to its end."""
 
 
 class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -142,7 +139,7 @@ class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """What the run came to. Every score is None unless `status` is `completed`, but for `final_score`."""
 
-    status: RunStatus
+    status: RunEnd
     error: str | None = None
     """Why the status is `error` or `cancelled`, for the operator."""
     final_score: float | None = None
@@ -172,6 +169,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     def score(self) -> float | None:
         """The held-out mean return; None unless the run completed."""
         return self.final_score if self.status == "completed" else None
+
+    @property
+    def random_score(self) -> float | None:
+        """The mean return of uniform random actions on the same cases; None where they were not played."""
+        return None if self.random_reference is None else self.random_reference.mean_return
 
     @property
     def agent_never_played(self) -> bool:

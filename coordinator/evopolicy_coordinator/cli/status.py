@@ -154,28 +154,19 @@ def _set_worker(
     say(f"{worker} is {state}")
 
 
-@workers_app.command(epilog="Example: evopolicy workers drain lab-3f2a")
-def drain(
-    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
-) -> None:
-    """Give a worker no more work: it finishes what runs, then ends."""
-    _set_worker(worker, "draining", connect, file, absent)
+def _command(name: str, state: Literal["active", "paused", "draining"], what: str) -> None:
+    @workers_app.command(name, epilog=f"Example: evopolicy workers {name} lab-3f2a", help=what)
+    def command(
+        worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
+    ) -> None:
+        _set_worker(worker, state, connect, file, absent)
 
 
-@workers_app.command(epilog="Example: evopolicy workers pause lab-3f2a")
-def pause(
-    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
-) -> None:
-    """Give a worker no more work until it is resumed: it finishes what it holds, and stays."""
-    _set_worker(worker, "paused", connect, file, absent)
-
-
-@workers_app.command(epilog="Example: evopolicy workers resume lab-3f2a")
-def resume(
-    worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
-) -> None:
-    """Take a worker back that was paused or drained, or quarantined by an audit."""
-    _set_worker(worker, "active", connect, file, absent)
+_command("drain", "draining", "Give a worker no more work: it finishes what runs, then ends.")
+_command(
+    "pause", "paused", "Give a worker no more work until it is resumed: it finishes what it holds, and stays."
+)
+_command("resume", "active", "Take a worker back that was paused or drained, or quarantined by an audit.")
 
 
 @runs_app.command("list", epilog="Example: evopolicy runs list")

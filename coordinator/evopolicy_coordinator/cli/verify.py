@@ -17,7 +17,14 @@ import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
+from evopolicy_common.cli import (
+    Connect,
+    CredentialsFile,
+    end_on_sigterm,
+    fail,
+    fail_on_our_errors,
+    run_to_end,
+)
 from evopolicy_common.commands import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError, EvopolicyError
@@ -117,7 +124,7 @@ def verify(
     console = terminal(stderr=as_json)
     with fail_on_our_errors():
         try:
-            report = asyncio.run(_verify(options, console))
+            report = run_to_end(_verify(options, console))
         except ConfigError:
             raise
         except EvopolicyError as error:

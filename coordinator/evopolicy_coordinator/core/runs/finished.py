@@ -54,7 +54,7 @@ def result(
 ) -> operator.RunFinished:
     """All that is recorded of a run that is over; `best` is its selected submit."""
     row, stored, ok = run.row, run.state, ok_submits(run)
-    status: Literal["completed", "no_ok_submit", "error", "cancelled"] = "completed"
+    status: operator.RunEnd = "completed"
     error = None
     if cancelled:
         status = "cancelled"
@@ -86,7 +86,7 @@ def result(
         settings=row.settings,
         status=status,
         error=error,
-        close_reason=stored.close_reason,
+        closed_reason=stored.close_reason,
         agent=stored.agent,
         final_score=final_score,
         best_submit_index=None if best is None else best.submit_index,

@@ -25,7 +25,7 @@ from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import child_messages
 from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
-from evopolicy_gateway.operator.runs import Cluster, RunResult, ends_of, exit_code, report
+from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.layout import Staged
 from evopolicy_gateway.run.plan import Plan
@@ -240,34 +240,6 @@ def test_watchers_on_a_terminal_draw_a_table() -> None:
     text = out.getvalue()
     for needed in ("run r-1", "4/8", "validating 1/2"):
         assert needed in text
-
-
-def test_exit_codes_and_the_report_tell_how_runs_ended(capsys: pytest.CaptureFixture[str]) -> None:
-    completed = RunResult(
-        env="a", run_directory="/r/a", status="completed", final_score=1.0, random_score=0.5
-    )
-    nothing = RunResult(env="b", run_directory="/r/b", status="no_ok_submit")
-    failed = RunResult(env="c", run_directory="/r/c", status="error", error="worker lost")
-    gave_up = RunResult(env="d", run_directory="/r/d", status="completed", closed_reason="agent_failed")
-    cancelled = RunResult(env="e", run_directory="/r/e", status="cancelled", closed_reason="agent_failed")
-    seen = []
-    for result, code in ((completed, 0), (nothing, 3), (gave_up, 4), (cancelled, 5), (failed, 1)):
-        seen.append(result)
-        assert exit_code(ends_of(seen)) == code
-        # Whatever is no success is explained where nobody has to look for it.
-        said = capsys.readouterr().err.splitlines()
-        assert [line.partition(":")[0] for line in said] == [one.env for one in seen[1:]]
-    assert said == [
-        "b: no submit of it was ok; see /r/b",
-        "d: its agent stopped: agent_failed; see /r/d",
-        "e: it was cancelled; see /r/e",
-        "c: worker lost; see /r/c",
-    ]
-    out = io.StringIO()
-    report(seen, Path("my runs"), Terminal(file=out, width=100))
-    assert "next: evopolicy report 'my runs' --out report" in out.getvalue()
-    for needed in ("no_ok_submit", "run directory: /r/a", "agent failed", "cancelled"):
-        assert needed in out.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
+from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import (
     Decision,
@@ -25,7 +26,7 @@ from evopolicy_gateway.suite.decisions import (
     side_by_side,
     told,
 )
-from evopolicy_gateway.suite.suite_file import SuiteRun, check_agents_start, expand, read
+from evopolicy_gateway.suite.suite_file import check_agents_start, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index, used
 from evopolicy_gateway.suite.suite_view import SuiteView
 
@@ -57,10 +58,10 @@ MORE = ("limits", "notes", "n_heldout")
 JAIL = '[agents.jail]\nhosts = ["h"]\n'
 
 
-def suite_in(tmp_path: Path, text: str = FILE) -> list[SuiteRun]:
+def suite_in(tmp_path: Path, text: str = FILE) -> list[Plan]:
     path = tmp_path / "s.toml"
     path.write_text(text)
-    return expand(read(str(path)), tmp_path)
+    return expand(read(str(path)), tmp_path / "runs", tmp_path)
 
 
 def test_runs_are_agents_times_environments_times_repeats_with_overrides(tmp_path: Path) -> None:
@@ -84,11 +85,11 @@ def test_a_cli_that_is_missing_is_refused_before_a_run_begins(
 ) -> None:
     runs = suite_in(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
-    check_agents_start([run for run in runs if run.agent == "evolve"], tmp_path)
+    check_agents_start([run for run in runs if run.entry == "evolve"])
     with pytest.raises(
         ConfigError, match="'GPT': there is no program 'codex' on the PATH; install it with: npm"
     ):
-        check_agents_start(runs, tmp_path)
+        check_agents_start(runs)
 
 
 def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
@@ -110,6 +111,15 @@ def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
         ("name = 's'", "environments"),
         (FILE.replace("budget = 8", "budgte = 8"), "budgte"),
         (FILE.replace("budget = 8", "budget = 0"), "budget"),
+        (
+            FILE.replace("budget = 8", "limits = { act_wall = 1 }"),
+            "limits.act_wall=1: there is no such limit",
+        ),
+        (
+            FILE.replace("budget = 8", "limits = { act_wall_s = 0 }"),
+            "limits.act_wall_s=0: a limit is a finite",
+        ),
+        (FILE.replace("budget = 8", "limits = { act_wall_s = 1e30 }"), "act_wall_s can be .* at most"),
         (FILE.replace('name = "GPT"', 'name = "evolve"'), "agents of one name: evolve"),
         (FILE.replace('agent = "evolve"', 'agent = "nobody"'), "'evolve': --agent 'nobody'"),
         (FILE.replace('name = "s"', 'name = "s/t"'), "letters, digits"),
@@ -128,7 +138,7 @@ SHIPPED = ["smoke.toml", "core16.toml", "core16-paper.toml", "core16-published.t
 def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ANTHROPIC_AUTH_TOKEN", "set")
     suite = read(name)
-    runs = expand(suite, tmp_path)
+    runs = expand(suite, tmp_path, tmp_path)
     core16 = catalogue.resolve(["core16"])
     assert len(runs) == len(suite.agents) * 16
     assert {run.settings.env for run in runs} == set(core16)
@@ -155,10 +165,10 @@ def test_a_file_that_contradicts_its_profile_is_refused(tmp_path: Path) -> None:
         suite_in(tmp_path, text)
 
 
-def entry(run: SuiteRun, **more: object) -> Entry:
+def entry(run: Plan, **more: object) -> Entry:
     fields = {
         "name": run.name,
-        "agent": run.agent,
+        "agent": run.entry,
         "env": run.settings.env,
         "repeat": 0,
         "digest": run.digest,
@@ -224,7 +234,7 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
         was = before[run.name]
         known = entry(was, state="completed", settings=msgspec.to_builtins(was.defining))
         decision = decide(run, Found(status="completed", entry=known), "rerun")
-        if run.agent == "evolve":
+        if run.entry == "evolve":
             assert decision.kind == "keep"
             continue
         changes = decision.why.partition("now: ")[2]
@@ -243,7 +253,7 @@ def test_a_setting_that_a_later_version_adds_makes_no_other_run(tmp_path: Path) 
     for run in suite_in(tmp_path, FILE.replace("budget = 16", "limits = { act_wall_s = 2.0 }")):
         told = run.defining
         assert set(told["settings"]) <= {"env", "entry", "model", "exp_id", "repeat", "budget", *MORE}
-        if run.agent == "GPT":
+        if run.entry == "GPT":
             assert told["config"] == {"harness": "codex", "model": "gpt-5.5"}
             assert told["settings"]["limits"] == {"act_wall_s": 2.0}
 
@@ -319,7 +329,7 @@ PLACES = st.tuples(st.sampled_from("abcd"), st.sampled_from(["shared", "per_run"
 
 
 def waiting(places: list[tuple[str, str]]) -> list[Decision]:
-    run = expand(read("smoke"), Path())[0]
+    run = expand(read("smoke"), Path(), Path())[0]
     return [
         Decision(
             run=msgspec.structs.replace(
@@ -334,7 +344,7 @@ def waiting(places: list[tuple[str, str]]) -> list[Decision]:
     ]
 
 
-def related(one: SuiteRun, other: SuiteRun) -> bool:
+def related(one: Plan, other: Plan) -> bool:
     shared = {one.settings.hidden_cases, other.settings.hidden_cases} == {"shared"}
     return one.name == other.name or (shared and one.settings.env == other.settings.env)
 
@@ -361,7 +371,7 @@ def test_related_runs_meet_only_where_nothing_else_is_left(
     agents: int, environments: int, parallel: int, luck: random.Random
 ) -> None:
     left = waiting([(f"env-{env}", "shared") for env in range(environments) for _ in range(agents)])
-    under_way: list[SuiteRun] = []
+    under_way: list[Plan] = []
     while left:
         while left and len(under_way) < parallel:
             decision = side_by_side(left, under_way)[0]

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import contextlib
+import io
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from evopolicy_common.messages.operator import ClaimState, RunFinished
+from evopolicy_common.console import Terminal
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.operator import ClaimState, RunFinished, RunSettings
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.child_messages import AgentDoing
+from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
 from evopolicy_gateway.run.layout import RunFolder
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.suite import suite_index, sweep
+from evopolicy_gateway.suite import claimed, runs, suite_index, sweep
+from evopolicy_gateway.suite.claimed import ClaimedSweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
-from evopolicy_gateway.suite.suite_file import SuiteFile, SuiteRun, expand, read
+from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read
 from evopolicy_gateway.suite.suite_index import Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
@@ -61,8 +68,8 @@ class Stage:
         path = root / "s.toml"
         path.write_text(text)
         self.suite: SuiteFile = read(str(path))
-        self.runs: list[SuiteRun] = expand(self.suite, root)
         self.root = root / "runs"
+        self.runs: list[Plan] = expand(self.suite, self.root, root)
         self.index = index or Index(suite="s")
         self.cluster = Cluster()
         self.view = SuiteView([run.name for run in self.runs], 2)
@@ -76,6 +83,8 @@ class Stage:
         self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
         self.score: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.0)
         """What a run takes once its agent is gone."""
+        self.beside: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0.0)
+        """What happens beside the sweep."""
         stage = self
 
         class Play:
@@ -88,12 +97,12 @@ class Stage:
                 gateway: object,
                 watch: object,
                 *,
-                name: str,
                 stays_open: bool,
                 on_agent_gone: Callable[[], None],
             ) -> None:
                 self.on_agent_gone = on_agent_gone
-                self.plan, self.name, self.run, self.agent_at_work = plan, name, f"run of {name}", True
+                self.plan, self.name, self.agent_at_work = plan, plan.name, True
+                self.run = f"run of {plan.name}"
                 assert stays_open
 
             async def play(self) -> RunRecord:
@@ -109,19 +118,18 @@ class Stage:
                 await stage.score(self.name)
                 return run_record(self.plan, finished(self.plan), None, [], Times())
 
-            resume = play
+            go_on = play
 
-        monkeypatch.setattr(sweep, "RunPlay", Play)
+        monkeypatch.setattr(sweep, "RunLifecycle", Play)
 
     def doing(self, name: str, **more: Any) -> None:
         self.view.doing(name, AgentDoing(**more))
 
     def play(self) -> Index:
         """Plays the sweep; the index as it is on disk afterwards."""
-        played = sweep.Sweep(
+        played = ClaimedSweep(
             self.suite,
             self.root,
-            self.root.parent,
             self.index,
             self.cluster,  # type: ignore[arg-type]
             Credentials(
@@ -133,7 +141,7 @@ class Stage:
 
         async def main() -> None:
             async with asyncio.timeout(TIMEOUT_S):
-                await played.play(decided)
+                await asyncio.gather(played.play(decided), self.beside())
 
         asyncio.run(main())
         return suite_index.load(self.root, "s")
@@ -145,7 +153,7 @@ def finished(plan: Plan) -> RunFinished:
         settings=plan.settings,
         status="completed",
         error=None,
-        close_reason="budget_spent",
+        closed_reason="budget_spent",
         agent={},
         final_score=1.0,
         best_submit_index=0,
@@ -195,7 +203,7 @@ def test_next_agent_begins_while_the_run_before_is_scored(
 ) -> None:
     text = HEAD + "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "_LOOK_S", TIMEOUT_S)
+    monkeypatch.setattr(sweep, "LOOK_S", TIMEOUT_S)
 
     async def score(name: str) -> None:
         # No run's score comes before the last agent has begun.
@@ -207,12 +215,37 @@ def test_next_agent_begins_while_the_run_before_is_scored(
     assert max(map(len, stage.most)) == 1
 
 
+def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = HEAD + "[defaults]\nrepeats = 2\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = Stage(tmp_path, text, monkeypatch)
+    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    pause = stage.root / PAUSED
+    begun: list[int] = []
+
+    async def act(name: str) -> None:
+        if len(stage.begun) == 1:
+            pause.touch()
+
+    async def unpause() -> None:
+        await until(lambda: any("paused" in said for said in stage.said))
+        await asyncio.sleep(0.1)
+        begun.append(len(stage.begun))
+        pause.unlink()
+
+    stage.act = act
+    stage.beside = unpause
+    index = stage.play()
+    assert begun == [1]
+    assert {entry.state for entry in index.runs.values()} == {"completed"}
+    assert len([said for said in stage.said if "paused: no further run begins" in said]) == 1
+
+
 def test_runs_that_are_followed_without_an_agent_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = HEAD + "[defaults]\nrepeats = 4\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "_MAX_SCORED", 2)
+    monkeypatch.setattr(sweep, "MAX_SCORED", 2)
     scored: set[str] = set()
     most: list[int] = []
 
@@ -243,7 +276,7 @@ def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_bac
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + CODEX.format("b")
     stage = Stage(tmp_path, HEAD + "[parallel]\nmachine = 2\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
     seen: list[list[str]] = []
 
     async def act(name: str) -> None:
@@ -268,7 +301,7 @@ def test_a_cap_of_the_sweep_leaves_coding_agents_open_and_begins_no_further_run(
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + EVOLVE.format("d")
     stage = Stage(tmp_path, HEAD + f"[parallel]\nmachine = 2\n[caps]\n{cap}\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
     ended: list[str] = []
 
     async def act(name: str) -> None:
@@ -303,7 +336,7 @@ def test_what_an_earlier_attempt_used_counts_towards_the_cap(
     for run in (a, b):
         stage.index.runs[run.name] = Entry(
             name=run.name,
-            agent=run.agent,
+            agent=run.entry,
             env=run.settings.env,
             repeat=0,
             digest=run.digest,
@@ -328,7 +361,7 @@ def test_a_run_is_told_to_the_cluster_as_soon_as_it_is_open(
 ) -> None:
     text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "_LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
     name = stage.runs[0].name
 
     async def act(_: str) -> None:
@@ -348,7 +381,7 @@ def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluste
 ) -> None:
     stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
     run = stage.runs[0]
-    left = run.folder(stage.root).workspace
+    left = run.folder.workspace
     left.mkdir(parents=True)
     answers = [ClaimState(granted=True, holder="me", run="r-7", previous="other:1")]
     stage.cluster.answer = lambda _: answers.pop() if answers else None
@@ -364,8 +397,8 @@ def test_a_claim_that_another_host_has_meanwhile_ends_the_run_here_and_its_resul
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"), monkeypatch)
-    for name in ("_LOOK_S", "_ASK_AGAIN_S"):
-        monkeypatch.setattr(sweep, name, 0.01)
+    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(claimed, "_ASK_AGAIN_S", 0.01)
     run = stage.runs[0]
     theirs = Entry(
         name=run.name,
@@ -408,7 +441,7 @@ def test_our_own_failure_gives_the_claim_back_and_is_told(
 
     async def fails(name: str) -> None:
         stage.doing(name, tokens=TOKENS)
-        raise sweep.EvopolicyError("the gateway cannot serve")
+        raise EvopolicyError("the gateway cannot serve")
 
     stage.act = fails
     index = stage.play()
@@ -453,3 +486,123 @@ def test_a_sweep_that_renews_no_claims_ends_with_the_reason(
     with pytest.raises(LookupError, match="a bug"):
         stage.play()
     assert not stage.going
+
+
+class Direct:
+    """The runs of `evopolicy local`, which do what a test says by their environments."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
+        self.said = io.StringIO()
+        self.ended: list[str] = []
+        self.kinds: list[str] = []
+        stage = self
+        self.plans = [
+            Plan(
+                name=env,
+                settings=RunSettings(env=env, entry="a", model="a", exp_id="t"),
+                agent="evolve",
+                runs=root,
+                started_in=root,
+                wall_limit_s=60.0,
+            )
+            for env in ("toy/line", "toy/maze")
+        ]
+
+        class Play:
+            """In place of `RunLifecycle`."""
+
+            def __init__(
+                self,
+                plan: Plan,
+                operations: object,
+                gateway: object,
+                watch: object,
+                *,
+                stays_open: bool,
+                on_agent_gone: Callable[[], None],
+            ) -> None:
+                self.plan = plan
+                assert not stays_open
+
+            async def play(self, kind: str = "play") -> RunRecord:
+                stage.kinds.append(kind)
+                try:
+                    await stage.act(self.plan.name)
+                finally:
+                    stage.ended.append(self.plan.name)
+                return run_record(self.plan, finished(self.plan), None, [], Times())
+
+            async def go_on(self) -> RunRecord:
+                return await self.play("go_on")
+
+        @contextlib.asynccontextmanager
+        async def connected(*_: object) -> AsyncIterator[tuple[object, object, None]]:
+            yield None, None, None
+
+        monkeypatch.setattr(sweep, "RunLifecycle", Play)
+        monkeypatch.setattr(runs, "connected", connected)
+
+    def play(self, parallel: int = 1) -> runs.Played:
+        async def main() -> runs.Played:
+            async with asyncio.timeout(TIMEOUT_S):
+                return await runs.play(
+                    self.plans, LocalCluster(), parallel, Terminal(file=self.said, width=200)
+                )
+
+        return asyncio.run(main())
+
+
+def test_of_a_commands_own_runs_one_that_fails_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+
+    async def act(name: str) -> None:
+        if name == "toy/line":
+            raise EvopolicyError("the gateway cannot serve")
+
+    direct.act = act
+    failed, completed = runs.documents(direct.play())
+    assert (failed["status"], failed["error"]) == ("error", "the gateway cannot serve")
+    assert (completed["status"], completed["final_score"]) == ("completed", 1.0)
+    assert direct.said.getvalue() == "toy/line: failed: the gateway cannot serve\n"
+    assert not list(tmp_path.glob("**/suite.json"))
+
+
+def test_a_wrong_option_of_each_run_is_the_commands_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+    wrong = {"toy/line"}
+
+    async def act(name: str) -> None:
+        if name in wrong:
+            raise ConfigError(f"{name} has too few cases")
+
+    direct.act = act
+    told = runs.documents(direct.play())
+    assert [one["wrong_option"] for one in told] == [True, False]
+    wrong.add("toy/maze")
+    with pytest.raises(ConfigError, match="toy/line has too few cases"):
+        direct.play()
+    assert direct.said.getvalue() == ""
+
+
+def test_a_commands_own_runs_go_on_where_they_are_resumed_and_end_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+    direct.plans[1] = msgspec.structs.replace(direct.plans[1], resume=True)
+
+    async def act(name: str) -> None:
+        await until(lambda: len(direct.kinds) == 2)
+        if name == "toy/line":
+            raise KeyboardInterrupt
+        await asyncio.Event().wait()
+
+    direct.act = act
+    with pytest.raises(KeyboardInterrupt):
+        direct.play(parallel=2)
+    assert direct.kinds == ["play", "go_on"]
+    assert direct.ended == ["toy/line", "toy/maze"]

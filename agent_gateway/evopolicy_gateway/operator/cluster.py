@@ -1,0 +1,82 @@
+"""The cluster that a command uses: an operator's, or one of this machine brought up for it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Collection, Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.cli import end_on_sigterm
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.processes.local_cluster import local_cluster
+from evopolicy_common.terminal import say
+from evopolicy_common.wire import transport
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.operator.operations import Operations, find_credentials
+
+
+class Cluster(msgspec.Struct, frozen=True, kw_only=True):
+    """Which cluster a command uses: a local one with so many slots, or the one that is named (or this machine's own)."""
+
+    connect: tuple[str, ...] = ()
+    file: Path | None = None
+    """The operator's credentials."""
+    local_slots: int | None = None
+    state: Path | None = None
+    """Of a local one: its folder; None for one that is thrown away."""
+    unjailed: bool = False
+    """Of a local one with a state: agents could read it."""
+    data: Path | None = None
+    audit: float = 0.0
+    """Of a local one: share of the episodes that a second worker plays again."""
+    hidden_isolation: str | None = None
+    """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
+
+    def check_cases(self, runs: Iterable[RunSettings]) -> None:
+        """ConfigError where a local one has not the case files that a run plays."""
+        if (
+            self.local_slots is not None
+            and self.data is None
+            and any(run.profile == "published" for run in runs)
+        ):
+            raise ConfigError(
+                "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
+                " published software, which holds gym/acrobot/train.json and so on"
+            )
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
+) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
+    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+
+    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
+    """
+    end_on_sigterm()
+    async with contextlib.AsyncExitStack() as stack:
+        failed: asyncio.Future[None] | None = None
+        file, opened = where.file, None
+        if where.local_slots is not None:
+            cluster = await stack.enter_async_context(
+                local_cluster(
+                    "local",
+                    state=where.state,
+                    data=where.data,
+                    audit=where.audit,
+                    hidden_isolation=where.hidden_isolation,
+                    unjailed=where.unjailed,
+                )
+            )
+            if cluster.note:
+                say(f"note: {cluster.note}", err=True)
+            await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
+            file, failed, opened = cluster.operator_file, cluster.failed, cluster.opened
+        operator, gateway = find_credentials(where.connect, file)
+        link = await stack.enter_async_context(transport.connect(operator))
+        yield Operations(link, opened), gateway, failed

@@ -1,0 +1,306 @@
+"""A suite's sweep on this host: keeps its claims on the runs that it plays, and the index up to date.
+
+Rules, beside those of every sweep:
+- A run is played only while this host holds its claim at the coordinator. A claim that another host has meanwhile ends
+  the run here, and its folder stays as it is.
+- Cancelled, it leaves runs open and gives no claim back: the same host goes on with them, and another takes them over
+  once their time is up.
+- A provider that is away holds back further runs with it; those that go on wait by themselves.
+- A cap that is used up holds back all further runs, and leaves those of coding agents open as a cancelled sweep does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.suite_folder import PAUSED
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.harnesses import session
+from evopolicy_gateway.operator.child_messages import AgentDoing
+from evopolicy_gateway.operator.locks import alone
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.suite import suite_index, sweep
+from evopolicy_gateway.suite.decisions import Decision, Found
+from evopolicy_gateway.suite.suite_file import SuiteFile
+from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
+from evopolicy_gateway.suite.suite_view import SuiteView
+from evopolicy_gateway.suite.sweep import Sweep
+
+_ASK_AGAIN_S = 5.0
+ATTEMPTS = ".attempts"
+
+
+class ClaimedSweep(Sweep):
+    """Plays a suite's decisions beside the other hosts that take part."""
+
+    stays_open = True
+
+    def __init__(
+        self,
+        suite: SuiteFile,
+        root: Path,
+        index: Index,
+        operations: Operations,
+        gateway: Credentials,
+        view: SuiteView,
+    ) -> None:
+        super().__init__(suite.parallel, index, operations, gateway, view)
+        self._suite = suite
+        self._view = view
+        self._root = root.absolute()
+        self._host = socket.gethostname()
+        # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts.
+        self._holder = f"{self._host}:{hashlib.sha256(str(self._root).encode()).hexdigest()[:12]}"
+        self._not_before: dict[str, float] = {}
+        self._paused_until: dict[str, float] = {}
+        self._ending: set[str] = set()
+        """Runs that have been cancelled and are not done with it."""
+        self._unsaved = False
+        self._paused = False
+        view.on_doing = self._on_doing
+
+    async def play(self, decisions: Sequence[Decision]) -> None:
+        renewing = asyncio.create_task(self._renew())
+        try:
+            # Claims that nobody renews would go to another host while their runs go on here.
+            await unless_failed(asyncio.create_task(super().play(decisions)), renewing)
+        finally:
+            renewing.cancel()
+            await asyncio.gather(renewing, return_exceptions=True)
+            with contextlib.suppress(EvopolicyError):
+                self._save()
+
+    def _startable(self) -> list[Decision]:
+        """As ever; none while the sweep is paused."""
+        was_paused, self._paused = self._paused, (self._root / PAUSED).exists()
+        if self._paused and not was_paused:
+            self._view.say(f"paused: no further run begins while {self._root / PAUSED} is there")
+        return [] if self._paused else super()._startable()
+
+    def _given_up(self) -> bool:
+        why = self._used_up()
+        if why is not None:
+            self._view.say(f"{len(self._todo)} runs are left as they are: {why}")
+        return why is not None
+
+    def _may_begin(self, run: Plan) -> bool:
+        waits_until = max(self._not_before.get(run.name, 0.0), self._paused_until.get(run.provider, 0.0))
+        return waits_until <= time.monotonic() and self._used_up() is None
+
+    async def _wait(self, active: list[asyncio.Task[None]]) -> None:
+        self._stop_at_the_cap()
+        await super()._wait(active)
+
+    def _stop_at_the_cap(self) -> None:
+        """Interrupts what still uses tokens once a cap of the sweep is used up."""
+        why = self._used_up()
+        for name, task in self._active.items() if why is not None else ():
+            play = self._plays.get(name)
+            if self._decided[name].run.config is not None and play is not None and play.agent_at_work:
+                self._end(name, task, f"interrupted: {why}; it goes on where it was once the cap is raised")
+
+    def _end(self, name: str, task: asyncio.Task[None], why: str) -> None:
+        """Ends a run here and leaves it open; once, as a second time would break the ending off."""
+        if name not in self._ending:
+            self._ending.add(name)
+            self._view.note(name, why)
+            task.cancel()
+
+    def _ended(self, name: str, task: asyncio.Task[None]) -> None:
+        self._ending.discard(name)
+        if not task.cancelled():
+            task.result()
+            return
+        # Another host has it, whose result is asked for in time; or a cap is used up.
+        self._not_before[name] = time.monotonic() + _ASK_AGAIN_S
+        self._view.waits(name)
+        self._todo.append(self._decided[name])
+
+    async def _begin(self, decision: Decision) -> bool:
+        """Claims the run and starts it; False when another host has it at the moment."""
+        run = decision.run
+        claim = await self._ask(run)
+        if claim.result is not None:
+            entry = msgspec.structs.replace(msgspec.convert(claim.result, Entry), directory="")
+            self._put(entry)
+            self._view.finished(run.name, entry)
+            return True
+        if not claim.granted:
+            self._not_before[run.name] = time.monotonic() + _ASK_AGAIN_S
+            self._view.elsewhere(run.name, claim.holder.partition(":")[0])
+            return False
+        if claim.previous:
+            self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
+            if claim.run:
+                await self._forget(claim.run)
+            decision = self._anew(run.name)
+        return await super()._begin(decision)
+
+    def _begun(self, decision: Decision) -> Entry:
+        settings = msgspec.to_builtins(decision.run.defining)
+        used = self._used_before(decision)
+        return msgspec.structs.replace(super()._begun(decision), host=self._host, settings=settings, **used)
+
+    async def _play(self, decision: Decision) -> None:
+        await super()._play(decision)
+        entry = self._index.runs[decision.run.name]
+        self._view.finished(entry.name, entry)
+        if entry.state in FINISHED:
+            await self._ask(decision.run, result=msgspec.to_builtins(entry))
+        else:
+            await self._ask(decision.run, ttl_s=0.0)
+
+    async def _record(self, decision: Decision, begun: Entry) -> Entry:
+        run = decision.run
+        self._view.started(run.name, decision.attempt)
+        if decision.kind in ("restart", "new"):
+            with alone(run.folder.lock, run.folder.root):
+                await self._put_aside(run.folder, decision.attempt - 1)
+        settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
+        record = await self._played(decision, msgspec.structs.replace(run, settings=settings))
+        if record.outcome.status == "cancelled" and await self._is_taken_over(run):
+            self._view.note(run.name, "another host has it now and has cancelled it here")
+            self._anew(run.name)
+            raise asyncio.CancelledError
+        known = {"settings": begun.settings, "earlier": begun.earlier}
+        return suite_index.entry_of(run, record, host=self._host, run=self._run_of(run), **known)
+
+    async def _is_taken_over(self, run: Plan) -> bool:
+        claim = await self._ask(run)
+        return claim.result is not None or not claim.granted
+
+    async def _renew(self) -> None:
+        """Keeps the claims of what goes on here, and tells soon which run of the cluster is played for each."""
+        every_s = self._limits.claim_ttl_s / 4
+        told: dict[str, tuple[str, float]] = {}
+        while True:
+            await asyncio.sleep(min(sweep.LOOK_S, every_s))
+            if self._unsaved:
+                # Claims are renewed whatever the disk says.
+                with contextlib.suppress(EvopolicyError):
+                    self._save()
+            for name, task in list(self._active.items()):
+                run = self._decided[name].run
+                known, at = told.get(name, ("", 0.0))
+                fresh = self._run_of(run) == known and time.monotonic() - at < every_s
+                if fresh or name in self._ending:
+                    continue
+                with contextlib.suppress(EvopolicyError):
+                    told[name] = (self._run_of(run), time.monotonic())
+                    claim = await self._ask(run)
+                    if not claim.granted and claim.holder != self._holder and not task.done():
+                        # That host has ended our run at the cluster.
+                        self._anew(name)
+                        self._end(name, task, f"another host has it now ({claim.holder}): ended here")
+
+    async def _ask(
+        self, run: Plan, ttl_s: float | None = None, result: dict[str, Any] | None = None
+    ) -> ClaimState:
+        # With other settings it is another run, whatever has become of the one before.
+        name = f"{run.name}@{run.digest}"
+        return await self._operations.claim(
+            self._suite.name,
+            name,
+            self._holder,
+            self._limits.claim_ttl_s if ttl_s is None else ttl_s,
+            self._run_of(run),
+            result,
+        )
+
+    async def _put_aside(self, folder: RunFolder, attempt: int) -> None:
+        """Keeps what there is of an earlier attempt, and ends its run at the cluster."""
+        if not folder.root.exists():
+            return
+        await self._operations.drop(folder)
+        kept = self._root / ATTEMPTS / folder.root.relative_to(self._root)
+        target = kept.with_name(f"{kept.name}.{max(attempt, 1)}")
+        while target.exists():
+            target = target.with_name(f"{target.name}+")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_tree(folder.state)
+        folder.root.rename(target)
+
+    async def _forget(self, run: str) -> None:
+        with contextlib.suppress(EvopolicyError):
+            await self._operations.cancel(run)
+
+    def _anew(self, name: str) -> Decision:
+        """What becomes of a run that another host has had meanwhile."""
+        before = self._decided[name]
+        self._decided[name] = msgspec.structs.replace(before, kind="restart", attempt=before.attempt + 1)
+        return self._decided[name]
+
+    def _run_of(self, run: Plan) -> str:
+        play = self._plays.get(run.name)
+        return "" if play is None else play.run
+
+    def _used_before(self, decision: Decision) -> dict[str, Any]:
+        """What a run that is gone on with, or the attempts before it, have used."""
+        entry = self._index.runs.get(decision.run.name)
+        if entry is None:
+            return {}
+        if decision.kind in ("resume", "finish"):
+            return {"tokens": entry.tokens, "earlier": entry.earlier}
+        return {"earlier": suite_index.added(entry.earlier, entry.tokens)}
+
+    def _on_doing(self, name: str, doing: AgentDoing) -> None:
+        entry = self._index.runs.get(name)
+        if entry is not None and doing.tokens is not None:
+            # Written with the next look: a stream may tell it many times a second.
+            self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
+            self._unsaved = True
+        if doing.provider:
+            self._paused_until[doing.provider] = time.monotonic() + doing.paused_s
+
+    def _used_up(self) -> str | None:
+        caps = self._suite.caps
+        tokens, cost = suite_index.used(self._index)
+        if caps.max_tokens is not None and tokens >= caps.max_tokens:
+            return f"{tokens} of {caps.max_tokens} tokens are used"
+        if caps.max_cost is not None and cost >= caps.max_cost:
+            return f"{cost:.2f} of {caps.max_cost:.2f} dollars are spent"
+        return None
+
+    def _put(self, entry: Entry) -> None:
+        super()._put(entry)
+        self._save()
+
+    def _save(self) -> None:
+        suite_index.save(self._root, self._index)
+        self._unsaved = False
+
+
+async def look(run: Plan, index: Index, operations: Operations) -> Found:
+    """What there is of a run."""
+    folder = run.folder
+    status: str | None = None
+    with contextlib.suppress(OSError, EvopolicyError):
+        status = suite_index.state_of(decode_run_record(folder.run_json.read_bytes()))
+    opened = status is None and folder.opened.exists() and folder.credentials.exists()
+    phase: str | None = None
+    has_session = False
+    if opened:
+        identity = saved(folder.opened, OpenedRun).run
+        phase = await operations.phase(identity)
+        resumable = harnesses.make(run.agent, run.started_in, run.config).resumable
+        has_session = resumable and session.load(folder.session).session is not None
+    return Found(
+        entry=index.runs.get(run.name), status=status, opened=opened, phase=phase, has_session=has_session
+    )

@@ -1,0 +1,50 @@
+"""What a command's runs came to: the exit code with its reasons."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from evopolicy_common.terminal import say_lines
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.suite.suite_index import Entry, Index
+
+EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
+"""Of a command that plays runs, the gravest first; 0 when every run completed."""
+_AGENT_FAILED = ("agent_failed", "silent")
+
+
+def exit_code(runs: Sequence[Plan], index: Index) -> int:
+    """For the gravest of these runs' ends: see `EXIT_CODES`. Says on stderr of each run that did not complete why."""
+    ends = [(run, index.runs.get(run.name)) for run in runs]
+    say_lines((_why(run, entry) for run, entry in ends if _kind(entry) != "completed"), err=True)
+    kinds = {_kind(entry) for _, entry in ends}
+    return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
+
+
+def _kind(entry: Entry | None) -> str:
+    """A key of `EXIT_CODES`, or `completed`."""
+    if entry is None:
+        return "error"
+    if entry.closed_reason in _AGENT_FAILED and entry.state != "cancelled":
+        return "agent_failed"
+    return entry.state if entry.state in EXIT_CODES or entry.state == "completed" else "error"
+
+
+def _why(run: Plan, entry: Entry | None) -> str:
+    """In a line."""
+    if entry is None:
+        return f"{run.name}: it was not begun"
+    said = {
+        "agent_failed": f"its agent stopped: {entry.closed_reason}",
+        "no_ok_submit": "no submit of it was ok",
+        "cancelled": "it was cancelled",
+    }
+    why = entry.error or said.get(_kind(entry), f"it was left {entry.state}")
+    return f"{run.name}: {why}" + (f"; see {run.folder.root}" if entry.directory else "")
+
+
+def next_step(runs: Path) -> str:
+    """What to do with the runs in that folder."""
+    return f"next: evopolicy report {shlex.quote(str(runs))} --out report"

@@ -1,0 +1,127 @@
+"""The runs of `run` and `local`: a sweep without a file, an index on disk or other hosts."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.console import Terminal, table
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.terminal import number
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.operator.cluster import Cluster, connected
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.operator.watch import RunView, Watch
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.suite.decisions import Decision
+from evopolicy_gateway.suite.ends import next_step
+from evopolicy_gateway.suite.suite_file import Parallel
+from evopolicy_gateway.suite.suite_index import Entry, Index, entry_of
+from evopolicy_gateway.suite.sweep import Sweep
+
+
+class Played(msgspec.Struct, frozen=True):
+    """What the runs came to."""
+
+    plans: Sequence[Plan]
+    index: Index
+    """Of this command alone; on no disk."""
+    records: dict[str, RunRecord]
+    """`run.json` of those that came so far, by name."""
+    wrong: set[str]
+    """Names of those that were never opened, for an option's sake."""
+
+
+class _Runs(Sweep):
+    stays_open = False
+
+    def __init__(
+        self, played: Played, parallel: int, operations: Operations, gateway: Credentials, watch: Watch
+    ) -> None:
+        super().__init__(Parallel(machine=parallel), played.index, operations, gateway, watch)
+        self._told = played
+
+    async def _record(self, decision: Decision, begun: Entry) -> Entry:
+        run = decision.run
+        record = self._told.records[run.name] = await self._played(decision, run)
+        # Here no run is played again because its agent never played, so it keeps its own end.
+        return msgspec.structs.replace(
+            entry_of(run, record), state=record.outcome.status, error=record.outcome.error
+        )
+
+    def _why(self, run: Plan, error: Exception) -> str:
+        if isinstance(error, ConfigError):
+            self._told.wrong.add(run.name)
+            return str(error)
+        why = super()._why(run, error)
+        self._watch.note(run.name, f"failed: {why}")
+        return why
+
+
+async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> Played:
+    """Plays all plans, so many agents at once; one that fails does not stop the others. ConfigError when an option is wrong
+    for each of them."""
+    played = Played(plans, Index(suite=""), {}, set())
+    decided = [Decision(run=plan, kind="resume" if plan.resume else "new", attempt=1) for plan in plans]
+    with RunView(console).shown() as watch:
+        settings = [plan.settings for plan in plans]
+        where.check_cases(settings)
+        async with connected(
+            where, [one.env for one in settings], {one.sandbox_tier for one in settings}
+        ) as (operations, gateway, failed):
+            runs = _Runs(played, parallel, operations, gateway, watch)
+            await unless_failed(asyncio.create_task(runs.play(decided)), failed)
+    if played.wrong == set(played.index.runs):
+        raise ConfigError(played.index.runs[plans[0].name].error or "")
+    return played
+
+
+def documents(played: Played) -> list[dict[str, Any]]:
+    """What the runs came to, for scripts."""
+    return [_document(run, played.index.runs[run.name], played) for run in played.plans]
+
+
+def _document(run: Plan, entry: Entry, played: Played) -> dict[str, Any]:
+    record = played.records.get(run.name)
+    audit = None if record is None else record.audit
+    return {
+        "env": entry.env,
+        "run_directory": str(run.folder.root),
+        "status": entry.state,
+        "error": entry.error,
+        "final_score": entry.score,
+        "random_score": entry.random,
+        "best_submit_index": None if record is None else record.outcome.best_submit_index,
+        "n_submits": 0 if record is None else len(list(run.folder.checkpoints.glob("submit_*"))),
+        "budget_used": entry.budget_used,
+        "closed_reason": entry.closed_reason,
+        "wall_s": entry.wall_s,
+        "in_question": audit is not None and audit.in_question,
+        "wrong_option": run.name in played.wrong,
+    }
+
+
+def report(played: Played, runs: Path, console: Terminal) -> None:
+    """A table of what the runs came to, where each of them is, and what to do with all that are in the folder `runs`."""
+    headings = ("environment", "score", "random", "best submit", "budget used", "ended")
+    made = table(*headings, right=("score", "random"))
+    told = documents(played)
+    for one in told:
+        best = "" if one["best_submit_index"] is None else f"submit {one['best_submit_index']}"
+        shown = one["closed_reason"].replace("_", " ") if one["status"] == "completed" else one["status"]
+        score, random = number(one["final_score"]), number(one["random_score"])
+        made.add_row(one["env"], score, random, best, str(one["budget_used"]), shown)
+    console.print(made)
+    for one in told:
+        if one["in_question"]:
+            text = f"{one['env']}: audits put these results in question; see `audit` in run.json"
+            console.print(text, soft_wrap=True)
+        console.print(f"run directory: {one['run_directory']}", soft_wrap=True)
+    if any(one["status"] == "completed" for one in told):
+        console.print(next_step(runs), soft_wrap=True)

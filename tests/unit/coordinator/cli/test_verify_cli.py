@@ -1,0 +1,23 @@
+"""`evopolicy verify`: how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from evopolicy_coordinator.cli import verify
+
+
+def test_verify_ended_by_a_signal_says_so_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def ended(*_: object) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        task.cancel()
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr(verify, "_verify", ended)
+    result = CliRunner().invoke(verify.app, [str(tmp_path)])
+    assert (result.exit_code, result.output.split()) == (130, ["error:", "interrupted"])

@@ -1,0 +1,182 @@
+"""What is told of finished runs: the index's bytes, the documents of `--json`, the exit code with its reasons, the report."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from finished_run import finished
+
+from evopolicy_common.console import Terminal
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.record import run_record
+from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.suite import suite_index
+from evopolicy_gateway.suite.ends import exit_code
+from evopolicy_gateway.suite.runs import Played, documents, report
+from evopolicy_gateway.suite.suite_file import expand, read
+from evopolicy_gateway.suite.suite_index import Entry, Index, entry_of
+
+FILE = """
+name = "s"
+environments = ["toy/line"]
+[defaults]
+budget = 8
+[[agents]]
+name = "evolve"
+agent = "evolve"
+"""
+GOLDEN_INDEX = """{
+  "schema_version": 1,
+  "suite": "s",
+  "updated_at": "",
+  "runs": {
+    "evolve/toy/line/0": {
+      "name": "evolve/toy/line/0",
+      "agent": "evolve",
+      "env": "toy/line",
+      "repeat": 0,
+      "digest": "f6b6e349fa3cfde6",
+      "settings": {
+        "agent": "evolve",
+        "config": null,
+        "settings": {
+          "env": "toy/line",
+          "entry": "evolve",
+          "model": "evolve",
+          "exp_id": "s-0",
+          "budget": 8,
+          "notes": {
+            "suite": "s"
+          }
+        },
+        "agent_wall_s": 43200.0
+      },
+      "state": "completed",
+      "attempt": 1,
+      "directory": "evolve/toy_line/s-0",
+      "run": "r",
+      "host": "h",
+      "score": 2.0,
+      "random": 0.5,
+      "n_submits": 2,
+      "budget_used": 8,
+      "tokens": null,
+      "earlier": null,
+      "closed_reason": "budget_spent",
+      "error": null,
+      "wall_s": 12.5,
+      "finished_at": "1970-01-01T00:01:52.500000Z"
+    }
+  }
+}"""
+"""Of version 1, which later versions go on with: hosts of a sweep may be of several."""
+NEVER_PLAYED = {
+    "status": "no_ok_submit",
+    "final_score": None,
+    "best_submit_index": None,
+    "closed_reason": "agent_failed",
+    "budget_used": 0,
+    "val_scores": {},
+    "heldout_returns": (),
+    "submits": (),
+}
+
+
+def one_run(root: Path, **fields: Any) -> tuple[Plan, RunRecord]:
+    path = root / "s.toml"
+    path.write_text(FILE)
+    (plan,) = expand(read(str(path)), root / "runs", root)
+    for index in range(3):
+        (plan.folder.checkpoints / f"submit_{index:03d}").mkdir(parents=True)
+    return plan, run_record(plan, finished(settings=plan.settings, **fields), None, [], Times(open_s=9.0))
+
+
+def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:
+    plan, record = one_run(tmp_path)
+    told = entry_of(plan, record, settings=msgspec.to_builtins(plan.defining), host="h", run="r")
+    index = Index(suite="s", runs={plan.name: told})
+    assert msgspec.json.format(msgspec.json.encode(index), indent=2).decode() == GOLDEN_INDEX
+    (tmp_path / "suite.json").write_text(GOLDEN_INDEX)
+    assert suite_index.load(tmp_path, "s") == index
+
+
+def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
+    plan, record = one_run(tmp_path)
+    played = Played(
+        [plan], Index(suite="", runs={plan.name: entry_of(plan, record)}), {plan.name: record}, set()
+    )
+    assert json.loads(msgspec.json.encode(documents(played))) == [
+        {
+            "env": "toy/line",
+            "run_directory": str(plan.folder.root),
+            "status": "completed",
+            "error": None,
+            "final_score": 2.0,
+            "random_score": 0.5,
+            "best_submit_index": 1,
+            "n_submits": 3,
+            "budget_used": 8,
+            "closed_reason": "budget_spent",
+            "wall_s": 12.5,
+            "in_question": False,
+            "wrong_option": False,
+        }
+    ]
+
+
+def test_a_sweep_plays_again_what_its_agent_never_played(tmp_path: Path) -> None:
+    plan, record = one_run(tmp_path, **NEVER_PLAYED)
+    told = entry_of(plan, record)
+    assert (told.state, told.closed_reason, told.score) == ("error", "agent_failed", None)
+    assert "failed before its first submit" in (told.error or "")
+
+
+def test_exit_codes_and_the_report_tell_how_runs_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends: list[tuple[dict[str, Any], int]] = [
+        ({"state": "completed", "score": 1.0, "random": 0.5}, 0),
+        ({"state": "no_ok_submit"}, 3),
+        ({"state": "completed", "closed_reason": "agent_failed"}, 4),
+        ({"state": "cancelled", "closed_reason": "agent_failed"}, 5),
+        ({"state": "error", "error": "worker lost"}, 1),
+    ]
+    plans: list[Plan] = []
+    index = Index(suite="")
+    for name, (told, code) in zip("abcde", ends, strict=True):
+        settings = RunSettings(env=name, entry="evolve", model="none", exp_id="t")
+        plan = Plan(
+            name=name,
+            settings=settings,
+            agent="evolve",
+            runs=tmp_path,
+            started_in=tmp_path,
+            wall_limit_s=60.0,
+        )
+        plans.append(plan)
+        more = {"agent": "evolve", "env": name, "repeat": 0, "digest": "", "directory": f"evolve/{name}/t"}
+        index.runs[name] = Entry(name=name, **more | told)
+        assert exit_code(plans, index) == code
+        # Whatever is no success is explained where nobody has to look for it.
+        said = capsys.readouterr().err.splitlines()
+        assert [line.partition(":")[0] for line in said] == [one.name for one in plans[1:]]
+    assert said == [
+        f"b: no submit of it was ok; see {tmp_path}/evolve/b/t",
+        f"c: its agent stopped: agent_failed; see {tmp_path}/evolve/c/t",
+        f"d: it was cancelled; see {tmp_path}/evolve/d/t",
+        f"e: worker lost; see {tmp_path}/evolve/e/t",
+    ]
+    out = io.StringIO()
+    report(Played(plans, index, {}, set()), Path("my runs"), Terminal(file=out, width=200))
+    assert "next: evopolicy report 'my runs' --out report" in out.getvalue()
+    for needed in ("no_ok_submit", f"run directory: {tmp_path}/evolve/a/t", "agent failed", "cancelled"):
+        assert needed in out.getvalue()
+    assert exit_code(plans[:1], Index(suite="")) == 1
+    assert capsys.readouterr().err == "a: it was not begun\n"
