@@ -44,7 +44,7 @@ paper-worker:
 	@echo "next: .venv-paper/bin/evopolicy-worker --env core16"
 
 demo: install
-	@$(BIN)/evopolicy local --env gym/continuouscar --agent evolve --budget 32 --exp-id demo --overwrite --runs runs
+	@$(BIN)/evopolicy demo
 
 # One process more than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
 test: install

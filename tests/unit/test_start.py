@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import typer
@@ -62,6 +64,12 @@ def test_the_version_and_a_completed_name_import_nothing_large_either() -> None:
     asked = {"_EVOPOLICY_COMPLETE": "complete_bash", "COMP_WORDS": "evopolicy --ver", "COMP_CWORD": "1"}
     # typer itself asks bash for its version with asyncio.
     assert not imported(FRONT, **asked) & LARGE - {"asyncio", "ssl"}
+
+
+def test_commands_are_found_by_the_table_alone() -> None:
+    """An entry point of the group that there once was would be a command that nobody finds."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert "entry-points" not in project
 
 
 @pytest.mark.parametrize("name", PLACES)

@@ -29,6 +29,17 @@ _PLAY = "evopolicy_gateway.cli.play:app"
 _COORDINATOR = "evopolicy_coordinator.cli"
 
 PLACES = {
+    "demo": Place(
+        _PLAY, "Plays one whole run on this machine: the agent evolve on gym/continuouscar, 32 episodes."
+    ),
+    "doctor": Place(
+        "evopolicy_worker.sandbox.doctor_command:app",
+        "Checks this machine, and says for each missing part what to do and what works without it.",
+    ),
+    "files": Place(
+        "evopolicy_gateway.cli.files:app",
+        "Lists the examples, deployment files and pages that come with evopolicy, or copies them.",
+    ),
     "run": Place(
         _PLAY,
         "Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json.",
@@ -56,6 +67,7 @@ PLACES = {
     "status": Place(f"{_COORDINATOR}.status:status_app", "What a cluster is doing."),
     "workers": Place(f"{_COORDINATOR}.status:workers_app", "Take workers out of service and back."),
     "runs": Place(f"{_COORDINATOR}.status:runs_app", "An operator's word on runs."),
+    "web": Place(f"{_COORDINATOR}.web:app", "Show sweeps, runs and the cluster in a browser, live."),
     "report": Place(
         f"{_COORDINATOR}.report:app", "Turn run directories into a leaderboard, figures and diagnostics."
     ),

@@ -124,6 +124,23 @@ def local(
         _play(plans, where, parallel, as_json)
 
 
+@app.command(epilog="Example: evopolicy demo")
+def demo(
+    runs: Annotated[Path, typer.Option(help="Folder of run directories.")] = Path("runs"),
+    slots: options.Slots = 2,
+    as_json: options.Json = False,
+) -> None:
+    """Plays one whole run on this machine: the agent evolve on gym/continuouscar, 32 episodes. Takes about a minute.
+
+    The run directory is runs/evolve/gym_continuouscar/demo; the next demo replaces it.
+    """
+    with fail_on_our_errors():
+        given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
+        plans = _plans(given, ["gym/continuouscar"], JailOptions().settings())
+        where = Cluster(local_slots=slots, state=options.state_of(None, fresh=False))
+        _play(plans, where, 1, as_json)
+
+
 @app.command(
     "try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3"
 )

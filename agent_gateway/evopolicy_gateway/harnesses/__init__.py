@@ -49,7 +49,7 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
     """
     kind, colon, rest = agent.partition(":")
     if config is None and kind == "file" and rest:
-        config = read_agent(started_in / rest)
+        config = read_agent(shipped.found(rest, started_in))
     if config is None and kind in _DIALECTS:
         config = AgentConfig(harness=kind, model=rest or None)
     if config is not None:

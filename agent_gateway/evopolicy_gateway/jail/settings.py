@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes import distribution
 
 Mode = Literal["bwrap", "open-network", "none"]
 Host = tuple[str, int]
@@ -22,10 +23,7 @@ _HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TIMEOUT_S = 30.0
 _STATE_FOLDERS = (".gateway", "*/.gateway", "*/*/.gateway", "*/*/*/.gateway")
-_REMEDY = (
-    "install bubblewrap (apt-get install bubblewrap, dnf install bubblewrap) and permit user namespaces, or give the"
-    " jail up by name with --jail none, which run.json then says"
-)
+_GIVE_UP = "or give the jail up by name with --jail none, which run.json then says"
 
 
 class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,7 +81,9 @@ def check_bubblewrap() -> None:
     """ConfigError, with what to do, when this machine cannot build a jail."""
     program = shutil.which("bwrap")
     if program is None:
-        raise ConfigError(f"the agent's jail needs bubblewrap, which is not installed: {_REMEDY}")
+        raise ConfigError(
+            f"the agent's jail needs bubblewrap, which is not installed: {distribution.install('bubblewrap')}; {_GIVE_UP}"
+        )
     flags = ("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts")
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
     try:
@@ -91,10 +91,10 @@ def check_bubblewrap() -> None:
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(f"the agent's jail cannot be built here ({error}): {_REMEDY}") from error
+        raise ConfigError(f"the agent's jail cannot be built here ({error}): {_remedy()}") from error
     if tried.returncode:
         said = tried.stderr.decode("utf-8", "replace").strip() or f"exit status {tried.returncode}"
-        raise ConfigError(f"the agent's jail cannot be built here ({said}): {_REMEDY}")
+        raise ConfigError(f"the agent's jail cannot be built here ({said}): {_remedy()}")
 
 
 def absolute(path: str, started_in: Path) -> str:
@@ -110,3 +110,7 @@ def _check_path(option: str, path: Path) -> None:
         raise ConfigError(f"{option} /: the whole machine is no jail; say --jail none")
     if ".gateway" in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
         raise ConfigError(f"{option} {path}: it holds the credentials of a run that is open")
+
+
+def _remedy() -> str:
+    return f"permit user namespaces ({distribution.permit_namespaces()}), {_GIVE_UP}"

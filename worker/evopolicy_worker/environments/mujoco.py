@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
+from evopolicy_common.processes import distribution
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
@@ -42,8 +43,7 @@ class MujocoFamily(GymnasiumFamily):
         """As others; WorkerError where a picture is asked for and the host has no EGL to draw it."""
         if render and find_library("EGL") is None:
             raise WorkerError(
-                f"{entry.id} renders with EGL, which is not installed: apt-get install libegl1 libegl-mesa0 "
-                "libgl1-mesa-dri"
+                f"{entry.id} renders with EGL, which is not installed: {distribution.install('egl')}"
             )
         return super().make(entry, render=render)
 

@@ -14,7 +14,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes import host
+from evopolicy_common.processes import distribution, host
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import jail, seccomp, why_not
 
@@ -45,6 +45,8 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     found: str
     advice: str = ""
     """What to do, when something is missing."""
+    without: str = ""
+    """What works where it is missing."""
 
 
 def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]:
@@ -92,14 +94,24 @@ def _boot_id() -> Check:
 def _bubblewrap() -> Check:
     path = shutil.which("bwrap")
     if path is None:
-        return Check(name="bubblewrap", verdict="missing", found="not on the PATH", advice=jail.INSTALL_BWRAP)
+        return _no_bubblewrap("not on the PATH")
     try:
         said = subprocess.run(
             [path, "--version"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
         ).stdout.strip()
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Check(name="bubblewrap", verdict="missing", found=str(error), advice=jail.INSTALL_BWRAP)
+        return _no_bubblewrap(str(error))
     return Check(name="bubblewrap", verdict="ok", found=f"{said} ({path})")
+
+
+def _no_bubblewrap(found: str) -> Check:
+    return Check(
+        name="bubblewrap",
+        verdict="missing",
+        found=found,
+        advice=distribution.install("bubblewrap"),
+        without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
+    )
 
 
 def _namespace(name: str, flag: int) -> Check:
@@ -112,8 +124,8 @@ def _namespace(name: str, flag: int) -> Check:
         name=f"namespace {name}",
         verdict="missing",
         found=os.strerror(error),
-        advice="allow unprivileged user namespaces: sysctl user.max_user_namespaces, kernel.unprivileged_userns_clone,"
-        " kernel.apparmor_restrict_unprivileged_userns; in a container: --security-opt seccomp=unconfined",
+        advice=f"permit user namespaces: {distribution.permit_namespaces()}",
+        without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
     )
 
 

@@ -11,12 +11,12 @@ import msgspec
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes import distribution
 from evopolicy_worker.sandbox import python_files, seccomp
 
 INSIDE = Path(__file__).parent / "inside"
 """Our code that the sandbox shows: the zygote and the player, nothing else."""
 
-INSTALL_BWRAP = "apt-get install bubblewrap (Debian, Ubuntu), dnf install bubblewrap (Fedora)"
 
 POLICY_HOME = "/home/policy"
 _PACKAGES = "/packages"
@@ -119,7 +119,7 @@ def bubblewrap() -> str:
     """Where it is. SandboxError, with how to install it, when it is not."""
     found = shutil.which("bwrap")
     if found is None:
-        raise SandboxError(f"bubblewrap is not installed: {INSTALL_BWRAP}")
+        raise SandboxError(f"bubblewrap is not installed: {distribution.install('bubblewrap')}")
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from slots import HONEST, STUCK, Slots, begun, family, make_job, pid_of, runs
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.processes import distribution
 from evopolicy_worker.sandbox import available_tiers, jail, why_not
 from evopolicy_worker.slots.slot import Slot
 
@@ -127,11 +129,11 @@ def test_without_bubblewrap_the_error_says_what_to_install(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     slot = slots.new()
-    with pytest.raises(SandboxError, match="apt-get install bubblewrap"):
+    with pytest.raises(SandboxError, match=re.escape(distribution.install("bubblewrap"))):
         slots.run(slot.start())
     why_not.cache_clear()
     assert "bwrap" not in available_tiers()
-    assert "apt-get install bubblewrap" in str(why_not("bwrap"))
+    assert distribution.install("bubblewrap") in str(why_not("bwrap"))
     why_not.cache_clear()
 
 

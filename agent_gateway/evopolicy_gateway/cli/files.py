@@ -1,0 +1,51 @@
+"""`evopolicy files`: what comes with the package beside its code, for installations without a clone."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.terminal import say_lines
+from evopolicy_gateway import shipped
+
+app = App()
+
+
+@app.command("files", epilog="Example: evopolicy files deploy --to .")
+def files(
+    name: Annotated[
+        str, typer.Argument(help="A file or folder, such as deploy or constraints.txt; default: all.")
+    ] = "",
+    to: Annotated[Path | None, typer.Option(help="Copy them into this folder, under their names.")] = None,
+) -> None:
+    """Lists the examples, deployment files and pages that come with evopolicy, or copies them.
+
+    Commands find these files by the names that the documentation uses, unless a file of that name is here.
+    """
+    with fail_on_our_errors():
+        wanted = name.rstrip("/")
+        chosen = [
+            (each, place)
+            for each, place in shipped.files()
+            if not wanted or each == wanted or each.startswith(f"{wanted}/")
+        ]
+        if not chosen:
+            raise ConfigError(f"no file {name!r} comes with evopolicy; `evopolicy files` lists all")
+        if to is None:
+            # One file is given as its place, for other programs: pip install -c "$(evopolicy files constraints.txt)".
+            say_lines([str(chosen[0][1])] if chosen[0][0] == wanted else [each for each, _ in chosen])
+            return
+        targets = [to / each for each, _ in chosen]
+        there = [target for target in targets if target.exists()]
+        if there:
+            raise ConfigError(f"{there[0]} is there already; choose another folder with --to")
+        for target, (_, place) in zip(targets, chosen, strict=True):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(place, target)
+        say_lines([f"{len(chosen)} files copied to {to}"])

@@ -1,0 +1,91 @@
+"""What to install or set on this machine's distribution: its package manager by name, and the kernel setting that forbids."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+
+_INSTALL = {
+    "debian": "sudo apt-get install",
+    "fedora": "sudo dnf install",
+    "arch": "sudo pacman -S",
+    "suse": "sudo zypper install",
+    "alpine": "sudo apk add",
+    "nixos": "nix-env -iA",
+}
+"""Commands by family, as `ID` and `ID_LIKE` of os-release name it."""
+_KIN = {"ubuntu": "debian", "rhel": "fedora", "centos": "fedora", "opensuse": "suse", "manjaro": "arch"}
+_PACKAGES = {
+    "bubblewrap": {"nixos": "nixos.bubblewrap"},
+    "egl": {
+        "debian": "libegl1 libegl-mesa0 libgl1-mesa-dri",
+        "fedora": "mesa-libEGL mesa-dri-drivers",
+        "arch": "mesa",
+        "suse": "Mesa-libEGL1 Mesa-dri",
+        "alpine": "mesa-egl mesa-dri-gallium",
+        "nixos": "nixos.mesa",
+    },
+    "chromium": {"nixos": "nixos.chromium"},
+}
+"""Names of packages by family, where they are not the key."""
+_SETTINGS = (
+    ("user/max_user_namespaces", "0", "sudo sysctl -w user.max_user_namespaces=15000"),
+    ("kernel/unprivileged_userns_clone", "0", "sudo sysctl -w kernel.unprivileged_userns_clone=1"),
+    (
+        "kernel/apparmor_restrict_unprivileged_userns",
+        "1",
+        "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with `userns,`",
+    ),
+)
+"""Files below `/proc/sys`, the value that forbids user namespaces, and what permits them (until the next start, without a
+file in `/etc/sysctl.d`)."""
+_CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
+
+
+def install(what: str, os_release: Path | None = None) -> str:
+    """How to install `bubblewrap`, `egl` or `chromium` here; on a distribution that is not known, with two examples."""
+    family = _family(os_release)
+    if family is None:
+        return f"{_command('debian', what)} (Debian, Ubuntu), {_command('fedora', what)} (Fedora)"
+    return _command(family, what)
+
+
+def _command(family: str, what: str) -> str:
+    return f"{_INSTALL[family]} {_PACKAGES[what].get(family, what)}"
+
+
+def _family(os_release: Path | None) -> str | None:
+    try:
+        if os_release is None:
+            told = platform.freedesktop_os_release()
+        else:
+            pairs = (line.partition("=") for line in os_release.read_text().splitlines())
+            told = {name: value.strip('"') for name, _, value in pairs}
+    except OSError:
+        return None
+    for name in (told.get("ID", ""), *told.get("ID_LIKE", "").split()):
+        family = name.partition("-")[0]
+        family = _KIN.get(family, family)
+        if family in _INSTALL:
+            return family
+    return None
+
+
+def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
+    """How to permit user namespaces here: the setting that forbids them, by its present value; else all that could."""
+    found = [remedy for name, forbids, remedy in _SETTINGS if _value(settings / name) == forbids]
+    if found:
+        return "; ".join(found)
+    if any(Path(mark).exists() for mark in _CONTAINER_MARKS):
+        return "this is a container: start it with --security-opt seccomp=unconfined --security-opt systempaths=unconfined"
+    names = ", ".join(name.replace("/", ".") for name, _, _ in _SETTINGS)
+    return (
+        f"none of {names} forbids them here: in a container, start it with --security-opt seccomp=unconfined"
+    )
+
+
+def _value(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""

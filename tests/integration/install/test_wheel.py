@@ -1,0 +1,206 @@
+"""Installed from a wheel, without a clone: everything that messages and pages name is there, and a run is played.
+
+Third-party packages are those of the environment that runs the tests: its site-packages stand behind the clean ones. Its
+editable evopolicy is not seen there, since nested .pth files are not read.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import site
+import subprocess
+import sys
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from email.parser import HeaderParser
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[3]
+NAMED = re.compile(r"\b(?:(?:examples|deploy|docs)/[\w.@/-]*\w|constraints\.txt|\w[\w-]*\.toml)")
+REPOSITORY_ONLY = (
+    "docs/images",
+    "docs/_site",
+    "docs/index.md",
+    "examples/smoke-report",
+    "examples/measure_policies.py",
+)
+"""What pages show or tell developers, and no user needs as a file."""
+NOBODY = 65534
+
+
+class Built(NamedTuple):
+    wheel: Path
+    sdist: Path
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    return build(ROOT, tmp_path_factory.mktemp("dist"))
+
+
+def build(source: Path, target: Path) -> Built:
+    command = [sys.executable, "-m", "hatchling", "build", "-d", str(target)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return Built(next(target.glob("*.whl")), next(target.glob("*.tar.gz")))
+
+
+def names(wheel: Path) -> list[str]:
+    return sorted(zipfile.ZipFile(wheel).namelist())
+
+
+def test_a_wheel_made_from_the_sdist_is_the_same(built: Built, tmp_path: Path) -> None:
+    with tarfile.open(built.sdist) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    again = build(source, tmp_path / "dist")
+    assert names(again.wheel) == names(built.wheel)
+
+
+def test_the_wheel_holds_what_messages_and_pages_name(built: Built) -> None:
+    held = names(built.wheel)
+    texts = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "deploy" / "README.md"]
+    texts += [
+        path
+        for room in ("common", "coordinator", "worker", "agent_gateway")
+        for path in (ROOT / room).rglob("*.py")
+    ]
+    told = {name for path in texts for name in NAMED.findall(path.read_text()) if (ROOT / name).exists()}
+    assert {"constraints.txt", "examples/policies", "examples/agents/qwen.toml"} <= told
+    for name in sorted(told):
+        if name in ("pyproject.toml",) or name.startswith(REPOSITORY_ONLY):
+            continue
+        inside = f"evopolicy_gateway/{name}"
+        assert any(each == inside or each.startswith(f"{inside}/") for each in held), name
+    assert {f"evopolicy_gateway/suite/shipped/{name}.toml" for name in ("smoke", "core16")} <= set(held)
+    assert not [name for name in held if "tests/" in name or "__pycache__" in name]
+
+
+def test_the_extra_local_asks_for_what_this_environment_has(built: Built) -> None:
+    with zipfile.ZipFile(built.wheel) as archive:
+        (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        told = HeaderParser().parsestr(archive.read(metadata).decode())
+    asked = [Requirement(text) for text in told.get_all("Requires-Dist", [])]
+
+    def of(extra: str) -> set[str]:
+        return {one.name for one in asked if one.marker is None or one.marker.evaluate({"extra": extra})}
+
+    assert of("local") == of("coordinator") | of("gateway") | of("worker")
+    for one in asked:
+        if one.name not in of("local"):
+            continue
+        try:
+            assert one.specifier.contains(version(one.name)), one
+        except PackageNotFoundError:
+            pytest.fail(f"{one} is asked for, and is not installed here")
+
+
+class Place:
+    """A clean virtual environment and a home, of an ordinary user where the tests run as root."""
+
+    def __init__(self, root: Path, wheel: Path) -> None:
+        self.root = root
+        self.bin = root / "venv" / "bin"
+        self.python, self.prefix = _ordinary()
+        root.chmod(0o755)
+        if self.prefix:
+            os.chown(root, NOBODY, NOBODY)
+        shutil.copy(wheel, root)
+        (root / wheel.name).chmod(0o644)
+        self.run([self.python, "-m", "venv", "--without-pip", str(root / "venv")])
+        (packages,) = (root / "venv" / "lib").glob("python3*/site-packages")
+        (packages / "third_party.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+        install = ["-m", "pip", "install", "-q", "--no-deps", "--no-index", "--ignore-installed"]
+        self.run([str(self.bin / "python"), *install, str(root / wheel.name)])
+
+    def run(self, words: list[str], *, code: int = 0) -> str:
+        """Its stdout."""
+        done = subprocess.run(
+            [*self.prefix, *words],
+            cwd=self.root,
+            env={"PATH": f"{self.bin}:{os.environ['PATH']}", "HOME": str(self.root), "LANG": "C.UTF-8"},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=600,
+        )
+        assert done.returncode == code, f"{words}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+        return done.stdout
+
+
+def _ordinary() -> tuple[str, list[str]]:
+    """A Python of this version, and what makes its user an ordinary one: as root, nobody, who needs one to read."""
+    own = os.path.realpath(sys.executable)
+    if os.geteuid() != 0:
+        return own, []
+    become = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups"]
+    numbered = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    for python in (own, f"/usr/bin/{numbered}", f"/usr/local/bin/{numbered}"):
+        # A second time from within: the first one may still be started with root's rights.
+        again = f"import os, sys; os.listdir({site.getsitepackages()[0]!r}); os.execv(sys.executable, ['python', '-c', ''])"
+        reads = [*become, python, "-c", again]
+        if Path(python).exists() and subprocess.run(reads, capture_output=True, check=False).returncode == 0:
+            return python, become
+    return own, []
+
+
+@pytest.fixture(scope="module")
+def place(built: Built) -> Iterator[Place]:
+    # Not below pytest's own folder, which is closed to other users.
+    with tempfile.TemporaryDirectory(prefix="evp-wheel-") as name:
+        yield Place(Path(name), built.wheel)
+
+
+def test_the_installation_finds_its_own_files_and_not_the_repository(place: Place) -> None:
+    where = "import evopolicy_common, evopolicy_gateway as g; print(g.__file__, evopolicy_common.__file__)"
+    assert str(ROOT) not in place.run([str(place.bin / "python"), "-c", where])
+    assert place.run(["evopolicy", "--version"]).startswith("evopolicy ")
+    listed = place.run(["evopolicy", "files"]).splitlines()
+    assert {"constraints.txt", "deploy/README.md", "examples/agents/qwen.toml"} <= set(listed)
+    constraints = place.run(["evopolicy", "files", "constraints.txt"]).strip()
+    assert constraints.startswith(str(place.root))
+    assert "mujoco==" in Path(constraints).read_text()
+    place.run(["evopolicy", "files", "deploy", "--to", "copied"])
+    assert (place.root / "copied" / "deploy" / "evopolicy-worker@.service").is_file()
+    place.run(["evopolicy", "files", "deploy", "--to", "copied"], code=2)
+    place.run(["evopolicy", "files", "none"], code=2)
+
+
+def test_doctor_says_that_this_machine_plays_runs(place: Place) -> None:
+    told = json.loads(place.run(["evopolicy", "doctor", "--json"]))
+    assert told["plays"]
+    assert told["tier"] == "bwrap"
+    found = {check["name"]: check for check in told["checks"]}
+    for name in (
+        "Python",
+        "extra gateway",
+        "drawing (EGL)",
+        "browser",
+        "disk",
+        "ports",
+        "date",
+        "open files",
+    ):
+        assert name in found
+    for check in told["checks"]:
+        assert check["verdict"] != "missing" or (check["advice"] and check["found"]), check
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_ordinary_user_plays_the_demo(place: Place) -> None:
+    told = place.run(["evopolicy", "demo"])
+    assert "next: evopolicy report runs --out report" in told
+    record = json.loads((place.root / "runs/evolve/gym_continuouscar/demo/run.json").read_text())
+    assert record["outcome"]["status"] == "completed"
+    assert record["outcome"]["budget_used"] == 32

@@ -1,0 +1,59 @@
+"""`evopolicy doctor`: the whole machine, and what works without each part that is missing."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.commands import App
+from evopolicy_common.console import table, terminal
+from evopolicy_common.terminal import say, say_json
+from evopolicy_worker.sandbox.doctor import Check, best_tier, examine
+from evopolicy_worker.sandbox.machine import examine_machine
+
+app = App(name="doctor")
+
+
+@app.command("doctor", epilog="Example: evopolicy doctor")
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Checks this machine, and says for each missing part what to do and what works without it.
+
+    Exit code 0 when runs can be played here in a sandbox, 1 when they cannot.
+    """
+    checks = examine_machine()
+    linux = sys.platform == "linux"
+    checks += examine() if linux else (_no_worker(),)
+    tier = best_tier(checks)
+    plays = tier is not None and not any(
+        check.name.startswith("extra") and check.verdict == "missing" for check in checks
+    )
+    if as_json:
+        say_json({"plays": plays, "tier": tier, "checks": checks})
+    else:
+        shown = table("check", "verdict", "found", "what works without it", "what to do")
+        for check in checks:
+            missing = check.verdict != "ok"
+            shown.add_row(
+                check.name, check.verdict, check.found, check.without if missing else "", check.advice
+            )
+        terminal().print(shown)
+        say(
+            "next: evopolicy demo"
+            if plays
+            else "runs cannot be played here yet: see the rows that say missing"
+        )
+    raise typer.Exit(0 if plays else 1)
+
+
+def _no_worker() -> Check:
+    return Check(
+        name="sandbox",
+        verdict="missing",
+        found=f"this is {sys.platform}; the sandbox is made of Linux namespaces",
+        without="coordinator, agents on another machine's workers, and reports",
+        advice="use Linux or WSL2 for workers",
+    )

@@ -1,0 +1,158 @@
+"""What the whole machine gives to evopolicy, beside the sandbox: rows of `evopolicy doctor`."""
+
+from __future__ import annotations
+
+import importlib.util
+import platform
+import resource
+import shutil
+import sys
+import time
+from ctypes.util import find_library
+from pathlib import Path
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes import distribution
+from evopolicy_common.processes.preflight import EXTRAS, check_loopback, check_scratch
+from evopolicy_common.wire.credentials import local_state_dir
+from evopolicy_worker.sandbox.doctor import Check
+
+_LEAST_FILES = 1024
+_NEWEST_TRIED = 13
+"""Python 3.13."""
+_ROOMY_BYTES = 5 << 30
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_PLAYS = {
+    "coordinator": "nothing can be played or reported on here; workers can still join another machine's coordinator",
+    "gateway": "no agent can be played here; `evopolicy try`, reports and workers work",
+    "worker": "no episode can be played here; runs on another machine's workers, and reports, work",
+}
+
+
+def examine_machine() -> tuple[Check, ...]:
+    """All checks, in the order in which to show them. Nothing is started."""
+    return (_python(), *_extras(), _graphics(), _browser(), _scratch(), _disk(), _ports(), _date(), _files())
+
+
+def _python() -> Check:
+    version = platform.python_version()
+    if int(version.split(".")[1]) <= _NEWEST_TRIED:
+        return Check(name="Python", verdict="ok", found=f"{version} ({sys.executable})")
+    return Check(
+        name="Python",
+        verdict="note",
+        found=f"{version}; simulators are tried with 3.11 to 3.13",
+        advice="use one of these where an environment does not install",
+    )
+
+
+def _extras() -> list[Check]:
+    rows = []
+    for extra, lost in _PLAYS.items():
+        modules = [module for module, its in EXTRAS.items() if its == extra]
+        missing = [module for module in modules if importlib.util.find_spec(module) is None]
+        rows.append(
+            Check(
+                name=f"extra {extra}",
+                verdict="missing" if missing else "ok",
+                found=f"no module {', '.join(missing)}" if missing else ", ".join(modules),
+                without=lost,
+                advice=f"pip install 'evopolicy[{extra}]'" if missing else "",
+            )
+        )
+    return rows
+
+
+def _graphics() -> Check:
+    found = find_library("EGL")
+    return Check(
+        name="drawing (EGL)",
+        verdict="missing" if found is None else "ok",
+        found=found or "no libEGL",
+        without="everything but videos and replays of MuJoCo's environments",
+        advice="" if found else distribution.install("egl"),
+    )
+
+
+def _browser() -> Check:
+    found = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    return Check(
+        name="browser",
+        verdict="ok" if found else "note",
+        found=found or "no Chromium on the PATH",
+        without="everything but the tests of the report's pages",
+        advice="" if found else distribution.install("chromium"),
+    )
+
+
+def _scratch() -> Check:
+    try:
+        check_scratch()
+    except ConfigError as error:
+        return Check(
+            name="temporary folder",
+            verdict="missing",
+            found=str(error),
+            without="nothing can be played here; reports work",
+            advice="make room, or name another folder with TMPDIR",
+        )
+    return Check(name="temporary folder", verdict="ok", found="can be written")
+
+
+def _disk() -> Check:
+    folder = local_state_dir()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(there).free
+    found = f"{free / 2**30:.1f} GiB free for {folder}"
+    if free >= _ROOMY_BYTES:
+        return Check(name="disk", verdict="ok", found=found)
+    return Check(
+        name="disk",
+        verdict="note",
+        found=found,
+        without="single runs; a sweep may fill it (`evopolicy disk` says how much it takes)",
+        advice="make room, or name other folders with --state and --runs",
+    )
+
+
+def _ports() -> Check:
+    try:
+        check_loopback()
+    except ConfigError as error:
+        return Check(
+            name="ports",
+            verdict="missing",
+            found=str(error).partition(";")[0],
+            without="no agent can be played here; workers and reports work",
+            advice="bring IPv4 loopback up: ip link set lo up (in a container: give it a network)",
+        )
+    return Check(name="ports", verdict="ok", found="a port of 127.0.0.1 can be listened on")
+
+
+def _date() -> Check:
+    # Nothing newer than the present can lie here, as long as the clock is right.
+    newest = Path(__file__).stat().st_mtime
+    if time.time() >= newest:
+        return Check(name="date", verdict="ok", found=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
+    return Check(
+        name="date",
+        verdict="missing",
+        found=f"{time.strftime('%Y-%m-%d', time.gmtime())}, before this program was installed",
+        without="one machine; certificates of other machines are refused when clocks differ by more than an hour",
+        advice="set the clock: timedatectl set-ntp true",
+    )
+
+
+def _files() -> Check:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    known = str(soft) if soft != resource.RLIM_INFINITY else "no limit"
+    if soft == resource.RLIM_INFINITY or soft >= _LEAST_FILES:
+        return Check(name="open files", verdict="ok", found=known)
+    most = "unlimited" if hard == resource.RLIM_INFINITY else str(min(hard, 65536))
+    return Check(
+        name="open files",
+        verdict="missing",
+        found=f"{known} at once",
+        without="a few slots and runs at once",
+        advice=f"ulimit -n {most}",
+    )
