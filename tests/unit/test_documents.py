@@ -26,7 +26,9 @@ DOCUMENTS = [
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
 FOLDERS = ("common", "coordinator", "worker", "agent_gateway", "deploy", "docs", "examples", "tests")
-ELSEWHERE = frozenset({"AGENTS.md", "system/policy.py", "policy.py", "my_policy/policy.py", "my_agent.py"})
+ELSEWHERE = frozenset(
+    {"AGENTS.md", "system/policy.py", "policy.py", "my_policy/policy.py", "my_agent.py", "my_env.py"}
+)
 """Files of a workspace, of an agent's or of an operator's."""
 ROOMS = {
     "common/": "common/evopolicy_common/",

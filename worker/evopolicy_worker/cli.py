@@ -49,7 +49,8 @@ def work(
     env: Annotated[
         list[str] | None,
         typer.Option(
-            help="Suite (core16), suite id (gym/acrobot) or glob (gymnasium/MiniGrid-*); may be repeated."
+            help="Suite (core16), suite id (gym/acrobot), glob (gymnasium/MiniGrid-*), an environment file (lander.toml) or"
+            " what Gymnasium makes (my_pkg:MyEnv-v0); may be repeated."
         ),
     ] = None,
     connect: Annotated[
@@ -108,11 +109,9 @@ def work(
         if name is not None and not keys.valid_name(name):
             raise ConfigError(f"--name {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
         wanted = catalogue.resolve(env)
-        missing = [env_id for env_id in wanted if env_id not in environments.offered()]
-        if missing:
-            raise ConfigError(
-                f"{', '.join(missing)}: not installed here; install the worker's extra: pip install 'evopolicy[worker]'"
-            )
+        lacking = [f"{env_id} needs {what}" for env_id in wanted if (what := environments.missing(env_id))]
+        if lacking:
+            raise ConfigError(f"not installed here: {'; '.join(lacking[:8])}")
         # Until the worker can drain, SIGTERM ends it as an exception does: what it has begun is cleared away.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
@@ -188,13 +187,18 @@ def default_name(found: credentials.Credentials) -> str:
     return certified
 
 
+def foreign(env_ids: list[str]) -> tuple[catalogue.Entry, ...]:
+    """The definitions of those that do not ship, for the processes that play them."""
+    return tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
+
+
 async def describe_all(env_ids: list[str], tier: Tier, scratch: Path) -> tuple[EnvironmentDescription, ...]:
     """Descriptions of environments, made in a slot of that tier: this process must stay free of simulators.
 
     A slot whose processes are killed meanwhile is started again; the WorkerError of the last try, when all fail.
     """
     for tries_left in reversed(range(DESCRIBE_TRIES)):
-        slot = Slot(None, tier, scratch / "describing")
+        slot = Slot(None, tier, scratch / "describing", definitions=foreign(env_ids))
         try:
             await slot.start()
             return await slot.describe(env_ids)
@@ -236,9 +240,10 @@ async def _run(
     if not options.boot_id:
         log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
     taken = [cores.take() for _ in range(options.slots)]
+    packages, definitions = ("numpy", *allowed_packages), foreign(env_ids)
 
     def make_slot(index: int, tier: Tier) -> Slot:
-        return Slot(taken[index], tier, scratch / f"slot-{index}", ("numpy", *allowed_packages))
+        return Slot(taken[index], tier, scratch / f"slot-{index}", packages, definitions=definitions)
 
     log.info("waiting for the coordinator", endpoints=found.endpoints)
     loop = asyncio.get_running_loop()

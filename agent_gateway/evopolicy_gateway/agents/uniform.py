@@ -13,6 +13,8 @@ POLICY = '''"""Uniform random actions on any action space; elements without a bo
 
 import random
 
+LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
 
 def sample(space):
     kind = space["type"]
@@ -32,7 +34,19 @@ def sample(space):
         return {key: sample(part) for key, part in space["spaces"].items()}
     if kind == "Text":
         length = random.randint(space["min_length"], space["max_length"])
-        return "".join(random.choice("abcdefghijklmnopqrstuvwxyz") for _ in range(length))
+        return "".join(random.choice(space.get("characters", LETTERS)) for _ in range(length))
+    if kind == "Sequence":
+        return [sample(space["space"]) for _ in range(random.randrange(8))]
+    if kind == "OneOf":
+        index = random.randrange(len(space["spaces"]))
+        return (index, sample(space["spaces"][index]))
+    if kind == "Graph":
+        nodes = [sample(space["node_space"]) for _ in range(random.randint(1, 8))]
+        n = random.randrange(8) if space["edge_space"] else 0
+        if not n:
+            return {"nodes": nodes, "edges": None, "edge_links": None}
+        links = [[random.randrange(len(nodes)), random.randrange(len(nodes))] for _ in range(n)]
+        return {"nodes": nodes, "edges": [sample(space["edge_space"]) for _ in range(n)], "edge_links": links}
     raise ValueError("no actions for a space of type " + kind)
 
 

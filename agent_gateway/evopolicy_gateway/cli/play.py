@@ -92,7 +92,7 @@ def local(
     env: Annotated[
         list[str],
         typer.Option(
-            help="Suite (core16), suite id or glob (gymnasium/MiniGrid-*); may be repeated.",
+            help="Suite (core16), suite id, glob (gymnasium/MiniGrid-*), environment file or module:Id; may be repeated.",
             show_default=False,
             rich_help_panel=options.RUN,
         ),
@@ -188,7 +188,10 @@ def try_policy(
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
 def play_random(
     env: Annotated[
-        list[str], typer.Option(help="Suite, suite id or glob; may be repeated.", show_default=False)
+        list[str],
+        typer.Option(
+            help="Suite, suite id, glob, environment file or module:Id; may be repeated.", show_default=False
+        ),
     ],
     split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
     cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,

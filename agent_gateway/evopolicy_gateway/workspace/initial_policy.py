@@ -53,7 +53,13 @@ def constant_action(space: SpaceSchema) -> Any:
     if kind == "Dict":
         return {key: constant_action(part) for key, part in space["spaces"].items()}
     if kind == "Text":
-        return "a" * int(space["min_length"])
+        return str(space.get("characters", "a"))[0] * int(space["min_length"])
+    if kind == "Sequence":
+        return []
+    if kind == "OneOf":
+        return (0, constant_action(space["spaces"][0]))
+    if kind == "Graph":
+        return {"nodes": [constant_action(space["node_space"])], "edges": None, "edge_links": None}
     raise ValueError(f"no action for a space of type {kind!r}")
 
 

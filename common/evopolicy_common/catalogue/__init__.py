@@ -1,55 +1,50 @@
-"""The suite catalogue: which environments there are, what each is called, and how suites group them.
+"""The catalogue: which environments ship with this software, what each is called, and how suites group them; and the
+environments that files and installed packages add here.
 
-Static data without any simulator, so every room may read it. What needs the simulator (spaces, task text) is described
-by a worker: see `messages.EnvironmentDescription`.
+Data without any simulator, so every room may read it. What needs the simulator (spaces, task text) is described by a worker:
+see `messages.EnvironmentDescription`. `catalogue.toml` has Core16 and the toys, `families/*.toml` a family each, a row an
+environment.
 """
 
 from __future__ import annotations
 
 import difflib
 import fnmatch
+import re
 import tomllib
 from collections.abc import Iterable
 from functools import cache
+from importlib import metadata
 from importlib.resources import files
-from typing import Literal
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import msgspec
 
+from evopolicy_common.catalogue.definition import USUAL_STEPS, Entry, Wrapper, read_file, valid_id
 from evopolicy_common.errors import ConfigError
 
-Demand = Literal["synthesis", "tuning"]
-ObservationKind = Literal["state", "image", "symbolic", "dict"]
-ActionKind = Literal["discrete", "continuous"]
+__all__ = [
+    "USUAL_STEPS",
+    "Entry",
+    "Suite",
+    "Wrapper",
+    "add",
+    "entries",
+    "entry",
+    "families",
+    "is_shipped",
+    "known",
+    "resolve",
+    "source_of",
+    "suite_of",
+    "suites",
+    "valid_id",
+]
 
-
-class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One environment of the catalogue."""
-
-    id: str
-    """Suite id: what users, runs and cases name it by, such as `gym/acrobot`."""
-    gymnasium_id: str | None = None
-    """What `gymnasium.make` takes; None for environments of our own (`toy/…`)."""
-    family: str
-    """Key of the family the environment's scores are averaged in, such as `gym_box2d`."""
-    title: str
-    """Short name for tables, such as `Acrobot`."""
-    max_episode_steps: int
-    """Upper bound on an episode's length, in steps."""
-    published_steps: int | None = None
-    """Where the published software cuts an episode, and what it tells as the limit; None: as here. It takes 1,000 where
-    Gymnasium has no limit registered, though all but one of these environments end earlier by themselves."""
-    step_bytes: int
-    """About what a step takes of a run directory in a train episode's feedback, without video; as measured."""
-    observation: ObservationKind
-    """What an observation is: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
-    action: ActionKind
-    demand: Demand | None = None
-    """Task-demand group of the paper's mechanism section; None when the paper does not place it."""
-
-    def feedback_bytes(self, episodes: int) -> int:
-        """What the feedback of so many train episodes takes of a run directory when all are as long as can be."""
-        return episodes * self.max_episode_steps * self.step_bytes
+ENTRY_POINTS = "evopolicy.environments"
+"""Group of entry points by which a package offers environments: `name = "package:FILE.toml"`, an environment file in it."""
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,35 +53,91 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     name: str
     title: str
     environments: tuple[str, ...]
-    budget: int
+    budget: int = 128
     """Train episodes a run may spend."""
-    min_episodes_per_submit: int
-    max_episodes_per_submit: int
-    n_train: int
-    n_validation: int
-    n_heldout: int
+    min_episodes_per_submit: int = 1
+    max_episodes_per_submit: int = 128
+    n_train: int = 64
+    n_validation: int = 16
+    n_heldout: int = 32
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+OTHER = Suite(name="other", title="Other", environments=())
+"""Of the environments that no suite has."""
+
+
+class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     families: dict[str, str]
     environment: tuple[Entry, ...]
     suite: tuple[Suite, ...]
 
 
+class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of `families/`: its environments are `prefix` and a key each, which is Gymnasium's id unless a row says so."""
+
+    family: str
+    title: str
+    adapter: str
+    environments: dict[str, dict[str, Any]]
+    prefix: str = "gymnasium/"
+    defaults: dict[str, Any] = {}
+    """Fields of `Entry` that all rows have unless they say otherwise."""
+    suite: tuple[Suite, ...] = ()
+    """Further suites; the family is one by its own name."""
+
+    def entries(self) -> Iterable[Entry]:
+        shared = {"family": self.family, "adapter": self.adapter, **self.defaults}
+        for name, row in self.environments.items():
+            yield msgspec.convert(
+                {"id": f"{self.prefix}{name}", "gymnasium_id": name, "title": name, **shared, **row}, Entry
+            )
+
+
+class _Loaded(msgspec.Struct, frozen=True):
+    entries: dict[str, Entry]
+    suites: dict[str, Suite]
+    families: dict[str, str]
+    prefixes: frozenset[str]
+
+
 @cache
-def _load() -> _File:
-    text = files(__package__).joinpath("catalogue.toml").read_text(encoding="utf-8")
-    return msgspec.convert(tomllib.loads(text), _File)
+def _load() -> _Loaded:
+    shipped = msgspec.convert(
+        _table(files(__package__).joinpath("catalogue.toml").read_text("utf-8")), _Shipped
+    )
+    found = {entry.id: entry for entry in shipped.environment}
+    grouped = {suite.name: suite for suite in shipped.suite}
+    titles = dict(shipped.families)
+    folder = files(__package__).joinpath("families")
+    names = sorted(item.name for item in folder.iterdir()) if folder.is_dir() else []
+    for name in names:
+        if name.endswith(".toml"):
+            family = msgspec.convert(_table(folder.joinpath(name).read_text("utf-8")), _Family)
+            rows = {entry.id: entry for entry in family.entries()}
+            titles.setdefault(family.family, family.title)
+            grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(rows))
+            grouped |= {suite.name: suite for suite in family.suite}
+            found = {**found, **{env_id: row for env_id, row in rows.items() if env_id not in found}}
+    prefixes = frozenset(env_id.partition("/")[0] for env_id in found)
+    return _Loaded(found, grouped, titles, prefixes)
+
+
+def _table(text: str) -> dict[str, Any]:
+    return tomllib.loads(text)
+
+
+_added: dict[str, tuple[Entry, str]] = {}
+"""By id what files that were named here define, and the file."""
 
 
 def entries() -> dict[str, Entry]:
-    """All environments by suite id, in catalogue order."""
-    return {entry.id: entry for entry in _load().environment}
+    """All environments that ship, by suite id, in catalogue order."""
+    return dict(_load().entries)
 
 
 def suites() -> dict[str, Suite]:
     """All suites by name."""
-    return {suite.name: suite for suite in _load().suite}
+    return dict(_load().suites)
 
 
 def families() -> dict[str, str]:
@@ -94,45 +145,126 @@ def families() -> dict[str, str]:
     return dict(_load().families)
 
 
-def entry(env_id: str) -> Entry:
-    """The catalogue's entry of `env_id`; ConfigError naming what is near when there is none."""
-    found = entries().get(env_id)
-    if found is None:
-        raise ConfigError(f"no environment {env_id!r} in the catalogue{_near(env_id)}")
+def is_shipped(env_id: str) -> bool:
+    """Whether this software ships the environment."""
+    return env_id in _load().entries
+
+
+@cache
+def plugins() -> dict[str, tuple[Entry, str]]:
+    """By id the environments of installed packages, and the file; nothing of theirs is imported to find out.
+
+    ConfigError for a package whose file is not there or is no environment file.
+    """
+    found: dict[str, tuple[Entry, str]] = {}
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        package, _, name = point.value.partition(":")
+        spec = find_spec(package.partition(".")[0])
+        places = list(spec.submodule_search_locations or ()) if spec is not None else []
+        inner = package.split(".")[1:]
+        paths = [Path(place, *inner, name.strip()) for place in places]
+        path = next((each for each in paths if each.is_file()), None)
+        if path is None or path.suffix != ".toml":
+            raise ConfigError(
+                f"entry point {point.name} = {point.value!r} of {ENTRY_POINTS} names no environment file in the package:"
+                ' say it as "package:FILE.toml", and ship the file as package data'
+            )
+        found |= {entry.id: (entry, str(path)) for entry in _checked(read_file(path), path)}
     return found
+
+
+def add(path: Path) -> list[str]:
+    """The ids of an environment file, which this process knows from now on. ConfigError for what is wrong in it."""
+    found = _checked(read_file(path), path)
+    _added.update((entry.id, (entry, str(path.absolute()))) for entry in found)
+    return [entry.id for entry in found]
+
+
+def _checked(found: tuple[Entry, ...], path: Path) -> tuple[Entry, ...]:
+    for each in found:
+        prefix = each.id.partition("/")[0]
+        if is_shipped(each.id) or ("/" in each.id and prefix in _load().prefixes):
+            raise ConfigError(
+                f"environment file {path}, environment {each.id}: ids that begin with {prefix}/ ship with evopolicy;"
+                " give yours a prefix of its own"
+            )
+    return found
+
+
+def source_of(env_id: str) -> str:
+    """What a worker's `--env` takes for the environment: the file that defines it here, or else its id."""
+    return _added[env_id][1] if env_id in _added else env_id
+
+
+def known(env_id: str) -> Entry | None:
+    """What is known here of an environment, without asking a worker; None for nothing."""
+    found = _load().entries.get(env_id)
+    if found is None and env_id in _added:
+        found = _added[env_id][0]
+    if found is None and is_foreign(env_id):
+        if ":" in env_id and "/" not in env_id:
+            return Entry(id=env_id, gymnasium_id=env_id)
+        found = plugins().get(env_id, (None, ""))[0]
+    return found
+
+
+def is_foreign(env_id: str) -> bool:
+    """Whether an id can be that of an environment which does not ship: `module:Id`, or with a prefix of its own."""
+    prefix, slash, _ = env_id.partition("/")
+    return valid_id(env_id) and (":" in prefix or (bool(slash) and prefix not in _load().prefixes))
+
+
+def entry(env_id: str) -> Entry:
+    """What is known here of `env_id`, for a foreign one perhaps no more than the id; ConfigError naming what is near when
+    there can be none."""
+    found = known(env_id)
+    if found is not None:
+        return found
+    if is_foreign(env_id):
+        return Entry(id=env_id)
+    raise ConfigError(f"no environment {env_id!r} in the catalogue{near(env_id)}")
 
 
 def suite_of(env_id: str) -> Suite:
     """The first suite that holds `env_id`: its numbers are the defaults of a run on it."""
     entry(env_id)
-    return next(suite for suite in suites().values() if env_id in suite.environments)
+    return next((suite for suite in suites().values() if env_id in suite.environments), OTHER)
 
 
 def resolve(patterns: Iterable[str]) -> list[str]:
-    """Suite ids named by `patterns`, in catalogue order without repeats.
+    """Suite ids named by `patterns`, without repeats: shipped ones in catalogue order, then the others as they were named.
 
-    A pattern is a suite name (`core16`), a suite id (`gym/acrobot`), or a glob over suite ids
-    (`gymnasium/MiniGrid-*`). ConfigError for one that names nothing.
+    A pattern is a suite name (`core16`), a suite id (`gym/acrobot`), a glob over suite ids (`gymnasium/MiniGrid-*`), an
+    environment file (`lander.toml`), or the id of an environment that does not ship: `module:Id`, or one with a prefix of its
+    own. ConfigError for one that names nothing.
     """
-    wanted: set[str] = set()
+    wanted: dict[str, None] = {}
     for pattern in patterns:
         if pattern in suites():
-            wanted.update(suites()[pattern].environments)
-            continue
-        hits = [env_id for env_id in entries() if fnmatch.fnmatchcase(env_id, pattern)]
-        if not hits:
-            raise ConfigError(f"no environment or suite matches {pattern!r}{_near(pattern)}")
-        wanted.update(hits)
-    return [env_id for env_id in entries() if env_id in wanted]
+            wanted.update(dict.fromkeys(suites()[pattern].environments))
+        elif pattern.endswith(".toml"):
+            wanted.update(dict.fromkeys(add(Path(pattern))))
+        elif hits := [env_id for env_id in _load().entries if fnmatch.fnmatchcase(env_id, pattern)]:
+            wanted.update(dict.fromkeys(hits))
+        elif pattern in _added or is_foreign(pattern):
+            wanted[pattern] = None
+        elif foreign := [env_id for env_id in (*_added, *plugins()) if fnmatch.fnmatchcase(env_id, pattern)]:
+            wanted.update(dict.fromkeys(foreign))
+        else:
+            raise ConfigError(f"no environment or suite matches {pattern!r}{near(pattern)}")
+    return [env_id for env_id in _load().entries if env_id in wanted] + [
+        each for each in wanted if not is_shipped(each)
+    ]
 
 
-def _near(name: str) -> str:
-    known = [*entries(), *suites()]
-    lowered = {item.lower(): item for item in known}
+def near(name: str, others: Iterable[str] = ()) -> str:
+    """Names like `name`, in words to be appended to an error; `others`: ids beside the catalogue's."""
+    known_ids = [*_load().entries, *others, *suites()]
+    lowered = {item.lower(): item for item in known_ids}
     close = [lowered[hit] for hit in difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)]
     if not close:
-        tail = name.lower().rsplit("/", 1)[-1].strip("*")
-        close = [item for item in known if tail and (tail in item.lower())][:3]
+        tail = re.split("[/:]", name.lower())[-1].strip("*")
+        close = [item for item in known_ids if tail and (tail in item.lower())][:3]
     if close:
         return f"; near: {', '.join(close)}"
     return f"; suites: {', '.join(suites())}"

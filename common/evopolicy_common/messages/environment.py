@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.messages.bounds import Int, Many, Named, Plain, Text, Word
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Plain, Text, Word
 
 SpaceSchema = Plain
 """A space as a plain dict: `{"type": "Box", "shape": [2], "dtype": "float32", "low": …, "high": …}` and so on."""
@@ -58,6 +58,14 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Short name for tables; empty: the id."""
     family: Word = ""
     """Key of the family its scores are averaged in; empty: as the catalogue has it."""
+    definition: Plain = {}
+    """How it is made: `gymnasium_id`, and `kwargs` and `wrappers` where it has any."""
+    reward_weights: Named[Number] = {}
+    """Of a reward that is a vector: how its elements, in their order, are weighted in the return. Empty: it is a number."""
+    success: Word = ""
+    """Key in `info` that tells whether the task was solved; empty where nothing tells."""
+    success_at: Literal["end", "any"] = "end"
+    """Whether the last step's word counts, or that of any."""
     adapter: Word = ""
     """What plays it: the revision of its adapter, `+`, and a digest of the adapter's code. Empty from workers of older versions,
     whose fingerprint is that of the whole worker."""

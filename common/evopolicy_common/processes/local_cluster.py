@@ -15,6 +15,7 @@ import time
 from collections.abc import AsyncIterator, Collection, Sequence
 from pathlib import Path
 
+from evopolicy_common import catalogue
 from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
@@ -73,7 +74,7 @@ class LocalCluster:
         program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed"]
         program += ["--credentials", self._worker_file]
         for env_id in env_ids:
-            program += ["--env", env_id]
+            program += ["--env", catalogue.source_of(env_id)]
         for tier in sorted(tiers):
             program += ["--need-tier", tier]
         second = max(1, slots // 2) if self._audited else 0

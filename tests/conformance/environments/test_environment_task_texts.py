@@ -9,9 +9,9 @@ from importlib.resources import files
 import pytest
 from environment_checks import components, selected, table
 
-from evopolicy_common.catalogue import entries
+from evopolicy_common.catalogue import entries, suites
 from evopolicy_worker.environments import Environment, offered
-from evopolicy_worker.environments.tasks import task_text
+from evopolicy_worker.environments.tasks import written
 
 IDS = offered()
 Warm = Callable[[str], Environment]
@@ -134,6 +134,7 @@ def _includes(env_id: str) -> list[str]:
     return re.findall(r"<!-- include: (\S+) -->", raw)
 
 
-def test_an_environment_without_a_text_is_an_error() -> None:
-    with pytest.raises(FileNotFoundError):
-        task_text("gym/no-such")
+def test_core16_and_the_toys_have_texts_that_are_written_for_them() -> None:
+    for env_id in (*suites()["core16"].environments, *suites()["toy"].environments):
+        assert written(env_id), env_id
+    assert written("gym/no-such") is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from evopolicy_worker.environments.actions import ActionCodec, compile_actions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
-from evopolicy_worker.environments.registry import describe, make, offered
+from evopolicy_worker.environments.registry import define, definition, describe, make, missing, offered
 from evopolicy_worker.environments.settings import process_environment
 
 __all__ = [
@@ -14,8 +14,11 @@ __all__ = [
     "Observation",
     "Step",
     "compile_actions",
+    "define",
+    "definition",
     "describe",
     "make",
+    "missing",
     "offered",
     "process_environment",
 ]

@@ -5,6 +5,7 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
   lists, tuples, arrays of any number type; axes of length one more or fewer; a bool counts as 0 or 1; a float without
   fraction counts as an integer; a Box action is cast to the dtype of the space, and may stick out of its bounds by the
   rounding of a float32.
+- A Sequence is any list, an action of OneOf a pair of index and value, a Graph a dict of `nodes`, `edges` and `edge_links`.
 - Everything else is marked `invalid` and repaired: a number out of bounds is clipped; a wrong shape is broadcast where
   that is possible; NaN becomes the neutral value of its element; a missing part of a Dict or Tuple, the neutral value of
   that part; and anything that is no number at all (None, strings, ragged lists, objects) the neutral value of the space.
@@ -26,6 +27,8 @@ from evopolicy_worker.environments.spaces import bounds
 _FAST_ELEMENTS = 32
 """Up to this many elements a loop over Python floats is faster than numpy's comparisons."""
 _MAX_UNWRAP = 8
+MAX_ITEMS = 256
+"""Of an action that is a Sequence or a Graph; what is beyond is cut off."""
 _CHARACTERS = string.ascii_letters + string.digits
 """Gymnasium's default character set, of which random Text is made."""
 
@@ -58,11 +61,18 @@ def compile_actions(schema: SpaceSchema) -> ActionCodec:
     if kind == "MultiBinary":
         return _MultiBinary(schema["n"])
     if kind == "Text":
-        return _Text(schema["min_length"], schema["max_length"])
+        return _Text(schema["min_length"], schema["max_length"], schema.get("characters"))
     if kind == "Dict":
         return _Dict({key: compile_actions(part) for key, part in schema["spaces"].items()})
     if kind == "Tuple":
         return _Tuple([compile_actions(part) for part in schema["spaces"]])
+    if kind == "Sequence":
+        return _Sequence(compile_actions(schema["space"]), stacked=schema["stacked"])
+    if kind == "OneOf":
+        return _OneOf([compile_actions(part) for part in schema["spaces"]])
+    if kind == "Graph":
+        edges = None if schema["edge_space"] is None else compile_actions(schema["edge_space"])
+        return _Graph(compile_actions(schema["node_space"]), edges)
     raise TypeError(f"no actions for a space of type {kind!r}")
 
 
@@ -96,7 +106,8 @@ class _Box:
         self._bounded_above = np.isfinite(self._high)
         self._bounded = bool(self._bounded_below.all() and self._bounded_above.all())
         self._is_float = self._dtype.kind == "f"
-        limits: Any = np.finfo(self._dtype) if self._is_float else np.iinfo(self._dtype)
+        whole = np.uint8 if self._dtype.kind == "b" else self._dtype
+        limits: Any = np.finfo(self._dtype) if self._is_float else np.iinfo(whole)
         # An infinite element becomes the largest finite one: simulators do not survive infinities.
         self._clip_low = np.maximum(self._low, _inside(limits.min))
         self._clip_high = np.minimum(self._high, _inside(limits.max))
@@ -207,23 +218,27 @@ class _MultiBinary:
 
 
 class _Text:
-    def __init__(self, min_length: int, max_length: int) -> None:
+    def __init__(self, min_length: int, max_length: int, characters: str | None) -> None:
+        """`characters`: those that it is made of; None: any, and random ones are of Gymnasium's usual set."""
         self._min = min_length
         self._max = max_length
+        self._allowed = None if characters is None else frozenset(characters)
+        self._characters = characters or _CHARACTERS
+        self._filler = self._characters[0]
 
     def repair(self, raw: object) -> tuple[str, bool]:
         if not isinstance(raw, str):
             return self.neutral(), True
-        if len(raw) > self._max:
-            return raw[: self._max], True
-        return raw.ljust(self._min), len(raw) < self._min
+        kept = raw if self._allowed is None else "".join(each for each in raw if each in self._allowed)
+        invalid = len(kept) != len(raw) or not self._min <= len(kept) <= self._max
+        return kept[: self._max].ljust(self._min, self._filler), invalid
 
     def sample(self, rng: np.random.Generator) -> str:
         length = int(rng.integers(self._min, self._max + 1))
-        return "".join(_CHARACTERS[k] for k in rng.integers(len(_CHARACTERS), size=length).tolist())
+        return "".join(self._characters[k] for k in rng.integers(len(self._characters), size=length).tolist())
 
     def neutral(self) -> str:
-        return " " * self._min
+        return self._filler * self._min
 
 
 class _Dict:
@@ -270,6 +285,112 @@ class _Tuple:
 
     def neutral(self) -> tuple[Any, ...]:
         return tuple(part.neutral() for part in self._parts)
+
+
+class _Sequence:
+    """Items of one space, at most `MAX_ITEMS`; as an array where the space stacks them."""
+
+    def __init__(self, item: ActionCodec, *, stacked: bool) -> None:
+        self._item = item
+        self._stacked = stacked
+
+    def repair(self, raw: object) -> tuple[Any, bool]:
+        if isinstance(raw, np.ndarray) and raw.ndim:
+            raw = list(raw[: MAX_ITEMS + 1])
+        if not isinstance(raw, list | tuple):
+            return self.neutral(), True
+        invalid = len(raw) > MAX_ITEMS
+        items = []
+        for value in raw[:MAX_ITEMS]:
+            repaired, changed = self._item.repair(value)
+            items.append(repaired)
+            invalid = invalid or changed
+        return self._made(items), invalid
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        return self._made([self._item.sample(rng) for _ in range(_random_length(rng))])
+
+    def neutral(self) -> Any:
+        return self._made([])
+
+    def _made(self, items: list[Any]) -> Any:
+        if not self._stacked:
+            return tuple(items)
+        one = np.asarray(self._item.neutral())
+        return np.array(items, dtype=one.dtype).reshape(-1, *one.shape)
+
+
+class _OneOf:
+    """A pair: which of the spaces, and a value of it."""
+
+    def __init__(self, choices: list[ActionCodec]) -> None:
+        self._choices = choices
+
+    def repair(self, raw: object) -> tuple[tuple[int, Any], bool]:
+        index = _integer(raw[0]) if isinstance(raw, list | tuple) and len(raw) == 2 else None
+        if index is None or not 0 <= index < len(self._choices):
+            return self.neutral(), True
+        assert isinstance(raw, list | tuple)
+        value, changed = self._choices[index].repair(raw[1])
+        return (index, value), changed
+
+    def sample(self, rng: np.random.Generator) -> tuple[int, Any]:
+        index = int(rng.integers(len(self._choices)))
+        return index, self._choices[index].sample(rng)
+
+    def neutral(self) -> tuple[int, Any]:
+        return 0, self._choices[0].neutral()
+
+
+class _Graph:
+    """Nodes, and edges between them where the space has any: Gymnasium's `GraphInstance` from a dict of its three fields."""
+
+    def __init__(self, node: ActionCodec, edge: ActionCodec | None) -> None:
+        self._nodes = _Sequence(node, stacked=True)
+        self._edges = None if edge is None else _Sequence(edge, stacked=True)
+
+    def repair(self, raw: object) -> tuple[Any, bool]:
+        if isinstance(raw, list | tuple) and len(raw) == 3:  # as a recording has it
+            raw = dict(zip(("nodes", "edges", "edge_links"), raw, strict=True))
+        if not isinstance(raw, dict):
+            return self.neutral(), True
+        nodes, invalid = self._nodes.repair(raw.get("nodes"))
+        if not len(nodes):
+            return self.neutral(), True
+        links = _numbers(raw["edge_links"]) if raw.get("edge_links") is not None else None
+        if self._edges is None or raw.get("edges") is None or links is None:
+            stray = raw.get("edges") is not None or raw.get("edge_links") is not None
+            return self._made(nodes, None, None), invalid or stray
+        edges, changed = self._edges.repair(raw["edges"])
+        fits = links.shape == (len(edges), 2) and links.dtype.kind in "iu"
+        if not fits or not ((links >= 0) & (links < len(nodes))).all():
+            return self._made(nodes, None, None), True
+        return self._made(nodes, edges, links.astype(np.int32)), invalid or changed
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        nodes, _ = self._nodes.repair(
+            [self._nodes._item.sample(rng) for _ in range(1 + int(rng.integers(10)))]
+        )
+        n = int(rng.integers(len(nodes) + 1)) if self._edges is not None else 0
+        if self._edges is None or not n:
+            return self._made(nodes, None, None)
+        edges, _ = self._edges.repair([self._edges._item.sample(rng) for _ in range(n)])
+        return self._made(nodes, edges, rng.integers(len(nodes), size=(n, 2)).astype(np.int32))
+
+    def neutral(self) -> Any:
+        nodes, _ = self._nodes.repair([self._nodes._item.neutral()])
+        return self._made(nodes, None, None)
+
+    @staticmethod
+    def _made(nodes: Any, edges: Any, links: Any) -> Any:
+        from gymnasium.spaces import GraphInstance
+
+        return GraphInstance(nodes, edges, links)
+
+
+def _random_length(rng: np.random.Generator) -> int:
+    """As Gymnasium's Sequence draws it."""
+    return min(int(rng.geometric(0.25)), MAX_ITEMS)
 
 
 def _integer(raw: object) -> int | None:

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evopolicy_common.catalogue import Entry
+from evopolicy_common.catalogue import USUAL_STEPS, Entry
 from evopolicy_common.errors import WorkerError
-from evopolicy_common.messages.environment import Case, EnvironmentDescription
-from evopolicy_worker.environments import settings, spaces
+from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
+from evopolicy_worker.environments import rewards, settings, spaces, trial
 from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.adapters import adapter, versions
@@ -29,6 +29,7 @@ from evopolicy_worker.environments.base import Environment, Frame, Observation, 
 from evopolicy_worker.environments.info import plain_info
 from evopolicy_worker.environments.observations import compile_observation
 from evopolicy_worker.environments.tasks import task_text
+from evopolicy_worker.environments.wrappers import wrapped
 
 if TYPE_CHECKING:
     import gymnasium
@@ -46,6 +47,8 @@ class GymnasiumFamily:
     """Further distributions that decide what is played; numpy and gymnasium always do."""
     modules: tuple[str, ...] = ("gymnasium",)
     """Packages to import; a family is offered where all of them are installed."""
+    extra: str = "worker"
+    """Of this software, that installs them."""
     revision: int = 1
     """Counts up when the hooks of this class change what an environment plays: scores of several are not compared."""
     components: Mapping[str, Mapping[str, str]] = {}
@@ -54,6 +57,10 @@ class GymnasiumFamily:
     def installed(self) -> bool:
         """Whether all packages are there, found out without importing them."""
         return all(find_spec(module) is not None for module in self.modules)
+
+    def needs(self) -> str:
+        """What is to be installed for it, in words."""
+        return f"{' and '.join(self.distributions)}: install the extra `evopolicy[{self.extra}]`"
 
     def load(self) -> None:
         """Import the packages and register their environments."""
@@ -69,9 +76,9 @@ class GymnasiumFamily:
         import gymnasium
 
         assert entry.gymnasium_id is not None
-        return gymnasium.make(
-            entry.gymnasium_id, render_mode="rgb_array" if render else None, disable_env_checker=True
-        )
+        # Told only where it is needed: not every environment takes a render mode.
+        mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
+        return gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode, **entry.kwargs)
 
     def rebuilds(self, entry: Entry) -> bool:
         """True when a reused environment may play another episode than a fresh one of the same case."""
@@ -122,23 +129,33 @@ class GymnasiumEnvironment(Environment):
         self._options_used = False
         self._steps = 0
         self._build()
-        obs_schema = spaces.to_schema(self._env.observation_space)
-        action_schema = spaces.to_schema(self._env.action_space)
+        obs_schema = self._schema("observation_space")
+        action_schema = self._schema("action_space")
         self._observe = compile_observation(obs_schema)
         self._plain = family.info
         self.action_codec = compile_actions(action_schema)
-        components = family.components.get(entry.gymnasium_id or "", {})
+        components = entry.reward_components or family.components.get(entry.gymnasium_id or "", {})
+        self._rewards = rewards.Scalarisation.of(entry, self._env)
+        if self._rewards is not None:
+            components = self._rewards.texts(components)
         self.description = EnvironmentDescription(
             env=entry.id,
             env_version=family.version(entry),
+            title=entry.title,
+            family=entry.family,
+            definition=_definition(entry),
+            reward_weights={} if self._rewards is None else self._rewards.weights,
+            success=entry.success,
+            success_at=entry.success_at,
             obs_space=obs_schema,
             action_space=action_schema,
             obs_storage=spaces.obs_storage(obs_schema),
             max_episode_steps=self._limit,
             reward_components=tuple(components),
             reward_texts=dict(components),
-            task_text=task_text(entry.id),
-            deterministic=family.deterministic(entry)
+            task_text=task_text(entry, self._env, obs_schema, action_schema, components, self._limit),
+            deterministic=entry.deterministic
+            and family.deterministic(entry)
             and not (self._env.spec is not None and self._env.spec.nondeterministic),
             renders="rgb_array" in self._env.metadata.get("render_modes", ()),
             adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),
@@ -161,6 +178,8 @@ class GymnasiumEnvironment(Environment):
         self._steps += 1
         plain = self._plain(info)
         plain["steps"] = self._steps
+        if self._rewards is not None:
+            reward = self._rewards.scalar(reward, plain)
         return Step(
             self._observe(obs),
             float(reward),
@@ -181,15 +200,37 @@ class GymnasiumEnvironment(Environment):
         self._env.close()
 
     def _build(self) -> None:
+        entry = self._entry
         with _quiet():
-            env = self._family.make(self._entry, render=self._render)
-        self._limit = self._entry.max_episode_steps
+            env = self._family.make(entry, render=self._render)
+        limits = [entry.max_episode_steps]
         while type(env).__name__ in _PLAIN_WRAPPERS:
-            self._limit = min(self._limit, getattr(env, "_max_episode_steps", None) or self._limit)
+            limits.append(getattr(env, "_max_episode_steps", None) or 0)
             env = env.env  # type: ignore[attr-defined]
-        if self._accelerate:
-            self.accelerations = tuple(accelerate(str(self._entry.gymnasium_id), env))
+        self._limit = min(filter(None, limits), default=USUAL_STEPS)
+        if self._accelerate and not entry.kwargs:
+            self.accelerations = tuple(accelerate(str(entry.gymnasium_id), env))
+        for wrapper in entry.wrappers:
+            env = wrapped(entry.id, env, wrapper)
         self._env = env
+
+    def _schema(self, name: str) -> SpaceSchema:
+        try:
+            return spaces.to_schema(getattr(self._env, name))
+        except TypeError as error:
+            raise WorkerError(f"environment {self._entry.id}, {name}: {error}") from error
+
+    def try_out(self) -> None:
+        """Plays a few random steps. WorkerError that names the environment, the field and the remedy where an observation, a
+        reward or an info is not as the environment's spaces promise."""
+        trial.play(self, lambda: self._env, self._entry.id)
+
+
+def _definition(entry: Entry) -> dict[str, Any]:
+    """How Gymnasium makes it, for the digest of its definition."""
+    wrappers = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
+    told = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs, "wrappers": wrappers}
+    return {name: value for name, value in told.items() if value}
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """From what a simulator returns to a plain observation, compiled once per space because it runs on every step.
 
 The result holds numpy arrays that are fresh, C-contiguous and of exactly the dtype of the space; ints for Discrete;
-strings for Text; dicts in the order of the schema; tuples.
+strings for Text; dicts in the order of the schema; tuples, of any length for Sequence (one array where it is stacked); an index and
+a value for OneOf; for Graph a dict of `nodes`, `edges` and `edge_links`, the last two None where there are none.
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ def compile_observation(schema: SpaceSchema) -> Converter:
         return _dict({key: compile_observation(part) for key, part in schema["spaces"].items()})
     if kind == "Tuple":
         return _tuple([compile_observation(part) for part in schema["spaces"]])
+    if kind == "Sequence":
+        return _sequence(schema)
+    if kind == "Graph":
+        return _graph(schema)
+    if kind == "OneOf":
+        return _one_of([compile_observation(part) for part in schema["spaces"]])
     raise TypeError(f"no observations for a space of type {kind!r}")
 
 
@@ -58,5 +65,60 @@ def _dict(converters: dict[str, Converter]) -> Converter:
 def _tuple(converters: list[Converter]) -> Converter:
     def convert(raw: Any) -> Any:
         return tuple(part(value) for part, value in zip(converters, raw, strict=True))
+
+    return convert
+
+
+def _sequence(schema: SpaceSchema) -> Converter:
+    inner = schema["space"]
+    if schema["stacked"]:
+        shape, dtype = tuple(inner["shape"]), np.dtype(inner["dtype"])
+
+        def stacked(raw: Any) -> Any:
+            return np.array(raw, dtype=dtype, order="C").reshape(-1, *shape)
+
+        return stacked
+    convert = compile_observation(inner)
+
+    def each(raw: Any) -> Any:
+        return tuple(map(convert, raw))
+
+    return each
+
+
+def graph_dtypes(
+    schema: SpaceSchema,
+) -> tuple[np.dtype[Any], tuple[int, ...], np.dtype[Any], tuple[int, ...]]:
+    """Dtype and shape of one node and of one edge of a Graph."""
+    found: list[Any] = []
+    for name in ("node_space", "edge_space"):
+        part = schema[name]
+        boxed = part is not None and part["type"] in ("Box", "Image")
+        found += [np.dtype(part["dtype"]), tuple(part["shape"])] if boxed else [np.dtype(np.int64), ()]
+    return found[0], found[1], found[2], found[3]
+
+
+def _graph(schema: SpaceSchema) -> Converter:
+    node_dtype, node_shape, edge_dtype, edge_shape = graph_dtypes(schema)
+
+    def convert(raw: Any) -> Any:
+        bare = raw.edges is None or raw.edge_links is None
+        return {
+            "nodes": np.array(raw.nodes, dtype=node_dtype, order="C").reshape(-1, *node_shape),
+            "edges": None
+            if bare
+            else np.array(raw.edges, dtype=edge_dtype, order="C").reshape(-1, *edge_shape),
+            "edge_links": None
+            if bare
+            else np.array(raw.edge_links, dtype=np.int64, order="C").reshape(-1, 2),
+        }
+
+    return convert
+
+
+def _one_of(converters: list[Converter]) -> Converter:
+    def convert(raw: Any) -> Any:
+        index = int(raw[0])
+        return index, converters[index](raw[1])
 
     return convert

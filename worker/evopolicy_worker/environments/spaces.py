@@ -2,7 +2,7 @@
 
 Forms (as in the published protocol): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
 value_range, storage}`, `MultiDiscrete {nvec, start?}`, `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
-{min_length, max_length}`. Infinities are `"inf"` and `"-inf"`. `low` and `high` are nested lists, or one number for all values
+{min_length, max_length, characters?}`, and beyond it `Sequence {space, stacked}`, `Graph {node_space, edge_space}`, `OneOf {spaces}`. Infinities are `"inf"` and `"-inf"`. `low` and `high` are nested lists, or one number for all values
 where a Box has more than 32 and they are equal. A schema is JSON and msgpack by construction.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import string
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +25,10 @@ MAX_LISTED_BOUNDS = 32
 """A Box with more values than this states a bound that all of them share as one number."""
 MAX_INLINE_BYTES = 4096
 """Observations of more bytes a step are stored outside the rows, as the published protocol does."""
+VARYING = ("Sequence", "Graph", "OneOf")
+"""Spaces whose values differ in form."""
+USUAL_CHARACTERS = frozenset(string.ascii_letters + string.digits)
+"""Of which Text is made unless it tells `characters`."""
 MIN_IMAGE_SIDE = 16
 """A uint8 height × width × {1, 3} array is a picture from this side on; smaller ones are symbolic grids."""
 
@@ -58,17 +63,40 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
             "spaces": {key: to_schema(part) for key, part in space.spaces.items()},
         }
     if isinstance(space, spaces.Text):
-        return {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
+        schema = {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
+        if (characters := frozenset(space.characters)) != USUAL_CHARACTERS:
+            schema["characters"] = "".join(sorted(characters))
+        return schema
+    if isinstance(space, spaces.Sequence):
+        inner = to_schema(space.feature_space)
+        return {
+            "type": "Sequence",
+            "space": inner,
+            "stacked": bool(space.stack) and inner["type"] in ("Box", "Image"),
+        }
+    if isinstance(space, spaces.Graph):
+        edges = None if space.edge_space is None else to_schema(space.edge_space)
+        return {"type": "Graph", "node_space": to_schema(space.node_space), "edge_space": edges}
+    if isinstance(space, spaces.OneOf):
+        return {"type": "OneOf", "spaces": [to_schema(part) for part in space.spaces]}
     if hasattr(space, "mission_func"):
         return _mission(space)
-    raise TypeError(f"no schema for a space of type {type(space).__name__}: {space}")
+    raise TypeError(
+        f"a space of type {type(space).__name__} ({str(space)[:200]}) has no form here: known are Box, Discrete, MultiDiscrete,"
+        " MultiBinary, Text, Dict, Tuple, Sequence, Graph and OneOf; put a wrapper around the environment that encodes it"
+    )
 
 
 def obs_storage(schema: SpaceSchema) -> ObsStorage:
     """Where feedback keeps observations of this space: in the rows, or beside them when they are large or hold a picture."""
-    if not _has_image(schema) and _bytes(schema) <= MAX_INLINE_BYTES:
+    if varies(schema) or (not _has_image(schema) and _bytes(schema) <= MAX_INLINE_BYTES):
         return "inline"
     return "npz" if parts(schema) else "npy"
+
+
+def varies(schema: SpaceSchema) -> bool:
+    """Whether the values of a space differ in form: how many there are, or of which kind."""
+    return schema["type"] in VARYING or any(map(varies, parts(schema)))
 
 
 def parts(schema: SpaceSchema) -> list[SpaceSchema]:
@@ -88,6 +116,57 @@ def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64
         return np.full(shape, float(lowest)), np.full(shape, float(highest))
     low, high = (schema["low"], schema["high"]) if "low" in schema else (schema["min"], schema["max"])
     return _floats(low, shape), _floats(high, shape)
+
+
+def outside(value: Any, schema: SpaceSchema) -> str:
+    """How a plain observation is not in its space, in words; empty where it is in it."""
+    kind = schema["type"]
+    if kind in ("Dict", "Tuple"):
+        named = schema["spaces"].items() if kind == "Dict" else enumerate(schema["spaces"])
+        return next((f"[{key!r}] {why}" for key, part in named if (why := outside(value[key], part))), "")
+    if kind == "Discrete":
+        low = schema.get("start", 0)
+        return (
+            "" if low <= value < low + schema["n"] else f"it is {value}, not {low} to {low + schema['n'] - 1}"
+        )
+    if kind == "Text":
+        low, high = schema["min_length"], schema["max_length"]
+        return "" if low <= len(value) <= high else f"a text of {len(value)} characters, not {low} to {high}"
+    if kind == "Sequence":
+        items = list(value)
+        return next(
+            (f"[{k}] {why}" for k, item in enumerate(items) if (why := outside(item, schema["space"]))), ""
+        )
+    if kind == "OneOf":
+        index, inner = value
+        n = len(schema["spaces"])
+        return (
+            outside(inner, schema["spaces"][index]) if 0 <= index < n else f"choice {index}, not 0 to {n - 1}"
+        )
+    if kind == "Graph":
+        return ""
+    return _array_outside(value, schema)
+
+
+def _array_outside(value: NDArray[Any], schema: SpaceSchema) -> str:
+    kind = schema["type"]
+    if kind in ("Box", "Image"):
+        shape = tuple(schema["shape"])
+        if value.shape != shape:
+            return f"an array of shape {value.shape}, not {shape}"
+        low, high = bounds(schema)
+    elif kind == "MultiDiscrete":
+        low = np.broadcast_to(np.array(schema.get("start", 0)), np.shape(schema["nvec"]))
+        high = low + np.array(schema["nvec"]) - 1
+    else:
+        low, high = np.zeros(value.shape), np.ones(value.shape)
+    if value.shape != np.shape(low):
+        return f"an array of shape {value.shape}, not {np.shape(low)}"
+    wrong = ~((value >= low) & (value <= high))  # true for NaN too
+    if not wrong.any():
+        return ""
+    where = tuple(int(k) for k in np.argwhere(wrong)[0])
+    return f"element {where} is {value[where]}, not {low[where]} to {high[where]}"
 
 
 def _has_image(schema: SpaceSchema) -> bool:

@@ -18,7 +18,7 @@ from evopolicy_common.messages.environment import Case, EnvironmentDescription, 
 from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.adapters import adapter, versions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
-from evopolicy_worker.environments.tasks import task_text
+from evopolicy_worker.environments.tasks import written
 
 
 def make(entry: Entry, *, render: bool) -> Environment:
@@ -47,7 +47,7 @@ class _Toy(Environment):
             max_episode_steps=entry.max_episode_steps,
             reward_components=tuple(reward_components),
             reward_texts=reward_components,
-            task_text=task_text(entry.id),
+            task_text=written(entry.id) or "",
             renders=True,
             adapter=adapter(type(self), 1, ""),
             packages=versions(("numpy",)),

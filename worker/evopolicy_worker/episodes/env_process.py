@@ -83,6 +83,7 @@ class EnvProcess:
         scratch = Path(start.scratch)
         # Without its parents: a worker that has gone meanwhile has taken them with it.
         scratch.mkdir(exist_ok=True)
+        environments.define(start.definitions)
         env_jail.enclose(start.tier, scratch, draws=start.draws)
         plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed, user=start.user)
         with env_jail.expendable():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_worker.environments.actions import MAX_ITEMS
 
 INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
@@ -36,7 +37,13 @@ VALUE_BYTES = 16
 Writer = Callable[[Any], list[Any]]
 """From an observation to the buffers of its payload, in order."""
 
+Step = Callable[[Any, list[Any]], None]
+"""Appends the buffers of a value, or of a part of it."""
+
 _INT = struct.Struct("<q")
+_COUNT = struct.Struct("<I")
+_NONE = 0xFFFFFFFF
+"""In place of a number of edges: there are none, and no links."""
 _FLOAT = struct.Struct("<d")
 _EXT_ARRAY, _EXT_INT = 1, 2
 _DTYPES = {
@@ -105,16 +112,13 @@ def _collect(space: SpaceSchema, path: tuple[Any, ...], fixed: list[Any], texts:
             _collect(part, (*path, index), fixed, texts)
     elif kind == "Text":
         texts.append(_text_step(path))
+    elif kind in ("Sequence", "Graph", "OneOf"):
+        texts.append(_varying_step(path, _spelled(space)))
     elif kind == "Discrete":
         fixed.append(_int_step(path))
     else:
-        if kind in ("Box", "Image"):
-            shape, size = tuple(space["shape"]), np.dtype(space["dtype"]).itemsize
-        elif kind == "MultiDiscrete":
-            shape, size = np.shape(space["nvec"]), 8
-        else:
-            n = space["n"]
-            shape, size = (n,) if isinstance(n, int) else tuple(n), 1
+        widths = {"MultiDiscrete": 8, "MultiBinary": 1}
+        shape, size = _shape(space), widths.get(kind) or np.dtype(space["dtype"]).itemsize
         fixed.append(_array_step(path, shape, -(int(np.prod(shape, dtype=np.int64)) * size) % 8))
 
 
@@ -155,8 +159,79 @@ def _text_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
     return step
 
 
+def _varying_step(path: tuple[Any, ...], spell: Callable[[Any, list[Any]], None]) -> Step:
+    def step(obs: Any, out: list[Any]) -> None:
+        spell(_at(obs, path), out)
+
+    return step
+
+
+def _spelled(space: SpaceSchema) -> Step:
+    """How a value is laid out whose form the space leaves open: counts before what they count, nothing on a multiple of 8."""
+    kind = space["type"]
+    if kind == "Sequence":
+        item = _spelled(space["space"])
+        if space["stacked"]:
+            return lambda value, out: out.extend((_COUNT.pack(len(value)), value))
+
+        def sequence(value: Any, out: list[Any]) -> None:
+            out.append(_COUNT.pack(len(value)))
+            for each in value:
+                item(each, out)
+
+        return sequence
+    if kind == "OneOf":
+        choices = [_spelled(part) for part in space["spaces"]]
+
+        def one_of(value: Any, out: list[Any]) -> None:
+            out.append(_COUNT.pack(value[0]))
+            choices[value[0]](value[1], out)
+
+        return one_of
+    if kind == "Graph":
+
+        def graph(value: Any, out: list[Any]) -> None:
+            nodes, edges, links = value["nodes"], value["edges"], value["edge_links"]
+            out += [_COUNT.pack(len(nodes)), _COUNT.pack(_NONE if edges is None else len(edges)), nodes]
+            out += [] if edges is None else [edges, links]
+
+        return graph
+    if kind in ("Dict", "Tuple"):
+        named = list(space["spaces"].items() if kind == "Dict" else enumerate(space["spaces"]))
+        parts = [(key, _spelled(part)) for key, part in named]
+
+        def compound(value: Any, out: list[Any]) -> None:
+            for key, part in parts:
+                part(value[key], out)
+
+        return compound
+    return (
+        _text_step(())
+        if kind == "Text"
+        else _int_step(())
+        if kind == "Discrete"
+        else _array_step((), _shape(space), 0)
+    )
+
+
+def _shape(space: SpaceSchema) -> tuple[int, ...]:
+    """Of the array that a value of this space is."""
+    if "shape" in space:
+        return tuple(space["shape"])
+    if space["type"] == "MultiDiscrete":
+        return np.shape(space["nvec"])
+    return (space["n"],) if isinstance(space["n"], int) else tuple(space["n"])
+
+
 def elements(space: SpaceSchema) -> int:
     """How many numbers and characters a value of this space has at most."""
+    if space["type"] == "Sequence":
+        return MAX_ITEMS * elements(space["space"])
+    if space["type"] == "OneOf":
+        return 1 + max(map(elements, space["spaces"]))
+    if space["type"] == "Graph":
+        edge = 0 if space["edge_space"] is None else 2 + elements(space["edge_space"])
+        return MAX_ITEMS * (elements(space["node_space"]) + edge)
     if space["type"] == "Dict":
         return sum(map(elements, space["spaces"].values()))
     if space["type"] == "Tuple":

@@ -20,6 +20,7 @@ from typing import BinaryIO
 import msgspec
 import numpy as np
 
+from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.trajectory import decode
@@ -139,7 +140,9 @@ def main() -> None:
     """The process's entry."""
     orders, answers = take_pipes()
     with os.fdopen(orders, "rb") as reader, os.fdopen(answers, "wb") as writer:
-        serve(sys.argv[1], reader, writer)
+        env_id, *definitions = sys.argv[1:]
+        environments.define(msgspec.json.decode(each, type=Entry) for each in definitions)
+        serve(env_id, reader, writer)
         # Not by way of exit handlers, of which a graphics driver's may hang or crash.
         os._exit(0)
 

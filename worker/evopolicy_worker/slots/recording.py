@@ -121,7 +121,7 @@ class VideoRecorder:
             self.close()
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "evopolicy_worker.episodes.video", env],
+                [sys.executable, "-m", "evopolicy_worker.episodes.video", env, *environments.definition(env)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,

@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
+from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import DECODE_ERRORS, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
@@ -53,8 +54,10 @@ class Slot:
         allowed_packages: tuple[str, ...] = ("numpy",),
         *,
         sealed: bool = True,
+        definitions: tuple[Entry, ...] = (),
     ) -> None:
-        """`core` is the CPU that all its processes are pinned to; None leaves that to the system.
+        """`core` is the CPU that all its processes are pinned to; None leaves that to the system. `definitions`: environments
+        that do not ship.
 
         `scratch` is a folder of the slot's own. `sealed=False` (tests only) leaves the policy's process unsealed.
         """
@@ -65,7 +68,11 @@ class Slot:
             allowed_packages=allowed_packages,
             user=jail.some_user() if tier == "bwrap" and os.geteuid() == 0 else None,
             sealed=sealed,
+            definitions=definitions,
         )
+        self._foreign = {each.id for each in definitions}
+        self._saw_hidden = False
+        """Whether code that does not ship has played a hidden episode in the process there is."""
         self._scratch = scratch
         self._cancelled = False
         self._sent = ""
@@ -84,6 +91,9 @@ class Slot:
         await self.close()
         self._scratch.mkdir(parents=True, exist_ok=True)
         self._sent = ""
+        self._saw_hidden = False
+        for name in ("home", "tmp"):  # what the process before has written there is not for this one
+            remove_tree(self._scratch / name)
         self._process = await asyncio.create_subprocess_exec(
             *env_jail.command(self._start.tier, self._scratch, draws=self._start.draws),
             stdin=asyncio.subprocess.PIPE,
@@ -137,6 +147,10 @@ class Slot:
             if job.video and not self._start.draws and env_jail.graphics_devices():
                 self._start = msgspec.structs.replace(self._start, draws=True)
                 await self.start()
+            # What is not ours may keep what it saw of a hidden episode, and tell a train episode's policy by it.
+            if self._saw_hidden and job.record == "full":
+                await self.start()
+            self._saw_hidden = self._saw_hidden or (job.env in self._foreign and job.record != "full")
             files = None if bundle is None else await asyncio.to_thread(bundle_files, bundle, self._sent)
             if self._cancelled:
                 return ()

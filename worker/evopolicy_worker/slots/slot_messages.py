@@ -6,6 +6,7 @@ import struct
 
 import msgspec
 
+from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_worker.episodes.begun import PackedBegun
@@ -31,6 +32,8 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
     draws: bool = False
     """With the graphics devices of this machine."""
     sealed: bool = True
+    definitions: tuple[Entry, ...] = ()
+    """Environments that do not ship."""
 
 
 class Files(msgspec.Struct, frozen=True, kw_only=True):

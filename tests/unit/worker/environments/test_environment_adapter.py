@@ -78,7 +78,7 @@ ENTRY = Entry(
 
 @pytest.fixture(autouse=True)
 def _text(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gymnasium_adapter, "task_text", lambda env_id: "# Counter\n")
+    monkeypatch.setattr(gymnasium_adapter, "task_text", lambda *_: "# Counter\n")
     monkeypatch.setattr(Counter, "made", 0)
 
 

@@ -10,16 +10,42 @@ against the spaces.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_common.catalogue import Entry, is_shipped
+from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_worker.environments.tasks import template
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 
 
 @cache
-def task_text(env_id: str) -> str:
-    """The Markdown text of an environment. FileNotFoundError when none is written."""
-    return _read(env_id.replace("/", "_") + ".md")
+def written(env_id: str) -> str | None:
+    """The Markdown text that is written for an environment; None when none is."""
+    name = env_id.replace("/", "_") + ".md"
+    return _read(name) if files(__package__).joinpath(name).is_file() else None
+
+
+def task_text(
+    entry: Entry,
+    env: gymnasium.Env[Any, Any],
+    obs_space: SpaceSchema,
+    action_space: SpaceSchema,
+    components: Mapping[str, str],
+    limit: int,
+) -> str:
+    """The Markdown text of an environment: that of its definition, or the one that is written for it, or else made by the
+    template."""
+    if entry.task:
+        return template.clean(entry.task)
+    found = written(entry.id) if is_shipped(entry.id) else None
+    return found or template.text(entry, env, obs_space, action_space, components, limit)
 
 
 def _read(name: str) -> str:

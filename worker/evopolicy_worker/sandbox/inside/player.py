@@ -41,6 +41,10 @@ action_bytes = 16 << 10
 home = ""
 """The policy's own folder; told with it."""
 
+VARYING = ("Sequence", "Graph", "OneOf")
+NONE = 0xFFFFFFFF
+"""In place of a number of edges: there are none, and no links."""
+
 Reader = Callable[[Any, Any], Any]
 """From the buffer (and where the next text begins, or the payload's length) to the observation or a part of it."""
 
@@ -176,23 +180,95 @@ def leaf_reader(space: dict[str, Any], fixed: list[int], as_lists: bool) -> Read
         return lambda body, at: (list if as_lists else tuple)(read(body, at) for read in row)
     if kind == "Text":
         return read_text
+    if kind in VARYING:
+        return varying_reader(space, as_lists)
     offset = fixed[0]
     if kind == "Discrete":
         fixed[0] += 8
         return lambda body, at: int.from_bytes(body[offset : offset + 8], "little", signed=True)
-    if kind in ("Box", "Image"):
-        shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
-    elif kind == "MultiDiscrete":
-        shape, dtype = np.shape(space["nvec"]), np.dtype(np.int64)
-    else:
-        n = space["n"]
-        shape, dtype = (n,) if isinstance(n, int) else tuple(n), np.dtype(np.int8)
+    shape, dtype = array_of(space)
     count = int(np.prod(shape, dtype=np.int64))
     fixed[0] += -(-count * dtype.itemsize // 8) * 8
     frombuffer = np.frombuffer
     if as_lists:
         return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape).tolist()
     return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape)
+
+
+def array_of(space: dict[str, Any]) -> tuple[tuple[int, ...], Any]:
+    """Shape and dtype of the array that a value of this space is; () and int64 for Discrete."""
+    kind = space["type"]
+    if kind in ("Box", "Image"):
+        return tuple(space["shape"]), np.dtype(space["dtype"])
+    if kind == "MultiDiscrete":
+        return np.shape(space["nvec"]), np.dtype(np.int64)
+    if kind == "Discrete":
+        return (), np.dtype(np.int64)
+    n = space["n"]
+    return (n,) if isinstance(n, int) else tuple(n), np.dtype(np.int8)
+
+
+def varying_reader(space: dict[str, Any], as_lists: bool) -> Reader:
+    """For a value whose form the space leaves open: counts stand before what they count, and nothing is padded."""
+    kind = space["type"]
+    if kind == "Sequence":
+        if space["stacked"]:
+            shape, dtype = array_of(space["space"])
+            return lambda body, at: take_array(body, at, (take_count(body, at), *shape), dtype, as_lists)
+        item = varying_reader(space["space"], as_lists)
+        row = list if as_lists else tuple
+        return lambda body, at: row([item(body, at) for _ in range(take_count(body, at))])
+    if kind == "OneOf":
+        choices = [varying_reader(part, as_lists) for part in space["spaces"]]
+
+        def one_of(body: Any, at: Any) -> Any:
+            index = take_count(body, at)
+            found = index, choices[index](body, at)
+            return list(found) if as_lists else found
+
+        return one_of
+    if kind == "Graph":
+        node_shape, node_dtype = array_of(space["node_space"])
+        edge_shape, edge_dtype = array_of(space["edge_space"] or space["node_space"])
+
+        def graph(body: Any, at: Any) -> Any:
+            n, m = take_count(body, at), take_count(body, at)
+            nodes = take_array(body, at, (n, *node_shape), node_dtype, as_lists)
+            if m == NONE:
+                return {"nodes": nodes, "edges": None, "edge_links": None}
+            edges = take_array(body, at, (m, *edge_shape), edge_dtype, as_lists)
+            links = take_array(body, at, (m, 2), np.dtype(np.int64), as_lists)
+            return {"nodes": nodes, "edges": edges, "edge_links": links}
+
+        return graph
+    if kind == "Dict":
+        named = {key: varying_reader(part, as_lists) for key, part in space["spaces"].items()}
+        return lambda body, at: {key: read(body, at) for key, read in named.items()}
+    if kind == "Tuple":
+        parts = [varying_reader(part, as_lists) for part in space["spaces"]]
+        row = list if as_lists else tuple
+        return lambda body, at: row([read(body, at) for read in parts])
+    if kind == "Text":
+        return read_text
+    shape, dtype = array_of(space)
+    if kind == "Discrete":
+        return lambda body, at: int(take_array(body, at, (), dtype, False))
+    return lambda body, at: take_array(body, at, shape, dtype, as_lists)
+
+
+def take_count(body: Any, at: Any) -> int:
+    start = at[0]
+    at[0] = start + 4
+    return int.from_bytes(body[start : start + 4], "little")
+
+
+def take_array(body: Any, at: Any, shape: tuple[int, ...], dtype: Any, as_lists: bool) -> Any:
+    start = at[0]
+    count = math.prod(shape)
+    at[0] = start + count * dtype.itemsize
+    # A copy: what stands anywhere in the buffer may not be aligned.
+    array = np.frombuffer(body, dtype, count, start).reshape(shape).copy()
+    return array.tolist() if as_lists else array
 
 
 def read_text(body: Any, at: Any) -> str:

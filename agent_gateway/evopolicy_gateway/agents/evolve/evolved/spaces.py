@@ -79,7 +79,7 @@ def _features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
     if kind == "MultiBinary":
         size = int(np.prod(schema["n"]))
         return size, lambda obs: 2.0 * np.asarray(obs, dtype=float).reshape(-1) - 1.0
-    if kind == "Text":
+    if kind in ("Text", "Sequence", "Graph", "OneOf"):
         return 0, lambda obs: np.zeros(0)
     if kind == "Tuple":
         return _joined([(i, part) for i, part in enumerate(schema["spaces"])])
@@ -161,7 +161,15 @@ def _head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
         shape = tuple(np.atleast_1d(schema["n"]))
         return int(np.prod(shape)), lambda outputs: (outputs > 0).astype(np.int8).reshape(shape)
     if kind == "Text":
-        return 0, lambda outputs: " " * schema["min_length"]
+        return 0, lambda outputs: schema.get("characters", "a")[0] * schema["min_length"]
+    if kind == "Sequence":
+        return 0, lambda outputs: []
+    if kind == "Graph":
+        size, node = _head(schema["node_space"])
+        return size, lambda outputs: {"nodes": [node(outputs)], "edges": None, "edge_links": None}
+    if kind == "OneOf":
+        size, convert = _head(schema["spaces"][0])
+        return size, lambda outputs: (0, convert(outputs))
     named = kind == "Dict"
     items = list(schema["spaces"].items()) if named else list(enumerate(schema["spaces"]))
     heads = [(key, *_head(part)) for key, part in items]

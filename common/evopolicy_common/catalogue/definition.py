@@ -1,0 +1,214 @@
+"""What defines an environment: a row of the catalogue, or an environment file of anyone's. Read, never run.
+
+An environment file is TOML, one environment with the keys of `Entry`, or several under `[[environment]]`. `task_file` names a
+text beside it, in place of `task`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+
+Demand = Literal["synthesis", "tuning"]
+ObservationKind = Literal["state", "image", "symbolic", "dict"]
+ActionKind = Literal["discrete", "continuous"]
+
+USUAL_STEPS = 1000
+"""Step limit of an environment that states none, as the published software has it."""
+USUAL_STEP_BYTES = 1000
+"""What a step takes of a run directory where nobody has measured it."""
+MAX_STEPS = 1 << 22
+MAX_TASK_CHARACTERS = 64 << 10
+MAX_FILE_BYTES = 1 << 20
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*([/:][A-Za-z0-9][A-Za-z0-9_.-]*){0,3}")
+_MAX_ID = 120
+
+
+class Wrapper(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A wrapper around an environment."""
+
+    wrapper: str
+    """Name of a class in `gymnasium.wrappers`, or `module:Class`."""
+    kwargs: dict[str, Any] = {}
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One environment of the catalogue, or of an environment file."""
+
+    id: str
+    """Suite id: what users, runs and cases name it by, such as `gym/acrobot`."""
+    gymnasium_id: str | None = None
+    """What `gymnasium.make` takes, `module:Id` for one that a module registers when it is imported; None for environments of
+    our own (`toy/…`)."""
+    family: str = "other"
+    """Key of the family the environment's scores are averaged in, such as `gym_box2d`."""
+    title: str = ""
+    """Short name for tables, such as `Acrobot`; empty: the id."""
+    max_episode_steps: int = 0
+    """Upper bound on an episode's length, in steps; 0: as Gymnasium registers it, and `USUAL_STEPS` where it states none."""
+    published_steps: int | None = None
+    """Where the published software cuts an episode, and what it tells as the limit; None: as here. It takes 1,000 where
+    Gymnasium has no limit registered, though all but one of these environments end earlier by themselves."""
+    step_bytes: int = USUAL_STEP_BYTES
+    """About what a step takes of a run directory in a train episode's feedback, without video; as measured."""
+    observation: ObservationKind | None = None
+    """What an observation is: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
+    action: ActionKind | None = None
+    demand: Demand | None = None
+    """Task-demand group of the paper's mechanism section; None when the paper does not place it."""
+    adapter: str = "foreign"
+    """Module of the worker's environments that plays it."""
+    kwargs: dict[str, Any] = {}
+    """For `gymnasium.make`."""
+    wrappers: tuple[Wrapper, ...] = ()
+    """Around what it makes, the innermost first."""
+    task: str = ""
+    """Markdown for agents; empty: what is written for the id, or else made of its documentation and its spaces."""
+    reward_components: dict[str, str] = {}
+    """Names under which `info`, or its `rewards`, reports parts of the reward, and what each stands for."""
+    reward_vector: tuple[str, ...] = ()
+    """Names of the elements of a reward that is a vector."""
+    reward_weights: dict[str, float] = {}
+    """How its elements are weighted in the return; empty: each counts 1."""
+    success: str = ""
+    """Key in `info` that tells whether the task was solved; empty where nothing tells."""
+    success_at: Literal["end", "any"] = "end"
+    """Whether the last step's word counts, or that of any."""
+    deterministic: bool = True
+    """False where even a fresh environment does not repeat an episode from its seed and actions."""
+
+    @property
+    def label(self) -> str:
+        """Its short name for tables."""
+        return self.title or self.id
+
+    def feedback_bytes(self, episodes: int) -> int:
+        """What the feedback of so many train episodes takes of a run directory when all are as long as can be."""
+        return episodes * (self.max_episode_steps or USUAL_STEPS) * self.step_bytes
+
+
+_SHIPPED_ONLY = ("published_steps", "step_bytes", "observation", "action", "demand", "adapter")
+"""Fields that environment files do not have."""
+
+
+class _Many(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    environment: tuple[dict[str, Any], ...]
+
+
+def valid_id(env_id: str) -> bool:
+    """Whether an id can stand in messages and in the name of a folder."""
+    return len(env_id) <= _MAX_ID and _ID.fullmatch(env_id) is not None
+
+
+def read_file(path: Path) -> tuple[Entry, ...]:
+    """The environments of a file. ConfigError that names file, environment and field, and the remedy."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"environment file {path} cannot be read: {error.strerror}") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(
+            f"environment file {path} has {len(data):,} bytes; {MAX_FILE_BYTES:,} are the limit"
+        )
+    try:
+        table = tomllib.loads(data.decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"environment file {path} is not TOML: {error}") from error
+    tables = [table]
+    if "environment" in table:
+        try:
+            tables = list(msgspec.convert(table, _Many).environment)
+        except msgspec.ValidationError as error:
+            raise ConfigError(
+                f"environment file {path}: {error}; several environments are [[environment]] tables"
+            ) from error
+    entries = tuple(_entry(path, each) for each in tables)
+    doubled = sorted({each.id for each in entries if [one.id for one in entries].count(each.id) > 1})
+    if doubled:
+        raise ConfigError(
+            f"environment file {path} defines {', '.join(doubled)} more than once: keep one of each"
+        )
+    return entries
+
+
+def _entry(path: Path, table: dict[str, Any]) -> Entry:
+    told = dict(table)
+    where = f"environment file {path}, environment {told.get('id', 'without id')!s:.80}"
+    known = [name for name in Entry.__struct_fields__ if name not in _SHIPPED_ONLY] + ["task_file"]
+    for name in told:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            raise ConfigError(
+                f"{where}: there is no key {name!r}"
+                + (f"; near: {near[0]}" if near else f"; keys are {', '.join(known)}")
+            )
+    task_file = told.pop("task_file", None)
+    if task_file is not None:
+        told["task"] = _task(where, path, told, task_file)
+    try:
+        entry = msgspec.convert(told, Entry)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    for wrong, why in _faults(entry):
+        if wrong:
+            raise ConfigError(f"{where}: {why}")
+    return entry
+
+
+def _task(where: str, path: Path, told: dict[str, Any], task_file: object) -> str:
+    if "task" in told or not isinstance(task_file, str):
+        raise ConfigError(
+            f"{where}: task_file is the path of a text, and in place of task: leave out one of them"
+        )
+    try:
+        return (path.parent / task_file).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{where}: task_file {task_file!r} cannot be read: {error}") from error
+
+
+def _faults(entry: Entry) -> list[tuple[bool, str]]:
+    """What may be wrong with a definition of anyone's, each with the words for it."""
+    unknown = sorted(entry.reward_weights.keys() - set(entry.reward_vector))
+    return [
+        (
+            not valid_id(entry.id),
+            f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID} characters at most",
+        ),
+        (
+            not entry.gymnasium_id,
+            "gymnasium_id is missing: what gymnasium.make takes, such as my_pkg:MyEnv-v0",
+        ),
+        (
+            not 0 <= entry.max_episode_steps <= MAX_STEPS,
+            f"max_episode_steps is {entry.max_episode_steps}: 1 to {MAX_STEPS:,}, or 0 for what Gymnasium registers",
+        ),
+        (
+            len(entry.task) > MAX_TASK_CHARACTERS,
+            f"the task text has {len(entry.task):,} characters; {MAX_TASK_CHARACTERS:,} are the limit",
+        ),
+        (
+            not all(re.fullmatch(r"[a-z0-9_]{1,40}", name) for name in (entry.family,)),
+            f"family {entry.family[:80]!r}: lowercase letters, digits and '_', 40 at most",
+        ),
+        (bool(unknown), f"reward_weights names {', '.join(unknown)}, which reward_vector does not have"),
+        (not _is_plain(entry.kwargs), "kwargs: numbers, texts, lists and tables only, no dates"),
+        (
+            not all(_is_plain(each.kwargs) for each in entry.wrappers),
+            "wrappers.kwargs: numbers, texts, lists and tables only",
+        ),
+    ]
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return isinstance(value, str | int | float | bool)

@@ -1,0 +1,125 @@
+"""Environment files: what they define, and what is wrong with them in words that name file, environment and field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from evopolicy_common import catalogue
+from evopolicy_common.catalogue.definition import read_file
+from evopolicy_common.errors import ConfigError
+
+GOOD = """
+id = "acme/glider"
+gymnasium_id = "acme_envs:Glider-v0"
+title = "Glider"
+family = "acme"
+max_episode_steps = 15
+task_file = "glider.md"
+success = "near"
+success_at = "any"
+reward_components = {near = "1 near the origin"}
+
+[kwargs]
+push = 0.3
+
+[[wrappers]]
+wrapper = "ClipAction"
+"""
+
+
+def test_a_file_defines_an_environment_with_all_that_is_told_of_it(tmp_path: Path) -> None:
+    (tmp_path / "glider.toml").write_text(GOOD)
+    (tmp_path / "glider.md").write_text("# Glide")
+    (entry,) = read_file(tmp_path / "glider.toml")
+    assert (entry.id, entry.gymnasium_id, entry.label) == ("acme/glider", "acme_envs:Glider-v0", "Glider")
+    assert (entry.max_episode_steps, entry.task, entry.kwargs) == (15, "# Glide", {"push": 0.3})
+    assert [each.wrapper for each in entry.wrappers] == ["ClipAction"]
+    assert catalogue.resolve([str(tmp_path / "glider.toml"), "gym/acrobot"]) == ["gym/acrobot", "acme/glider"]
+    assert catalogue.source_of("acme/glider") == str(tmp_path / "glider.toml")
+    assert catalogue.entry("acme/glider") == entry
+
+
+def test_a_file_may_define_several(tmp_path: Path) -> None:
+    rows = [f'[[environment]]\nid = "acme/{k}"\ngymnasium_id = "acme_envs:Glider-v0"\n' for k in range(3)]
+    (tmp_path / "many.toml").write_text("".join(rows))
+    assert [entry.id for entry in read_file(tmp_path / "many.toml")] == ["acme/0", "acme/1", "acme/2"]
+    (tmp_path / "many.toml").write_text("".join([*rows, rows[0]]))
+    with pytest.raises(ConfigError, match="acme/0 more than once"):
+        read_file(tmp_path / "many.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("id = ", "is not TOML"),
+        (
+            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_steps = 3',
+            "no key 'max_steps'; near: max_episode_steps",
+        ),
+        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nadapter = "toy"', "no key 'adapter'"),
+        (
+            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_episode_steps = "3"',
+            "Expected `int`, got `str` - at `\\$.max_episode",
+        ),
+        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_episode_steps = -1', "max_episode_steps is -1"),
+        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nwrappers = ["ClipAction"]', "at `\\$.wrappers"),
+        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nday = 2026-01-01', "kwargs: numbers, texts"),
+        (
+            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nreward_weights = {speed = 1.0}',
+            "reward_weights names speed",
+        ),
+        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nfamily = "../x"', "family '../x': lowercase"),
+        (
+            'id = "acme/x"\ngymnasium_id = "a:B-v0"\ntask_file = "none.md"',
+            "task_file 'none.md' cannot be read",
+        ),
+        ('id = "acme/x"', "gymnasium_id is missing"),
+        ('id = "../x"\ngymnasium_id = "a:B-v0"', "id '../x': letters, digits"),
+        ('id = "gym/acrobot"\ngymnasium_id = "a:B-v0"', "ids that begin with gym/ ship with evopolicy"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, why: str) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=why) as caught:
+        catalogue.add(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["my_pkg:MyEnv-v0", "acme/glider", "acme.envs:Sub/Env-v1"])
+def test_environments_that_do_not_ship_are_named_by_module_or_by_a_prefix_of_their_own(name: str) -> None:
+    assert catalogue.resolve([name, "gym/acrobot"]) == ["gym/acrobot", name]
+    assert catalogue.suite_of(name).name == "other"
+
+
+@pytest.mark.parametrize("name", ["gym/acrobat", "acme", "acme/../x", "a b/c", "x" * 200 + "/y"])
+def test_other_names_are_refused_here(name: str) -> None:
+    with pytest.raises(ConfigError):
+        catalogue.resolve([name])
+
+
+def test_an_installed_package_adds_environments_without_being_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "acme_shop"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise RuntimeError('imported')")
+    (package / "environments.toml").write_text('id = "acme/shop"\ngymnasium_id = "acme_shop:Shop-v0"\n')
+    info = tmp_path / "acme_shop-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-shop\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[evopolicy.environments]\nacme = acme_shop:environments.toml\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    catalogue.plugins.cache_clear()
+    try:
+        found = catalogue.known("acme/shop")
+        assert found is not None
+        assert found.gymnasium_id == "acme_shop:Shop-v0"
+        (package / "environments.toml").unlink()
+        catalogue.plugins.cache_clear()
+        with pytest.raises(ConfigError, match="names no environment file in the package"):
+            catalogue.known("acme/shop")
+    finally:
+        catalogue.plugins.cache_clear()

@@ -1,0 +1,231 @@
+"""Environments that do not ship: made from files and by module, in every space, and refused where they break their word."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evopolicy_common.catalogue import Entry, Wrapper
+from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.records.trajectory import Recorder, decode
+from evopolicy_gateway.agents import uniform
+from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features
+from evopolicy_gateway.workspace.initial_policy import constant_action
+from evopolicy_worker.environments import Environment, compile_actions, define, describe, make, registry
+from evopolicy_worker.environments.spaces import outside
+from evopolicy_worker.episodes.frames import compile_writer
+from evopolicy_worker.sandbox.inside import player
+
+PACKAGE = Path(__file__).parents[3] / "support" / "foreign_package"
+
+
+@pytest.fixture(autouse=True)
+def _package(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    yield
+    registry._defined.clear()
+
+
+def defined(name: str, **more: Any) -> str:
+    define([Entry(id=f"acme/{name}", gymnasium_id=f"acme_envs:{name}-v0", **more)])
+    return f"acme/{name}"
+
+
+def test_what_gymnasium_makes_by_module_is_described_from_its_documentation_and_spaces() -> None:
+    told = describe("acme_envs:Glider-v0")
+    assert told.max_episode_steps == 20
+    assert "A point is steered to the origin." in told.task_text
+    assert "an array of shape (2,) of float32, from -10 to 10" in told.task_text
+    assert "after 20 steps at the latest" in told.task_text
+    assert told.definition == {"gymnasium_id": "acme_envs:Glider-v0"}
+    assert "+src." in told.packages["acme_envs"]
+    assert told.renders
+
+
+def test_an_environment_without_a_limit_gets_the_usual_one() -> None:
+    assert describe("acme_envs:Endless-v0").max_episode_steps == 1000
+
+
+def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
+    more = {
+        "kwargs": {"push": 0.9},
+        "wrappers": (Wrapper(wrapper="RescaleAction", kwargs={"min_action": -2.0, "max_action": 2.0}),),
+        "max_episode_steps": 7,
+        "task": "# Fly\u202e\x07",
+        "success": "near",
+        "title": "G",
+    }
+    told = describe(defined("Glider", **more))
+    assert (told.max_episode_steps, told.task_text, told.success, told.title) == (7, "# Fly", "near", "G")
+    assert told.action_space["high"] == [2.0]
+    assert told.digest() != describe("acme_envs:Glider-v0").digest()
+    environment = make("acme/Glider")
+    environment.reset(Case(seed=1))
+    assert [environment.step(np.zeros(1, "f")).truncated for _ in range(7)] == [False] * 6 + [True]
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "why"),
+    [
+        (
+            Wrapper(wrapper="ClipActions"),
+            "wrapper 'ClipActions': there is none of that name; near: ClipAction",
+        ),
+        (Wrapper(wrapper="no_such:Thing"), "wrapper 'no_such:Thing': there is none"),
+        (Wrapper(wrapper="TransformReward"), "kwargs {}: it cannot be put around the environment: TypeError"),
+    ],
+)
+def test_a_wrapper_that_does_not_fit_is_named(wrapper: Wrapper, why: str) -> None:
+    with pytest.raises(WorkerError, match=why):
+        describe(defined("Glider", wrappers=(wrapper,)))
+
+
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ("nan", "environment acme/Bad, step 0, reward: it is nan; rewards have to be finite"),
+        ("outside", "step 0, observation: element .* is 9.*, not -10.0 to 10.0; correct the environment"),
+        ("shape", "step 0, observation: an array of shape .3,., not .2,."),
+        (
+            "raise in reset",
+            r"environment acme/Bad, reset\(seed=0\): it raised RuntimeError: no level of that seed",
+        ),
+        ("change spaces", "environment acme/Bad, observation_space: it has changed in reset"),
+        ("custom space", "observation_space: a space of type Opaque .* has no form here: known are Box"),
+    ],
+)
+def test_an_environment_that_breaks_its_word_is_refused_when_it_is_described(how: str, why: str) -> None:
+    with pytest.raises(WorkerError, match=why):
+        describe(defined("Bad", kwargs={"how": how}))
+
+
+def test_a_package_that_is_missing_is_named_with_what_to_install() -> None:
+    with pytest.raises(WorkerError, match="no_such_pkg:X-v0 needs the package with the module 'no_such_pkg'"):
+        make("no_such_pkg:X-v0")
+
+
+def test_a_reward_vector_is_recorded_whole_and_counts_by_its_weights() -> None:
+    told = describe("acme_envs:Treasure-v0")
+    assert told.reward_weights == {"reward_0": 1.0, "reward_1": 1.0}
+    name = defined("Treasure", reward_vector=("distance", "effort"), reward_weights={"effort": 0.5})
+    told = describe(name)
+    assert told.reward_components == ("distance", "effort")
+    assert told.reward_texts["effort"] == "element of the reward vector; weight 0.5"
+    environment = make(name)
+    environment.reset(Case(seed=0))
+    step = environment.step(np.ones(1, "f"))
+    distance, effort = step.info["reward_vector"]
+    assert step.info["rewards"] == {"distance": distance, "effort": effort}
+    assert step.reward == distance + 0.5 * effort
+    with pytest.raises(
+        WorkerError, match="reward_vector: it names 3 elements, and the environment's rewards have 2"
+    ):
+        describe(defined("Treasure", reward_vector=("a", "b", "c")))
+
+
+@pytest.fixture
+def everything() -> Iterator[Environment]:
+    environment = make("acme_envs:Everything-v0")
+    yield environment
+    environment.close()
+
+
+def received(environment: Environment, obs: Any, *, as_lists: bool) -> Any:
+    """The observation as the policy's process reads it from the bytes that are sent."""
+    space = json.loads(json.dumps(environment.description.obs_space))
+    data = b"".join(map(bytes, compile_writer(space)(obs)))
+    _, read = player.observation_reader(space, as_lists)
+    return read(bytearray(data), len(data))
+
+
+def same(left: Any, right: Any) -> bool:
+    if isinstance(left, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, list | tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    return bool(np.array_equal(left, right)) and getattr(left, "dtype", None) == getattr(right, "dtype", None)
+
+
+def plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_observations_of_every_space_reach_the_policy_as_they_are(everything: Environment, seed: int) -> None:
+    obs = everything.reset(Case(seed=seed))
+    assert outside(obs, everything.description.obs_space) == ""
+    assert same(received(everything, obs, as_lists=False), obs)
+    assert received(everything, obs, as_lists=True) == plain(obs)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_actions_of_every_space_are_in_it_and_are_what_a_recording_plays(
+    everything: Environment, seed: int
+) -> None:
+    codec, rng = everything.action_codec, np.random.default_rng(seed)
+    recorder = Recorder()
+    obs = everything.reset(Case(seed=seed))
+    played = []
+    for _ in range(4):
+        action = codec.sample(rng)
+        again, invalid = codec.repair(action)
+        assert not invalid
+        step = everything.step(again)
+        assert step.info["inside"], action
+        recorder.append(obs, action, step.reward, False, False, step.info)
+        played.append(step)
+        obs = step.obs
+    rows = list(decode(recorder.finish()).rows())
+    everything.reset(Case(seed=seed))
+    for row, step in zip(rows, played, strict=True):
+        action, invalid = codec.repair(row.action)
+        assert not invalid
+        assert same(everything.step(action).obs, step.obs)
+        assert row.reward == 1.0
+
+
+@pytest.mark.parametrize(
+    "raw", [None, 3, [], {}, "x", {"items": 7, "graph": {"nodes": [[0, 0]], "edge_links": [[0, 9]]}}]
+)
+def test_anything_is_repaired_into_every_space(everything: Environment, raw: object) -> None:
+    action, invalid = everything.action_codec.repair(raw)
+    assert invalid
+    everything.reset(Case(seed=0))
+    assert everything.step(action).info["inside"]
+
+
+def test_texts_of_a_set_of_characters_are_made_of_these() -> None:
+    codec = compile_actions({"type": "Text", "min_length": 2, "max_length": 4, "characters": "ab"})
+    assert codec.repair("abba") == ("abba", False)
+    assert codec.repair("xaxbx") == ("ab", True)
+    assert codec.repair("") == ("aa", True)
+    assert set(codec.sample(np.random.default_rng(0))) <= {"a", "b"}
+
+
+def test_every_space_is_told_in_words(everything: Environment) -> None:
+    text = everything.description.task_text
+    for part in ("`graph`", "`either`", "`items`", "any number of items", "a pair of an index and a value"):
+        assert part in text
+
+
+def test_agents_that_ship_act_in_every_space(everything: Environment) -> None:
+    space = json.loads(json.dumps(everything.description.action_space))
+    names: dict[str, Any] = {}
+    exec(uniform.POLICY, names)  # as the policy's process does
+    head = ActionHead(space)
+    for action in (constant_action(space), names["sample"](space), head.action(np.zeros(head.size))):
+        repaired, invalid = everything.action_codec.repair(action)
+        assert not invalid
+        everything.reset(Case(seed=0))
+        assert everything.step(repaired).info["inside"]
+    assert Features(json.loads(json.dumps(everything.description.obs_space))).size > 0

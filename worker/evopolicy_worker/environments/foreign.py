@@ -1,0 +1,76 @@
+"""Environments that do not ship: whatever Gymnasium can make from an environment file or from `module:Id`.
+
+Nothing is known of them, so nothing is believed: each episode gets a fresh one, and their own source counts in their fingerprint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
+from pathlib import Path
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_worker.environments.adapters import versions
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+
+_OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
+"""What Gymnasium's own environments are made of, beside Gymnasium."""
+_SOURCES = (".py", ".pyx", ".so", ".xml", ".json", ".toml", ".yaml", ".csv", ".npz", ".npy")
+_MAX_FILES = 5000
+
+
+class ForeignFamily(GymnasiumFamily):
+    """Anyone's environments."""
+
+    def __init__(self, gymnasium_id: str) -> None:
+        self._module = gymnasium_id.partition(":")[0] if ":" in gymnasium_id else ""
+
+    def installed(self) -> bool:
+        return super().installed() and (not self._module or _package(self._module) is not None)
+
+    def needs(self) -> str:
+        return f"the package with the module {self._module!r} (installed, or in a folder on PYTHONPATH)"
+
+    def rebuilds(self, entry: Entry) -> bool:
+        return True
+
+    def packages(self, entry: Entry) -> dict[str, str]:
+        common = super().packages(entry)
+        if not self._module:
+            return common | versions(_OF_GYMNASIUM)
+        return common | _own(self._module.partition(".")[0])
+
+    def version(self, entry: Entry) -> str:
+        told = ", ".join(f"{name} {each}" for name, each in self.packages(entry).items() if name != "numpy")
+        return f"{entry.gymnasium_id} ({told})"
+
+
+@cache
+def _package(module: str) -> Path | None:
+    """Where a module's top-level package or file is; found without importing it. None when there is none."""
+    spec = find_spec(module.partition(".")[0])
+    if spec is None:
+        return None
+    places = list(spec.submodule_search_locations or ())
+    return Path(places[0]) if places else Path(spec.origin or "")
+
+
+@cache
+def _own(top: str) -> dict[str, str]:
+    """The package's version, where it is a distribution's, and a digest of its files: code that is edited in place has no
+    other version."""
+    place = _package(top)
+    named = packages_distributions().get(top, [])
+    digest = hashlib.sha256()
+    if place is not None:
+        files = (
+            sorted(each for each in place.rglob("*") if each.suffix in _SOURCES)
+            if place.is_dir()
+            else [place]
+        )
+        for path in files[:_MAX_FILES]:
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    release = version(named[0]) if named else "0"
+    return {(named[0] if named else top).lower(): f"{release}+src.{digest.hexdigest()[:12]}"}

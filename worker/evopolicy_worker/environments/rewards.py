@@ -1,0 +1,68 @@
+"""Rewards that are vectors: recorded whole, and scored by a weighted sum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import WorkerError
+
+if TYPE_CHECKING:
+    import gymnasium
+
+_MAX_ELEMENTS = 64
+
+
+class Scalarisation:
+    """From a vector to the number that counts."""
+
+    def __init__(self, env_id: str, weights: Mapping[str, float]) -> None:
+        self.weights = dict(weights)
+        """By name, in the order of the vector."""
+        self._env = env_id
+        self._values = np.array(list(weights.values()), dtype=np.float64)
+
+    @classmethod
+    def of(cls, entry: Entry, env: gymnasium.Env[Any, Any]) -> Scalarisation | None:
+        """That of an environment; None where its rewards are numbers.
+
+        Its definition tells the elements' names, or else the environment's `reward_space` how many there are.
+        """
+        space = getattr(env.unwrapped, "reward_space", None)
+        shape = getattr(space, "shape", None)
+        n = int(np.prod(shape)) if shape else 0
+        names = entry.reward_vector or tuple(f"reward_{k}" for k in range(n))
+        if not names:
+            return None
+        if n and n != len(names):
+            raise WorkerError(
+                f"environment {entry.id}, reward_vector: it names {len(names)} elements, and the environment's rewards have {n}"
+            )
+        if len(names) > _MAX_ELEMENTS:
+            raise WorkerError(
+                f"environment {entry.id}, reward_vector: {len(names)} elements; {_MAX_ELEMENTS} are the limit"
+            )
+        return cls(entry.id, {name: entry.reward_weights.get(name, 1.0) for name in names})
+
+    def texts(self, told: Mapping[str, str]) -> dict[str, str]:
+        """What each element stands for, as far as it is told; its weight is told in any case."""
+        return {
+            name: f"{told.get(name, 'element of the reward vector')}; weight {weight:g}"
+            for name, weight in self.weights.items()
+        }
+
+    def scalar(self, reward: Any, info: dict[str, Any]) -> float:
+        """The number that a vector counts; it is put into `info` whole, and by name under `rewards`."""
+        vector = np.asarray(reward, dtype=np.float64).reshape(-1)
+        if vector.size != self._values.size:
+            raise WorkerError(
+                f"environment {self._env}, reward: a vector of {vector.size} elements, and {self._values.size} are declared;"
+                " name them all in reward_vector"
+            )
+        values = vector.tolist()
+        info["reward_vector"] = values
+        info["rewards"] = dict(zip(self.weights, values, strict=True))
+        return float(vector @ self._values)

@@ -1,0 +1,34 @@
+"""The wrappers that an environment file asks for."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_common.catalogue import Wrapper
+from evopolicy_common.errors import WorkerError
+
+if TYPE_CHECKING:
+    import gymnasium
+
+
+def wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymnasium.Env[Any, Any]:
+    """`env` in that wrapper. WorkerError that names environment and wrapper when there is none of that name, or it does not
+    take its arguments."""
+    where = f"environment {env_id}, wrapper {wrapper.wrapper!r}"
+    module, colon, name = wrapper.wrapper.rpartition(":")
+    try:
+        found = importlib.import_module(module if colon else "gymnasium.wrappers")
+        make = getattr(found, name)
+    except (ImportError, AttributeError, ValueError) as error:
+        near = [] if colon else difflib.get_close_matches(name, dir(found), n=3)
+        hint = f"near: {', '.join(near)}" if near else "say a class of gymnasium.wrappers, or module:Class"
+        raise WorkerError(f"{where}: there is none of that name; {hint}") from error
+    try:
+        made: gymnasium.Env[Any, Any] = make(env, **wrapper.kwargs)
+    except Exception as error:
+        raise WorkerError(
+            f"{where}, kwargs {wrapper.kwargs}: it cannot be put around the environment: {type(error).__name__}: {error}"
+        ) from error
+    return made
