@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_worker import environments
 from evopolicy_worker.episodes.loop import CancelledJobError, Player, Progress, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles

@@ -30,6 +30,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from evopolicy_common.catalogue import is_shipped
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
@@ -250,6 +251,8 @@ class Player:
 
     def describe(self, env_id: str) -> EnvironmentDescription:
         """What an environment is; it is made for that, and kept for the jobs to come. Raises WorkerError as they do."""
+        if not is_shipped(env_id):
+            return environments.describe(env_id)
         return self._environment(env_id).description
 
     def _environment(self, env_id: str) -> Environment:
