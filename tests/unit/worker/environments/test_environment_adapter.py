@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case
@@ -144,12 +145,11 @@ def test_a_family_that_is_not_installed_is_not_offered(monkeypatch: pytest.Monke
         make("gymnasium/MiniGrid-FourRooms-v0")
 
 
-def test_an_entry_without_an_adapter_is_not_offered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "entries", lambda: {ENTRY.id: ENTRY})
-    monkeypatch.setattr(registry, "entry", lambda env_id: ENTRY)
-    assert registry.offered() == []
-    with pytest.raises(WorkerError, match="no adapter"):
-        make(ENTRY.id)
+def test_every_environment_that_ships_has_an_adapter_and_is_offered_where_its_packages_are() -> None:
+    core16 = catalogue.suites()["core16"].environments
+    assert set(core16) <= set(registry.offered()) <= set(catalogue.entries())
+    assert not any(registry.missing(env_id) for env_id in core16)
+    assert "no environment 'gym/none' here" in registry.missing("gym/none")
 
 
 def test_an_environment_that_does_not_repeat_itself_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
