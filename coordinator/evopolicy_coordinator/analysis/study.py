@@ -25,13 +25,15 @@ from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.analysis.reading.records import LeftOut, Run
 from evopolicy_coordinator.analysis.scoring.evolution import Evolution, evolutions
 from evopolicy_coordinator.analysis.scoring.normalised import Normalised, normalised
-from evopolicy_coordinator.analysis.scoring.ranking import RESAMPLES, Leaderboard, leaderboard
+from evopolicy_coordinator.analysis.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_coordinator.analysis.scoring.scores import (
     ScoreTable,
     ordered_environments,
     score_table,
     suites_of,
 )
+from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES
+from evopolicy_coordinator.analysis.statistics.suite import SuiteStatistics, suite_statistics
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,6 +43,7 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True):
     table: ScoreTable
     board: Leaderboard
     normalised: Normalised
+    statistics: SuiteStatistics
 
 
 class Timeline(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,7 +117,7 @@ def study_of(
         left_out=tuple(left_out),
         mixtures=tuple(mixed),
         suites=tuple(
-            _suite(name, table.restricted(envs), resamples)
+            _suite(name, table.restricted(envs), ordered, resamples)
             for name, envs in suites_of(table.environments).items()
         ),
         evolutions=tuple(evolutions(ordered, _reference_of(table))),
@@ -147,9 +150,14 @@ def study(
     )
 
 
-def _suite(name: str, table: ScoreTable, resamples: int) -> Suite:
+def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:
+    board = leaderboard(table)
     return Suite(
-        name=name, table=table, board=leaderboard(table, resamples=resamples), normalised=normalised(table)
+        name=name,
+        table=table,
+        board=board,
+        normalised=normalised(table),
+        statistics=suite_statistics(runs, table, board, resamples=resamples),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from evopolicy_coordinator.analysis.figures import cost, edits, scores
+from evopolicy_coordinator.analysis.figures import cost, edits, profiles, scores
 from evopolicy_coordinator.analysis.figures.style import Plot
 from evopolicy_coordinator.analysis.palette import looks
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
@@ -21,6 +21,7 @@ def figures_of(study: Study) -> Iterator[Plot]:
         for plot in (
             scores.rank_scores(suite, look),
             scores.score_evolution(suite, study, look),
+            profiles.performance_profiles(suite, look),
             scores.normalised_performance(suite, look),
         ):
             if plot is not None:

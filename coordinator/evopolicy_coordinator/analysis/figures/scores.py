@@ -39,11 +39,12 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
                 look = looks[row.entry]
                 panel.hlines(place, 0.0, value, color=look.colour, linewidth=2.2, alpha=0.55)
                 panel.plot(value, place, look.marker, color=look.colour, markersize=6.5)
-                if not family and row.score_interval is not None:
+                sure = suite.statistics.standings.of(row.entry)
+                if not family and sure is not None:
                     panel.hlines(
                         place + 0.22,
-                        row.score_interval.low,
-                        row.score_interval.high,
+                        sure.score_low,
+                        sure.score_high,
                         color=MUTED,
                         linewidth=1.0,
                     )
@@ -62,12 +63,12 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
         axes[0][0].set_yticks(range(len(standings)), [row.entry for row in standings])
         figure.supxlabel("Mean rank score (1 = best on every environment)", fontsize=9)
     first = standings[0]
-    has_intervals = any(row.score_interval is not None for row in standings)
+    resampled = suite.statistics.standings
     return Plot(
         name=f"rank_scores_{suite.name}",
         title=f"{suite_title(suite.name)} rank scores",
         caption="Mean rank score over the suite and over each family of environments."
-        + (" Thin bars: 95 % bootstrap interval over runs." if has_intervals else ""),
+        + (f" Thin bars: 95 % bootstrap interval over {resampled.over}." if resampled.rows else ""),
         alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {first.entry}"
         + (f" at {first.score:.2f}." if first.score is not None else "."),
         data=rows(standings),

@@ -100,6 +100,15 @@ def index_page(
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"cells_{s}")],
         ),
         _section(
+            "statistics",
+            "Statistics",
+            title="How sure the scores are",
+            texts=["Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases."],
+            figures=shown_figures(*(f"profiles_{s}" for s in suites)),
+            tables=[v for s in suites for v in shown_tables(f"resolution_{s}", f"aggregates_{s}", f"improvement_{s}")]
+            + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],
+        ),
+        _section(
             "evolution",
             "Score evolution",
             figures=shown_figures(*(f"score_evolution_{s}" for s in suites)),

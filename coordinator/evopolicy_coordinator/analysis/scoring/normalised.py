@@ -44,6 +44,25 @@ class Normalised(msgspec.Struct, frozen=True, kw_only=True):
     groups: tuple[GroupMean, ...]
 
 
+class Scale(msgspec.Struct, frozen=True, kw_only=True):
+    """The ends of one environment's scale, in returns; `best` is above `random`."""
+
+    random: float
+    best: float
+
+
+def scales_of(table: ScoreTable) -> dict[str, Scale]:
+    """By environment, in the table's order; those without a scale are absent."""
+    out: dict[str, Scale] = {}
+    for env in table.environments:
+        column = table.column(env)
+        anchor = column.pop(table.reference, None) if table.reference is not None else None
+        best = max((value for value in column.values() if value is not None), default=None)
+        if anchor is not None and best is not None and best > anchor:
+            out[env] = Scale(random=anchor, best=best)
+    return out
+
+
 def normalise(score: float | None, random: float | None, best: float | None) -> float | None:
     """The formula; None when a value is missing or `best ≤ random`."""
     if score is None or random is None or best is None or best <= random:
@@ -54,12 +73,13 @@ def normalise(score: float | None, random: float | None, best: float | None) -> 
 def normalised(table: ScoreTable) -> Normalised:
     """Every agent of `table` on every environment that it played, and the means of the two demand groups."""
     cells: dict[tuple[str, str], NormalisedCell] = {}
+    scales = scales_of(table)
     for env in table.environments:
-        column = table.column(env)
-        anchor = column.pop(table.reference, None) if table.reference is not None else None
-        best = max((value for value in column.values() if value is not None), default=None)
-        for entry, value in column.items():
-            cells[entry, env] = NormalisedCell(entry=entry, env=env, value=normalise(value, anchor, best))
+        scale = scales.get(env)
+        ends = (None, None) if scale is None else (scale.random, scale.best)
+        for entry, value in table.column(env).items():
+            if entry != table.reference:
+                cells[entry, env] = NormalisedCell(entry=entry, env=env, value=normalise(value, *ends))
     groups: list[GroupMean] = []
     for demand in DEMANDS:
         for entry in table.agents:

@@ -1,4 +1,4 @@
-"""Ranks, rank scores, wins, and how sure they are when runs are repeated (paper, appendix on scoring).
+"""Ranks, rank scores and wins (paper, appendix on scoring); `statistics` tells how sure they are.
 
 Within an environment entries are ranked by held-out mean, descending; equal means share the better rank. With N entries
 on it, `s = 1 − (rank − 1)/(N − 1)`. A family's score is the mean of `s` over its environments, a suite's over all of
@@ -7,24 +7,12 @@ its environments. Wins count rank 1, top-2 rank ≤ 2. Only the order of means m
 
 from __future__ import annotations
 
-import random
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 
 import msgspec
 
-from evopolicy_coordinator.analysis.scoring.scores import Cell, ScoreTable, family_of
-
-CONFIDENCE = 0.95
-RESAMPLES = 1000
-"""Bootstrap resamples; intervals are percentiles of them, from a fixed seed."""
-
-
-class Interval(msgspec.Struct, frozen=True, kw_only=True):
-    """A percentile bootstrap interval at level `CONFIDENCE`, runs resampled."""
-
-    low: float
-    high: float
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, family_of
 
 
 class CellResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,8 +23,6 @@ class CellResult(msgspec.Struct, frozen=True, kw_only=True):
     n_runs: int
     mean: float | None
     """Held-out mean return over runs; None with no ok submit."""
-    interval: Interval | None
-    """Of the mean; None with fewer than two runs."""
     rank: int
     """1 is best."""
     score: float | None
@@ -60,10 +46,6 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     n_runs: int
     rank: int
     """By `score`, ties share the better rank."""
-    score_interval: Interval | None = None
-    """None unless each of the entry's cells has two runs or more: what was run once shows no spread."""
-    rank_interval: Interval | None = None
-    """Range of the entry's rank by suite score over the resamples' central 95 %."""
 
 
 class Leaderboard(msgspec.Struct, frozen=True, kw_only=True):
@@ -100,21 +82,17 @@ def rank_score(rank: int, n: int) -> float | None:
     return 1.0 - (rank - 1) / (n - 1) if n > 1 else None
 
 
-def leaderboard(table: ScoreTable, *, resamples: int = RESAMPLES) -> Leaderboard:
-    """Ranks `table` as one suite. Intervals appear where a cell has at least two runs."""
-    cells = _rank_cells(table, resamples)
+def leaderboard(table: ScoreTable) -> Leaderboard:
+    """Ranks `table` as one suite."""
+    cells = _rank_cells(table)
     suite_scores = {entry: _mean(_scores(cells, table, entry)) for entry in table.entries}
     ranks = competition_ranks(suite_scores)
-    intervals = _bootstrap_standings(table, resamples)
-    standings = [
-        _standing(table, cells, entry, suite_scores[entry], ranks[entry], intervals.get(entry))
-        for entry in table.entries
-    ]
+    standings = [_standing(table, cells, entry, suite_scores[entry], ranks[entry]) for entry in table.entries]
     standings.sort(key=lambda row: (row.rank, row.is_reference, row.entry.casefold(), row.entry))
     return Leaderboard(environments=tuple(table.environments), standings=tuple(standings), cells=cells)
 
 
-def _rank_cells(table: ScoreTable, resamples: int) -> dict[tuple[str, str], CellResult]:
+def _rank_cells(table: ScoreTable) -> dict[tuple[str, str], CellResult]:
     out: dict[tuple[str, str], CellResult] = {}
     for env in table.environments:
         column = table.column(env)
@@ -125,7 +103,6 @@ def _rank_cells(table: ScoreTable, resamples: int) -> dict[tuple[str, str], Cell
                 env=env,
                 n_runs=len(cell.scores),
                 mean=column[entry],
-                interval=bootstrap_mean(cell.scores, resamples=resamples),
                 rank=rank,
                 score=rank_score(rank, len(column)),
             )
@@ -148,7 +125,6 @@ def _standing(
     entry: str,
     score: float | None,
     rank: int,
-    intervals: tuple[Interval, Interval] | None,
 ) -> Standing:
     own = [cells[entry, env] for env in table.environments if (entry, env) in cells]
     families: dict[str, list[float | None]] = {}
@@ -168,66 +144,4 @@ def _standing(
         n_environments=len(own),
         n_runs=sum(cell.n_runs for cell in own),
         rank=rank,
-        score_interval=intervals[0] if intervals else None,
-        rank_interval=intervals[1] if intervals else None,
     )
-
-
-def bootstrap_mean(
-    scores: Sequence[float | None], *, resamples: int = RESAMPLES, seed: int = 0
-) -> Interval | None:
-    """Percentile interval of the mean over runs; None with fewer than two runs or where one has no score."""
-    known = [score for score in scores if score is not None]
-    if len(known) < 2 or len(known) < len(scores):
-        return None
-    generator = random.Random(seed)
-    found = sorted(fmean(generator.choices(known, k=len(known))) for _ in range(resamples))
-    return _percentiles(found)
-
-
-def _percentiles(ordered: Sequence[float]) -> Interval:
-    tail = (1.0 - CONFIDENCE) / 2.0
-    last = len(ordered) - 1
-    return Interval(low=ordered[round(tail * last)], high=ordered[round((1.0 - tail) * last)])
-
-
-def _bootstrap_standings(table: ScoreTable, resamples: int) -> dict[str, tuple[Interval, Interval]]:
-    """Entry to the intervals of its suite score and suite rank: every cell's runs are resampled together.
-
-    Only for entries whose cells all have two runs or more: a cell of one run does not vary under resampling, and an interval
-    from it would pass for certainty. Entries beside them that were run once, such as the random reference, stay fixed.
-    """
-    once = {cell.entry for cell in table.cells.values() if len(cell.scores) < 2}
-    if once.issuperset(table.entries):
-        return {}
-    generator = random.Random(1)
-    scores: dict[str, list[float]] = {entry: [] for entry in table.entries}
-    ranks: dict[str, list[float]] = {entry: [] for entry in table.entries}
-    by_env = {
-        env: [table.cells[e, env] for e in table.entries if (e, env) in table.cells]
-        for env in table.environments
-    }
-    for _ in range(resamples):
-        drawn: dict[str, list[float | None]] = {entry: [] for entry in table.entries}
-        for cells in by_env.values():
-            means = {cell.entry: _resampled_mean(cell, generator) for cell in cells}
-            for entry, rank in competition_ranks(means).items():
-                drawn[entry].append(rank_score(rank, len(means)))
-        suite = {entry: _mean(values) for entry, values in drawn.items()}
-        for entry, rank in competition_ranks(suite).items():
-            ranks[entry].append(float(rank))
-            value = suite[entry]
-            if value is not None:
-                scores[entry].append(value)
-    return {
-        entry: (_percentiles(sorted(scores[entry])), _percentiles(sorted(ranks[entry])))
-        for entry in table.entries
-        if scores[entry] and entry not in once
-    }
-
-
-def _resampled_mean(cell: Cell, generator: random.Random) -> float | None:
-    if len(cell.scores) == 1:
-        return cell.scores[0]
-    drawn = generator.choices(cell.scores, k=len(cell.scores))
-    return Cell(entry=cell.entry, env=cell.env, scores=tuple(drawn)).mean

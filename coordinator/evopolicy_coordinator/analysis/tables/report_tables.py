@@ -7,7 +7,6 @@ from typing import Any
 from evopolicy_coordinator.analysis.behaviour import structure
 from evopolicy_coordinator.analysis.behaviour.edits import demand_of
 from evopolicy_coordinator.analysis.scoring.normalised import DEMANDS
-from evopolicy_coordinator.analysis.scoring.ranking import Interval
 from evopolicy_coordinator.analysis.scoring.scores import (
     family_of,
     family_title,
@@ -15,6 +14,8 @@ from evopolicy_coordinator.analysis.scoring.scores import (
     suite_title,
     title_of,
 )
+from evopolicy_coordinator.analysis.statistics.intervals import Estimate
+from evopolicy_coordinator.analysis.statistics.standings import RankEstimate
 from evopolicy_coordinator.analysis.study import Study, Suite
 from evopolicy_coordinator.analysis.tables.run_tables import (
     ENTRY,
@@ -26,6 +27,13 @@ from evopolicy_coordinator.analysis.tables.run_tables import (
     one_or_all,
     tables_of_runs,
 )
+from evopolicy_coordinator.analysis.tables.statistics_tables import (
+    CHECKPOINTS,
+    has_single_runs,
+    interval_text,
+    span,
+    statistics_tables,
+)
 from evopolicy_coordinator.analysis.tables.table import Column, Table, best_marks
 
 _DEMAND = Column("demand", "Demand")
@@ -35,7 +43,8 @@ def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
     """Every table of the report in its order; those without rows are left out, except what was left out."""
     found: list[Table] = []
     for suite in study.suites:
-        found += [_aggregate(suite, study), _heldout(suite), _cells(suite), _normalised(suite)]
+        found += [_aggregate(suite, study), _heldout(suite), _cells(suite)]
+        found += [*statistics_tables(suite), _normalised(suite)]
     found += [
         _evolution(study, link_of),
         _edit_types(study),
@@ -45,10 +54,6 @@ def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
         *tables_of_runs(study, link_of),
     ]
     return [table for table in found if table.rows or table.name == "left_out"]
-
-
-def _span(interval: Interval | None, digits: int) -> str | None:
-    return None if interval is None else f"{interval.low:.{digits}f} to {interval.high:.{digits}f}"
 
 
 def _aggregate(suite: Suite, study: Study) -> Table:
@@ -62,9 +67,8 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             "harness": row.harness,
             **{family: row.families.get(family) for family in families},
             "score": row.score,
-            "score_interval": _span(row.score_interval, 3),
+            **_sure(suite.statistics.standings.of(row.entry)),
             "rank": row.rank,
-            "rank_interval": _span(row.rank_interval, 0),
             "budget": None if row.is_reference else budgets.get(row.entry),
             "wins": row.wins,
             "top2": row.top2,
@@ -76,9 +80,11 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     columns = [ENTRY, HARNESS]
     columns += [Column(family, family_title(family), "number") for family in families]
     columns.append(Column("score", suite_title(suite.name), "number"))
-    if any(row.score_interval is not None for row in suite.board.standings):
+    standings = suite.statistics.standings
+    if standings.rows:
         columns.append(Column("score_interval", "95 % interval"))
         columns.append(Column("rank_interval", "Rank interval"))
+        columns.append(Column("ties", "Tie group", note="Entries that share a letter cannot be told apart."))
     if budgets:
         columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
     columns += [
@@ -92,8 +98,14 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank, and "
         "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
     )
-    if any(row.score_interval is not None for row in suite.board.standings):
-        caption += " Intervals resample the runs of every cell (percentile bootstrap, 95 %); an entry with a cell of one run has none."
+    if standings.rows:
+        caption += (
+            f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie group: "
+            "entries that share a letter cannot be told apart (all pairs together at 5 %, Holm); the rank interval "
+            "is what these comparisons leave."
+        )
+        if has_single_runs(suite):
+            caption += f" {CHECKPOINTS}"
     return Table(
         name=f"leaderboard_{suite.name}",
         title=f"{suite_title(suite.name)} leaderboard",
@@ -102,6 +114,16 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         rows=tuple(rows),
         marks=best_marks(rows, [*families, "score"]),
     )
+
+
+def _sure(row: RankEstimate | None) -> dict[str, Any]:
+    if row is None:
+        return {}
+    return {
+        "score_interval": span(row.score_low, row.score_high, 3),
+        "rank_interval": f"{row.rank_low} to {row.rank_high}",
+        "ties": row.ties,
+    }
 
 
 def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
@@ -145,7 +167,8 @@ def _cells(suite: Suite) -> Table:
             "family": family_title(family_of(env)),
             "entry": cell.entry,
             "mean": cell.mean,
-            "interval": _span(cell.interval, 3),
+            "interval": interval_text(suite.statistics.means.get((cell.entry, env))),
+            "over": _over(suite.statistics.means.get((cell.entry, env))),
             "runs": cell.n_runs,
             "rank": cell.rank,
             "score": cell.score,
@@ -159,20 +182,26 @@ def _cells(suite: Suite) -> Table:
     return Table(
         name=f"cells_{suite.name}",
         title=f"{suite_title(suite.name)} cells",
-        caption="Every entry on every environment: mean over its runs, percentile bootstrap interval of the mean where there are "
-        "at least two, rank and rank score.",
+        caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
+        "and rank score. Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
+        "table of differences.",
         columns=(
             ENV,
             Column("family", "Family"),
             ENTRY,
             Column("mean", "Held-out mean", "number"),
             Column("interval", "95 % interval"),
+            Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases."),
             Column("runs", "Runs", "integer"),
             Column("rank", "Rank", "integer"),
             Column("score", "Rank score", "number"),
         ),
         rows=tuple(rows),
     )
+
+
+def _over(mean: Estimate | None) -> str | None:
+    return None if mean is None or mean.low is None else mean.over
 
 
 def _normalised(suite: Suite) -> Table:

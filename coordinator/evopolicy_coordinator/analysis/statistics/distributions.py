@@ -1,0 +1,79 @@
+"""Quantiles of Student's t and Holm's correction, in plain Python: numpy has neither, and scipy would be a dependency for these two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from statistics import NormalDist
+
+CONFIDENCE = 0.95
+ALPHA = 1.0 - CONFIDENCE
+
+
+def normal_quantile(p: float) -> float:
+    """The standard normal distribution's quantile, 0 < p < 1."""
+    return NormalDist().inv_cdf(p)
+
+
+@lru_cache(maxsize=65536)
+def t_quantile(p: float, df: float) -> float:
+    """Student's t quantile for 0.5 ≤ p < 1 and any `df` > 0, to about 1e-10; infinite `df` gives the normal's."""
+    if not 0.5 <= p < 1.0 or not df > 0.0:
+        raise ValueError(
+            f"t quantile of p = {p} with {df} degrees of freedom; p is in [0.5, 1) and df above 0"
+        )
+    if math.isinf(df):
+        return normal_quantile(p)
+    low, high = 0.0, 1.0
+    while _t_upper(high, df) > 1.0 - p:
+        low, high = high, high * 2.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if high - low <= 1e-12 * high:
+            break
+        low, high = (middle, high) if _t_upper(middle, df) > 1.0 - p else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _t_upper(t: float, df: float) -> float:
+    """P(T > t) for t ≥ 0: half the regularised incomplete beta function at df/(df + t²)."""
+    return 0.5 * _incomplete_beta(0.5 * df, 0.5, df / (df + t * t))
+
+
+def _incomplete_beta(a: float, b: float, x: float) -> float:
+    """Regularised; by its continued fraction (Abramowitz and Stegun 26.5.8), evaluated with Lentz's method."""
+    if x <= 0.0 or x >= 1.0:
+        return 0.0 if x <= 0.0 else 1.0
+    if x > (a + 1.0) / (a + b + 2.0):
+        return 1.0 - _incomplete_beta(b, a, 1.0 - x)
+    log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
+    tiny = 1e-300
+    c, d = 1.0, 1.0 / _away(1.0 - (a + b) * x / (a + 1.0), tiny)
+    found = d
+    for m in range(1, 500):
+        for numerator in (
+            m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)),
+        ):
+            d = 1.0 / _away(1.0 + numerator * d, tiny)
+            c = _away(1.0 + numerator / c, tiny)
+            found *= d * c
+        if abs(d * c - 1.0) < 1e-15:
+            break
+    return math.exp(log_front) * found / a
+
+
+def _away(value: float, tiny: float) -> float:
+    return value if abs(value) > tiny else tiny
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Holm's step-down correction: adjusted p values in the order given; None stays None and is no test of the family."""
+    known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    adjusted: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for place, (p, i) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - place) * p))
+        adjusted[i] = largest
+    return adjusted

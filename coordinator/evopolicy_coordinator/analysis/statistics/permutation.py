@@ -1,0 +1,87 @@
+"""Permutation tests of no difference, two-sided.
+
+Over cases, signs of the paired differences are flipped: under the null hypothesis the two checkpoints are exchangeable on every case.
+Over runs, runs change their entries; the statistic is Welch's t, so that entries of equal mean and unequal spread are not taken for
+different when runs are many (Janssen 1997). All patterns are tried where they are few, else a random part, the observed one counted in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from evopolicy_coordinator.analysis.statistics.resampling import label_patterns, sign_patterns
+from evopolicy_coordinator.analysis.statistics.samples import Floats
+
+LEAST_PATTERNS = 9999
+_CHUNK = 20_000
+_CLOSE = 1e-9
+"""Relative: statistics that are equal but for rounding count as equal."""
+
+
+class Test(msgspec.Struct, frozen=True, kw_only=True):
+    """A permutation test's result."""
+
+    p: float
+    least: float
+    """The smallest p value that so few cases or runs can give."""
+    exact: bool
+
+
+def patterns_for(n_tests: int, alpha: float) -> int:
+    """Random patterns such that a family of `n_tests` can still reject under Holm's correction at level `alpha`."""
+    return max(LEAST_PATTERNS, int(4 * n_tests / alpha) - 1)
+
+
+def sign_test(columns: Floats, n_random: int = LEAST_PATTERNS) -> list[Test]:
+    """Of each column (cases, m): that its values are symmetric about 0."""
+    n = len(columns)
+    patterns, exact = sign_patterns(n, n_random)
+    observed = np.abs(columns.sum(axis=0))
+    bound = observed - _CLOSE * np.abs(columns).sum(axis=0)
+    reached = np.zeros(columns.shape[1])
+    for start in range(0, len(patterns), _CHUNK):
+        reached += (np.abs(patterns[start : start + _CHUNK] @ columns) >= bound).sum(axis=0)
+    least = 2.0 / len(patterns) if exact else max(2.0 ** (1 - n), 1.0 / (len(patterns) + 1))
+    return [Test(p=_p(float(count), len(patterns), exact), least=least, exact=exact) for count in reached]
+
+
+def label_test(first: Sequence[float], second: Sequence[float], n_random: int = LEAST_PATTERNS) -> Test:
+    """That two groups of run scores, of two runs or more each, come from one distribution."""
+    n_first, n_second = len(first), len(second)
+    pooled = np.array([*first, *second])
+    pooled = pooled - pooled.mean()
+    patterns, exact = label_patterns(n_first, n_second, n_random)
+    own = np.zeros((1, len(pooled)))
+    own[0, :n_first] = 1.0
+    observed = float(_welch(own, pooled, n_first, n_second)[0])
+    reached = 0
+    for start in range(0, len(patterns), _CHUNK):
+        found = _welch(patterns[start : start + _CHUNK], pooled, n_first, n_second)
+        reached += int((found >= observed * (1.0 - _CLOSE)).sum())
+    both_ways = 2 if n_first == n_second else 1
+    least = both_ways / len(patterns) if exact else 1.0 / (len(patterns) + 1)
+    return Test(p=_p(float(reached), len(patterns), exact), least=least, exact=exact)
+
+
+def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Floats:
+    """|t| of each pattern; no spread and no difference is 0, no spread and a difference infinite."""
+    scale = float(np.abs(pooled).max(initial=0.0))
+    if scale == 0.0:
+        return np.zeros(len(labels))
+    values = pooled / scale
+    sums, squares = labels @ values, labels @ values**2
+    first, second = sums / n_first, (values.sum() - sums) / n_second
+    v_first = np.maximum(0.0, squares / n_first - first**2) / (n_first - 1)
+    v_second = np.maximum(0.0, ((values**2).sum() - squares) / n_second - second**2) / (n_second - 1)
+    gap, error = np.abs(first - second), np.sqrt(v_first + v_second)
+    error = np.where(error < _CLOSE, 0.0, error)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t: Floats = np.where(gap < _CLOSE, 0.0, gap / error)
+    return t
+
+
+def _p(reached: float, n_patterns: int, exact: bool) -> float:
+    return reached / n_patterns if exact else (reached + 1.0) / (n_patterns + 1.0)

@@ -1,0 +1,56 @@
+"""Seeded resampling, as weights: row b of a matrix says how often resample b draws each unit."""
+
+from __future__ import annotations
+
+import itertools
+from functools import lru_cache
+
+import numpy as np
+
+from evopolicy_coordinator.analysis.statistics.samples import Floats
+
+RESAMPLES = 2000
+EXACT_UP_TO = 1 << 13
+"""Sign or label patterns up to so many are all tried; of more a random part."""
+
+
+@lru_cache(maxsize=8)
+def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
+    """(resamples, n): multinomial counts of `n_drawn` draws with replacement out of `n`; rows sum to `n_drawn`. Read-only."""
+    drawn = np.random.default_rng([seed, n, n_drawn]).multinomial(n_drawn, np.full(n, 1.0 / n), resamples)
+    found: Floats = drawn.astype(np.float64)
+    found.setflags(write=False)
+    return found
+
+
+@lru_cache(maxsize=4)
+def sign_patterns(n: int, n_random: int) -> tuple[Floats, bool]:
+    """(patterns, n) of ±1, and whether they are all 2ⁿ of them; else `n_random` random ones. Read-only."""
+    if 2**n <= EXACT_UP_TO:
+        found = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
+        exact = True
+    else:
+        found = np.random.default_rng([11, n]).integers(0, 2, (n_random, n)) * 2.0 - 1.0
+        exact = False
+    found.setflags(write=False)
+    return found, exact
+
+
+@lru_cache(maxsize=4)
+def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, bool]:
+    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether they are all. Read-only."""
+    n = n_first + n_second
+    n_all = 1
+    for i in range(n_first):
+        n_all = n_all * (n - i) // (i + 1)
+    if n_all <= EXACT_UP_TO:
+        found = np.zeros((n_all, n))
+        for row, chosen in zip(found, itertools.combinations(range(n), n_first), strict=True):
+            row[list(chosen)] = 1.0
+        exact = True
+    else:
+        order = np.random.default_rng([12, n_first, n_second]).random((n_random, n)).argsort(axis=1)
+        found = (order < n_first).astype(np.float64)
+        exact = False
+    found.setflags(write=False)
+    return found, exact

@@ -1,0 +1,167 @@
+"""The smallest gap that an experiment resolves at 95 %, and how many repeats a given gap would need."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from statistics import fmean, median
+
+import msgspec
+
+from evopolicy_coordinator.analysis.scoring.normalised import Scale
+from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, t_quantile
+from evopolicy_coordinator.analysis.statistics.intervals import components
+from evopolicy_coordinator.analysis.statistics.pairs import Pair
+from evopolicy_coordinator.analysis.statistics.samples import Sample, matched
+
+GAPS = (0.05, 0.1, 0.2)
+"""Gaps on the random-to-best scale whose repeats a report tells."""
+MAX_REPEATS = 1000
+
+
+class Spread(msgspec.Struct, frozen=True, kw_only=True):
+    """How a difference between two agents varies on one environment, mean over its pairs."""
+
+    run: float
+    """Variance between runs of one agent, of their held-out means."""
+    case: float
+    """Variance of the difference that more runs do not reduce: agents differ by case, and these cases are a sample."""
+    n_cases: int
+
+
+class Repeats(msgspec.Struct, frozen=True, kw_only=True):
+    """How many runs of each agent resolve a gap."""
+
+    gap: float
+    n: int | None
+    """None where no number up to `MAX_REPEATS` does: it needs more cases."""
+
+
+class Resolution(msgspec.Struct, frozen=True, kw_only=True):
+    """What one environment can resolve between agents."""
+
+    env: str
+    gap: float | None
+    """Half width of the 95 % intervals of the differences, median over the pairs of agents, in returns."""
+    scale: float | None
+    """Best agent's mean minus the random reference's, in returns; None without such a scale."""
+    n_cases: int
+    n_runs: tuple[int, int]
+    """Fewest and most of an agent."""
+    spread: Spread | None
+    """None unless every agent has two runs or more on the same cases: one run does not show how runs vary."""
+
+    @property
+    def normalised_gap(self) -> float | None:
+        """`gap` as a share of the scale."""
+        return None if self.gap is None or self.scale is None else self.gap / self.scale
+
+    def repeats(self, share: float) -> Repeats | None:
+        """Runs of each agent that resolve a gap of `share` of the scale; None where it cannot be told."""
+        if self.spread is None or self.scale is None:
+            return None
+        return repeats_needed(self.spread, share * self.scale)
+
+
+def half_width(spread: Spread, n: int) -> float:
+    """Half width of the 95 % interval of a difference between two agents of n ≥ 2 runs each."""
+    by_run, by_case = 2.0 * spread.run / n, spread.case
+    total = by_run + by_case
+    if total <= 0.0:
+        return 0.0
+    below = (by_run / total) ** 2 / (2.0 * (n - 1))
+    below += (by_case / total) ** 2 / (spread.n_cases - 1) if spread.n_cases > 1 else 0.0
+    df = 1.0 / below if below > 0.0 else math.inf
+    return t_quantile(1.0 - ALPHA / 2.0, round(df, 3)) * math.sqrt(total)
+
+
+def repeats_needed(spread: Spread, gap: float) -> Repeats:
+    """The fewest runs of each agent, from 2, whose 95 % interval of a difference is no wider than ± `gap`: a true gap of that size is
+    then told from 0 every second time. ValueError for a gap that is not above 0."""
+    if not gap > 0.0:
+        raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
+    if half_width(spread, MAX_REPEATS) > gap:
+        return Repeats(gap=gap, n=None)
+    low, high = 1, MAX_REPEATS
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if half_width(spread, middle) <= gap else (middle, high)
+    return Repeats(gap=gap, n=high)
+
+
+def resolutions(
+    samples: Mapping[tuple[str, str], Sample],
+    found: Sequence[Pair],
+    agents: Sequence[str],
+    scales: Mapping[str, Scale],
+    environments: Sequence[str],
+) -> list[Resolution]:
+    """One for each environment that two agents have played."""
+    out: list[Resolution] = []
+    for env in environments:
+        here = [samples[agent, env] for agent in agents if (agent, env) in samples]
+        own = [pair for pair in found if pair.env == env and {pair.first, pair.second} <= set(agents)]
+        if len(here) < 2:
+            continue
+        halves = [
+            0.5 * (pair.gap.high - pair.gap.low)
+            for pair in own
+            if pair.gap is not None and pair.gap.low is not None and pair.gap.high is not None
+        ]
+        scale = scales.get(env)
+        out.append(
+            Resolution(
+                env=env,
+                gap=median(halves) if halves else None,
+                scale=None if scale is None else scale.best - scale.random,
+                n_cases=max((pair.n_cases for pair in own), default=0),
+                n_runs=(min(len(s.runs) for s in here), max(len(s.runs) for s in here)),
+                spread=_spread(here),
+            )
+        )
+    return out
+
+
+def overall(found: Sequence[Resolution]) -> Resolution | None:
+    """Of the mean over environments of normalised scores, on which the scale is 1; None unless each environment has a scale and
+    a gap. Environments are fixed: the suite is what it is."""
+    gaps = [one.normalised_gap for one in found]
+    if not found or any(gap is None for gap in gaps):
+        return None
+    n = len(found)
+    spread = None
+    spreads = [(one.spread, one.scale) for one in found]
+    if all(one is not None for one, _ in spreads):
+        known = [(one, scale) for one, scale in spreads if one is not None and scale is not None]
+        spread = Spread(
+            run=sum(one.run / scale**2 for one, scale in known) / n**2,
+            case=sum(one.case / scale**2 for one, scale in known) / n**2,
+            n_cases=sum(one.n_cases for one, _ in known),
+        )
+    return Resolution(
+        env="",
+        gap=math.sqrt(sum(gap**2 for gap in gaps if gap is not None)) / n,
+        scale=1.0,
+        n_cases=sum(one.n_cases for one in found),
+        n_runs=(min(one.n_runs[0] for one in found), max(one.n_runs[1] for one in found)),
+        spread=spread,
+    )
+
+
+def _spread(samples: Sequence[Sample]) -> Spread | None:
+    common = matched(samples)
+    if common is None or any(len(matrix) < 2 for matrix in common.returns):
+        return None
+    runs = [components(matrix) for matrix in common.returns]
+    beyond = [
+        components((common.returns[a].mean(axis=0) - common.returns[b].mean(axis=0))[None, :]).cases
+        - runs[a].residual
+        - runs[b].residual
+        for a, b in itertools.combinations(range(len(samples)), 2)
+    ]
+    return Spread(
+        run=fmean(part.runs * part.n_runs for part in runs),
+        case=max(0.0, fmean(beyond)),
+        n_cases=common.returns[0].shape[1],
+    )

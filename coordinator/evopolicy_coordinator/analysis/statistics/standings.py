@@ -1,0 +1,201 @@
+"""Intervals of rank scores and ranks, and tie groups: the whole suite is resampled.
+
+A rank score depends on the order of noisy means only. Its interval is for the score that the entry would have on average if the experiment
+were repeated with as many new runs and cases, on the same environments against the same entries. Each
+resample draws cases (the same for all entries, as they are shared) and runs, ranks all entries anew, and averages. Two entries are told apart
+when the resampled differences of their scores say so at 5 % after Holm's correction over all pairs. An entry's rank then
+lies between 1 + (entries told apart and better) and N − (entries told apart and worse), as in Mogstad et al. (2024).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import string
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, holm
+from evopolicy_coordinator.analysis.statistics.intervals import resampled_means
+from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, weights
+from evopolicy_coordinator.analysis.statistics.samples import Floats, Sample, matched
+
+MAX_GROUPS = 200
+"""More tie groups than this are not told: the letters would say nothing."""
+
+
+class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """How sure one row of a leaderboard is."""
+
+    entry: str
+    score_low: float
+    score_high: float
+    """95 % interval of the rank score."""
+    rank_low: int
+    rank_high: int
+    """Best and worst rank that the comparisons leave, all pairs together at 95 %."""
+    ties: str
+    """Letters of its tie groups: entries that share a letter cannot be told apart."""
+
+
+class Standings(msgspec.Struct, frozen=True, kw_only=True):
+    """Of a suite; entries whose cells show no spread are not in it."""
+
+    rows: tuple[RankEstimate, ...]
+    gap: float | None
+    """Half width of the 95 % interval of a difference of two agents' rank scores, median over pairs."""
+    over: str
+    """`cases`, `runs and cases`, or both where cells differ."""
+
+    def of(self, entry: str) -> RankEstimate | None:
+        """The row of `entry`, if it has one."""
+        return next((row for row in self.rows if row.entry == entry), None)
+
+
+def standings(
+    samples: Mapping[tuple[str, str], Sample],
+    scores: Mapping[str, float | None],
+    environments: Sequence[str],
+    *,
+    resamples: int = RESAMPLES,
+) -> Standings:
+    """Of the entries of `scores` (entry to its observed rank score), best first."""
+    entries = sorted(scores, key=lambda entry: (-_or_least(scores[entry]), entry.casefold(), entry))
+    n_pairs = len(entries) * (len(entries) - 1) // 2
+    resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
+    drawn, spread = _drawn_scores(samples, entries, environments, resamples)
+    sure = [
+        i
+        for i, entry in enumerate(entries)
+        if entry in spread and np.isfinite(drawn[i]).all() and scores[entry] is not None
+    ]
+    if len(sure) < 2:
+        return Standings(rows=(), gap=None, over="")
+    apart = _told_apart(drawn, sure)
+    letters = dict(zip(sure, _letters(len(sure), apart), strict=True))
+    rows: list[RankEstimate] = []
+    for place, i in enumerate(sure):
+        low, high = np.quantile(drawn[i], [ALPHA / 2.0, 1.0 - ALPHA / 2.0])
+        rows.append(
+            RankEstimate(
+                entry=entries[i],
+                score_low=float(low),
+                score_high=float(high),
+                rank_low=1 + sum(worse == place for _, worse in apart),
+                rank_high=len(entries) - sum(better == place for better, _ in apart),
+                ties=letters[i],
+            )
+        )
+    agents = [i for i in sure if not _is_fixed(samples, entries[i])]
+    halves = [
+        float(np.diff(np.quantile(drawn[i] - drawn[j], [ALPHA / 2.0, 1.0 - ALPHA / 2.0]))[0]) / 2.0
+        for i, j in itertools.combinations(agents, 2)
+    ]
+    kinds = {len(sample.runs) > 1 for sample in samples.values() if not sample.is_fixed}
+    over = " or ".join(text for many, text in ((False, "cases"), (True, "runs and cases")) if many in kinds)
+    return Standings(rows=tuple(rows), gap=float(np.median(halves)) if halves else None, over=over)
+
+
+def _or_least(score: float | None) -> float:
+    return -math.inf if score is None else score
+
+
+def _is_fixed(samples: Mapping[tuple[str, str], Sample], entry: str) -> bool:
+    return any(sample.is_fixed for (name, _), sample in samples.items() if name == entry)
+
+
+def _drawn_scores(
+    samples: Mapping[tuple[str, str], Sample],
+    entries: Sequence[str],
+    environments: Sequence[str],
+    resamples: int,
+) -> tuple[Floats, set[str]]:
+    """(entries, resamples) rank scores, NaN without any, and the entries that vary wherever they have played."""
+    total, n_scored = np.zeros((len(entries), resamples)), np.zeros(len(entries))
+    spread = set(entries)
+    for number, env in enumerate(environments):
+        here = [i for i, entry in enumerate(entries) if (entry, env) in samples]
+        drawn = {i: _drawn_mean(samples[entries[i], env], i, number, resamples) for i in here}
+        spread -= {
+            entries[i]
+            for i, found in drawn.items()
+            if found is None and not _known_failure(samples[entries[i], env])
+        }
+        means = np.stack(
+            [
+                _fixed_mean(samples[entries[i], env], resamples) if (found := drawn[i]) is None else found
+                for i in here
+            ]
+        )
+        if len(here) < 2:
+            continue
+        above = np.zeros((len(here), resamples))
+        for row in means:
+            above += row[None, :] > means
+        total[here] += 1.0 - above / (len(here) - 1)
+        n_scored[here] += 1
+    with np.errstate(invalid="ignore"):
+        return total / n_scored[:, None], spread  # fmt: skip
+
+
+def _known_failure(sample: Sample) -> bool:
+    """A single run without an ok submit is the worst there is, and stays it."""
+    return sample.scores is None
+
+
+def _fixed_mean(sample: Sample, resamples: int) -> Floats:
+    value = -math.inf if sample.scores is None else float(np.mean(sample.scores))
+    return np.full(resamples, value)
+
+
+def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats | None:
+    """Resampled means; None where the sample shows no spread, or has no mean."""
+    if sample.scores is None:
+        return None
+    common = matched([sample])
+    seed = 1000 + 97 * entry + 10_007 * env
+    if common is not None:
+        return resampled_means(common.returns[0], resamples, seed, unbiased=True, cases_seed=env)
+    if len(sample.runs) < 2:
+        return None
+    n = len(sample.scores)
+    found: Floats = weights(n, n - 1, resamples, seed) @ np.array(sample.scores) / (n - 1)
+    return found
+
+
+def _told_apart(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
+    """Pairs of places in `sure`, the better first."""
+    places = list(itertools.combinations(range(len(sure)), 2))
+    tails: list[tuple[float, bool]] = []
+    for a, b in places:
+        gap = drawn[sure[a]] - drawn[sure[b]]
+        n_below, n_above = int((gap <= 1e-12).sum()), int((gap >= -1e-12).sum())
+        tails.append((min(1.0, 2.0 * (min(n_below, n_above) + 1) / (len(gap) + 1)), n_below <= n_above))
+    found: set[tuple[int, int]] = set()
+    for (a, b), (_, a_better), p in zip(places, tails, holm([p for p, _ in tails]), strict=True):
+        if p is not None and p <= ALPHA:
+            found.add((a, b) if a_better else (b, a))
+    return found
+
+
+def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
+    """Letters of n entries such that two share one if and only if they are not told apart (Piepho 2004, insert and absorb)."""
+    groups: list[frozenset[int]] = [frozenset(range(n))]
+    for a, b in sorted(apart):
+        split = [
+            part for group in groups for part in ((group - {a}, group - {b}) if {a, b} <= group else (group,))
+        ]
+        distinct = list(dict.fromkeys(split))
+        groups = [group for group in distinct if not any(group < other for other in distinct)]
+        if len(groups) > MAX_GROUPS:
+            return ["…"] * n
+    groups.sort(key=sorted)
+    names = [_letter(i) for i in range(len(groups))]
+    return ["".join(name for name, group in zip(names, groups, strict=True) if i in group) for i in range(n)]
+
+
+def _letter(i: int) -> str:
+    more, last = divmod(i, 26)
+    return string.ascii_lowercase[last] + (str(more) if more else "")
