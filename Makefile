@@ -8,7 +8,7 @@
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-throughput   episodes per second through the coordinator
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
-# make bench-report       a report over 1,024 runs
+# make bench-report bench-coverage       a report over 1,024 runs
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
 # make faults real processes killed, frozen and starved through whole runs; ARGS="--chaos 3600": several at once, at random
 # make sim    the coordinator's core under a simulated network with faults
@@ -19,7 +19,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-channels bench-report bench-isolation faults sim clean
+.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-channels bench-report bench-coverage bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -77,12 +77,16 @@ bench-peers: install
 bench-throughput: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/throughput.py $(ARGS)
 
-# How long a report over 1,024 runs takes, and its memory.
 bench-channels: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channel_bench.py $(ARGS)
 
+# How long a report over 1,024 runs takes, and its memory.
 bench-report: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/report_scale.py $(ARGS)
+
+# How often a report's intervals cover, on simulated entries. Quicker: ARGS=300
+bench-coverage: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/coverage.py $(ARGS)
 
 # What it costs that hidden episodes and agents never share a machine. Smaller: ARGS="--agents 2 --environments toy --parallel 2"
 bench-isolation: install
