@@ -7,6 +7,7 @@
 # make bench-start        what one waits for before anything is played
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-throughput   episodes per second through the coordinator
+# make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards
 # make bench-report bench-coverage       a report over 1,024 runs
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
@@ -19,7 +20,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-channels bench-report bench-coverage bench-isolation faults sim clean
+.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -76,6 +77,10 @@ bench-peers: install
 # Episodes per second through coordinator and Zenoh, beside Dask's no-op tasks.
 bench-throughput: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/throughput.py $(ARGS)
+
+# What the path of a result costs beside its episode. Smaller: make bench-scale ARGS="--envs gym/acrobot --runs 1 --episodes 512"
+bench-scale: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/scale_bench.py $(ARGS)
 
 bench-channels: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channel_bench.py $(ARGS)

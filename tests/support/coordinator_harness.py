@@ -200,7 +200,9 @@ class GatewayClient:
 
     async def open(self) -> gateway.RunOpened:
         return await self.ask.until_answered(
-            "open", gateway.OpenRun(run=self.run, token=self.token, asks_permit=True), gateway.RunOpened
+            "open",
+            gateway.OpenRun(run=self.run, token=self.token, asks_permit=True, reads_rendered=True),
+            gateway.RunOpened,
         )
 
     async def permit(self, boot_id: str, wait_s: float = 0.0) -> gateway.Permit:

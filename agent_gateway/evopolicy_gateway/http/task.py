@@ -32,7 +32,8 @@ def _policy(run: RunOpened) -> str:
     stored = {
         "inline": "in the rows of `trajectory.jsonl`",
         "npy": "in `observations.npy`, one array row a step (`obs` in `trajectory.jsonl` is null)",
-        "npz": "in `observations.npz`, an array for each part of the space (`obs` in `trajectory.jsonl` is null)",
+        "npz": "in `observations.npz`, read with `numpy.load`: the array `observations`, or one for each part of the space, a row a"
+        " step (`obs` in `trajectory.jsonl` is null)",
     }[run.env.obs_storage]
     return f"""## The policy
 

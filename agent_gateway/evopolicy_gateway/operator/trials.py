@@ -20,12 +20,11 @@ from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
-from evopolicy_common.records import bundles
+from evopolicy_common.records import bundles, rendered
 from evopolicy_common.records.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say_json
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.submits.episode_files import trajectory_files
 from evopolicy_gateway.submits.formatting import cut_text
 
 
@@ -194,7 +193,7 @@ async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: O
 
 def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
     target.mkdir()
-    files = {} if packed is None else trajectory_files(packed, None)
+    files = {} if packed is None else rendered.files_of(rendered.decode(packed), None)
     files["stdout.txt"] = cut_text(outcome.stdout)
     files["stderr.txt"] = cut_text(outcome.stderr)
     if outcome.failure is not None:

@@ -75,7 +75,7 @@ class CoordinatorClient:
 
     async def open(self) -> RunOpened:
         """All that is fixed for the run, and its state."""
-        message = OpenRun(run=self._run, token=self._token, asks_permit=True)
+        message = OpenRun(run=self._run, token=self._token, asks_permit=True, reads_rendered=True)
         return await self._ask("open", message, RunOpened)
 
     async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:

@@ -45,13 +45,21 @@ class SubmitTree:
     def put_episode(self, name: str, files: Mapping[str, bytes]) -> None:
         """An episode's folder with its files; shows up whole."""
         episodes = self._partial / "episodes"
-        hidden = episodes / f".{name}"
-        _remove(hidden)
-        _remove(episodes / name)
-        hidden.mkdir()
+        hidden, shown = episodes / f".{name}", episodes / name
+        try:
+            hidden.mkdir()
+        except FileExistsError:
+            _remove(hidden)
+            hidden.mkdir()
+        folder = f"{hidden}/"
         for file_name, data in files.items():
-            _write(hidden / file_name, data)
-        hidden.rename(episodes / name)
+            _write(folder + file_name, data)
+        try:
+            os.rename(hidden, shown)
+        except OSError:
+            # Something stands there: it is removed, never followed.
+            _remove(shown)
+            os.rename(hidden, shown)
 
     def drop_episode(self, name: str) -> None:
         """Takes an episode's folder back; what is not there is no error."""
@@ -69,10 +77,14 @@ class SubmitTree:
         fsync_directory(self._feedback)
 
 
-def _write(path: Path, data: bytes) -> None:
+def _write(path: Path | str, data: bytes) -> None:
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o444)
-    with os.fdopen(fd, "wb") as file:
-        file.write(data)
+    try:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(fd, view) :]
+    finally:
+        os.close(fd)
 
 
 def _remove(path: Path) -> None:

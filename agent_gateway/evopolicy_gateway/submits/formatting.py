@@ -1,23 +1,21 @@
 """Feedback as bytes: pure functions from what happened to what the files hold, the same bytes every time.
 
-JSON has no NaN and no infinities, so they are the texts `"NaN"`, `"Inf"` and `"-Inf"` wherever a number may stand.
-numpy numbers are written in the shortest form that reads back as the same number of their own dtype.
+How values are spelled is `records.json_text`'s.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
-import orjson
 
 from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import NO_POLICY, TIME_LIMITS, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitDone
+from evopolicy_common.records.json_text import json_bytes, plain
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
 
 MAX_TEXT_BYTES = 64 << 10
@@ -54,40 +52,6 @@ def submit_id(index: int, episode_budget: int) -> str:
 def episode_name(global_index: int, episode_budget: int) -> str:
     """`ep_XXX`: counts attempted episodes through the run."""
     return f"ep_{global_index:0{digits(episode_budget)}d}"
-
-
-def json_bytes(value: Any) -> bytes:
-    """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and odd objects as text."""
-    try:
-        data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
-    except orjson.JSONEncodeError:
-        pass
-    else:
-        # orjson writes NaN and infinities as null: without one there was none. Nearly every row ends here.
-        if b"null" not in data:
-            return data
-    plain = _plain(value)
-    try:
-        return orjson.dumps(plain, option=orjson.OPT_SERIALIZE_NUMPY)
-    except orjson.JSONEncodeError:
-        # What a hostile policy can make: lone surrogates, integers of more than 64 bits.
-        return json.dumps(_odd(plain), ensure_ascii=True, separators=(",", ":"), allow_nan=False).encode()
-
-
-def trajectory_row(
-    t: int, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, info: Any
-) -> bytes:
-    """One line of `trajectory.jsonl`; `obs` is None where observations are stored beside it."""
-    row = {
-        "t": t,
-        "obs": obs,
-        "action": action,
-        "reward": reward,
-        "terminated": terminated,
-        "truncated": truncated,
-        "info": info,
-    }
-    return json_bytes(row) + b"\n"
 
 
 def cut_text(data: bytes) -> bytes:
@@ -143,8 +107,8 @@ def summary_bytes(
     observations: ObservationForm = "arrays",
 ) -> bytes:
     """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order."""
-    plain = _plain(msgspec.to_builtins(_summary(env, submit_index, done, scores, observations)))
-    return msgspec.json.format(msgspec.json.encode(plain), indent=2) + b"\n"
+    told = plain(msgspec.to_builtins(_summary(env, submit_index, done, scores, observations)))
+    return msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n"
 
 
 def _summary(
@@ -252,61 +216,3 @@ def _fitting(line: dict[str, Any]) -> bytes:
                 f"[cut] {text[len(text) - keep :]}" if field == "traceback" else f"{text[:keep]} [cut]"
             )
     return json_bytes(line) + b"\n"
-
-
-def _plain(value: Any) -> Any:
-    """`value` with every number that JSON cannot say as text; arrays stay arrays where all of them are finite."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else _name(value)
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, np.ndarray):
-        return _plain_array(value)
-    if isinstance(value, np.generic):
-        return _plain_scalar(value)
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, bytes | bytearray | memoryview):
-        return bytes(value).decode("utf-8", "backslashreplace")
-    return str(value)
-
-
-def _plain_array(array: np.ndarray[Any, Any]) -> Any:
-    if array.ndim == 0:
-        return _plain(array[()])
-    if array.dtype.kind == "f":
-        if array.dtype.itemsize > 8:
-            array = array.astype(np.float64)
-        if np.isfinite(array).all():
-            return np.ascontiguousarray(array)
-        return [_plain(item) for item in array]
-    if array.dtype.kind in "iub":
-        return np.ascontiguousarray(array)
-    return [_plain(item) for item in array.tolist()]
-
-
-def _plain_scalar(value: np.generic) -> Any:
-    if isinstance(value, np.floating):
-        if not np.isfinite(value):
-            return _name(float(value))
-        return float(value) if value.dtype.itemsize > 8 else value
-    return _plain(value.item())
-
-
-def _name(value: float) -> str:
-    if math.isnan(value):
-        return "NaN"
-    return "Inf" if value > 0 else "-Inf"
-
-
-def _odd(value: Any) -> Any:
-    """For the standard library's encoder: numpy as lists."""
-    if isinstance(value, dict):
-        return {key: _odd(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_odd(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
-    return value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -121,6 +122,7 @@ class AtWork:
             )
             if key and index.isdecimal():
                 self.died_over.append((key, int(index)))
+        self._lock = threading.Lock()
         self._free: list[int] = []
         self._n_records = 0
 
@@ -130,11 +132,12 @@ class AtWork:
 
     @contextlib.contextmanager
     def on(self, key: str, index: int) -> Iterator[None]:
-        """While inside, the episode is being worked on. To be entered and left on one thread."""
-        if not self._free:
-            self._free.append(self._n_records * self._RECORD)
-            self._n_records += 1
-        at = self._free.pop()
+        """While inside, the episode is being worked on. For several threads."""
+        with self._lock:
+            if not self._free:
+                self._free.append(self._n_records * self._RECORD)
+                self._n_records += 1
+            at = self._free.pop()
         record = f"{key} {index}".encode()[: self._RECORD]
         os.pwrite(self._fd, record.ljust(self._RECORD, b"\0"), at)
         try:

@@ -15,6 +15,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import structlog
@@ -65,6 +66,22 @@ RUN_CLOSED = "run_closed"
 MAX_DEATHS = 2
 """So often a gateway may end over one submit, or over the files of one episode, before that is put aside."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
+
+
+class _Fetched(NamedTuple):
+    """An episode, and the bytes that its files are made of."""
+
+    episode: EpisodeFeedback
+    trajectory: bytes = b""
+    video: bytes | None = None
+    why: str = ""
+    """Why there are no bytes."""
+
+
+def _is_whole(episode: EpisodeFeedback) -> bool:
+    """Whether its bytes have come with it."""
+    refs = (episode.trajectory, episode.video)
+    return all(ref is None or ref.inline is not None for ref in refs)
 
 
 class SubmitPipeline:
@@ -426,49 +443,75 @@ class SubmitPipeline:
         wanted = [episode for episode in page.episodes if episode.index not in scores]
         # What a gateway has ended over is written alone, so that no other episode is blamed for it.
         suspects = [episode for episode in wanted if self._deaths[key, episode.index]]
+        # Those that have come with the page are written by one call of the thread; the others as their bytes come.
+        whole = [episode for episode in wanted if _is_whole(episode) and episode not in suspects]
+        others = [episode for episode in wanted if not _is_whole(episode) and episode not in suspects]
 
-        async def write(episode: EpisodeFeedback) -> None:
+        async def write(episodes: list[EpisodeFeedback]) -> None:
             async with gate:
-                files = await self._files_of(key, episode)
-                name = formatting.episode_name(first + episode.index, self.run.episode_budget)
-                await asyncio.to_thread(tree.put_episode, name, files)
-                scores[episode.index] = EpisodeScore(
-                    index=episode.index,
-                    episode_return=episode.episode_return,
-                    length=episode.length,
-                    failure=episode.failure,
-                    reward_components=episode.reward_components,
-                )
+                fetched = [await self._fetched(key, episode) for episode in episodes]
+                await asyncio.to_thread(self._put, tree, key, first, fetched)
+                for episode in episodes:
+                    scores[episode.index] = EpisodeScore(
+                        index=episode.index,
+                        episode_return=episode.episode_return,
+                        length=episode.length,
+                        failure=episode.failure,
+                        reward_components=episode.reward_components,
+                    )
 
         # All have ended before an error is raised: nothing may write on into a tree that is begun again.
-        writes = [write(episode) for episode in wanted if episode not in suspects]
+        writes = [write(whole), *(write([episode]) for episode in others)]
         for outcome in await asyncio.gather(*writes, return_exceptions=True):
             if isinstance(outcome, BaseException):
                 raise outcome
         for episode in suspects:
-            await write(episode)
+            await write([episode])
 
-    async def _files_of(self, key: str, episode: EpisodeFeedback) -> dict[str, bytes]:
-        """An episode's files; without its trajectory where that cannot be had, or a gateway has ended over it before."""
-        why = f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
-        if self._deaths[key, episode.index] < MAX_DEATHS:
+    async def _fetched(self, key: str, episode: EpisodeFeedback) -> _Fetched:
+        """An episode with its bytes; without them where they cannot be had, or a gateway has ended over it before."""
+        if self._deaths[key, episode.index] >= MAX_DEATHS:
+            why = f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
+            return _Fetched(episode, why=why)
+        try:
+            trajectory = await self._client.fetch(episode.trajectory)
+            video = None if episode.video is None else await self._client.fetch(episode.video)
+        except RefusedError as error:
+            if error.status != Refusal.UNKNOWN_BLOB:
+                raise
+            return _Fetched(episode, why="this episode's trajectory or video is not stored any more")
+        except ProtocolError as error:
+            log.error(
+                "an episode's bytes are not what they should be",
+                submit=key,
+                index=episode.index,
+                exc_info=error,
+            )
+            return _Fetched(episode, why="this episode's trajectory cannot be written")
+        return _Fetched(episode, trajectory, video)
+
+    def _put(self, tree: SubmitTree, key: str, first: int, fetched: list[_Fetched]) -> None:
+        """Writes episodes' folders, one after another."""
+        for each in fetched:
+            name = formatting.episode_name(first + each.episode.index, self.run.episode_budget)
+            tree.put_episode(name, self._files_of(key, each))
+
+    def _files_of(self, key: str, fetched: _Fetched) -> dict[str, bytes]:
+        """An episode's files; without its trajectory where there is none, or none of its length and return."""
+        episode, at = fetched.episode, self._clock()
+        why = fetched.why
+        if not why:
+            storage = self.run.env.obs_storage
             try:
-                trajectory = await self._client.fetch(episode.trajectory)
-                video = None if episode.video is None else await self._client.fetch(episode.video)
-                storage, at = self.run.env.obs_storage, self._clock()
                 with self._journal.at_work.on(key, episode.index):
-                    return await asyncio.to_thread(episode_files, episode, trajectory, video, storage, at=at)
-            except RefusedError as error:
-                if error.status != Refusal.UNKNOWN_BLOB:
-                    raise
-                why = "this episode's trajectory or video is not stored any more"
+                    return episode_files(episode, fetched.trajectory, fetched.video, storage, at=at)
             except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
                 log.error(
                     "an episode's files cannot be made", submit=key, index=episode.index, exc_info=error
                 )
                 why = "this episode's trajectory cannot be written"
         log.error("episode put aside", submit=key, index=episode.index, why=why)
-        return set_aside_files(episode, why, at=self._clock())
+        return set_aside_files(episode, why, at=at)
 
     def _commit(
         self, tree: SubmitTree, index: int, done: SubmitDone, scores: dict[int, EpisodeScore]

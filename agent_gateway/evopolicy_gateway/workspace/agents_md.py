@@ -185,7 +185,7 @@ head -n 2 feedback/$first_submit/episodes/$first_episode/trajectory.jsonl
 | `summary.json` | status, returns, lengths, failed episodes; the same as the answer's `summary` |
 | `errors.txt` | why a submit is not `ok`, JSON lines |
 | `episodes/ep_*/trajectory.jsonl` | a line a step: `t, obs, action, reward, terminated, truncated, info` |
-| `episodes/ep_*/observations.npy`, `.npz` | observations that are pictures; `obs` is null then |
+| `episodes/ep_*/observations.npz` (runs on older workers: `.npy`) | observations that are pictures, read with `numpy.load`: the array `observations`, or one for each part of the space; `obs` is null then |
 | `episodes/ep_*/stdout.txt`, `stderr.txt` | what the policy printed |
 | `episodes/ep_*/error.txt` | step, category and traceback where the policy failed |
 | `episodes/ep_*/video.mp4` | a frame a step, where this run records videos |

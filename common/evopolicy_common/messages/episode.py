@@ -122,6 +122,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     """Handed to `Policy.__init__` without the spaces, which the worker adds."""
     observations: ObservationForm = "arrays"
     record: Record = "full"
+    render: bool = False
+    """With record "full": report the feedback files themselves (`records.rendered`), which their reader only unpacks."""
     video: bool = False
     """Also record a video of each episode (a rendered frame a row)."""
     video_episodes: Int = 0
@@ -163,7 +165,8 @@ class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
     reward_components: Named[Number] = {}
     """Per-episode sum of each of the environment's reward components."""
     trajectory: BlobRef | None = None
-    """`trajectory` codec bytes: the whole episode, or with record `actions` the action log."""
+    """`trajectory` codec bytes: the whole episode, or with record `actions` the action log. Of a job with `render` those of
+    `rendered`; workers of earlier versions do not know that."""
     video: BlobRef | None = None
     """MP4 bytes."""
     stdout: Bytes = b""

@@ -51,6 +51,8 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     """The run's capability; sent with every request and checked on each."""
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Without it the agent may be on any machine already."""
+    reads_rendered: bool = False
+    """The gateway reads episodes that workers have rendered (`records.rendered`); those of earlier versions do not."""
 
 
 class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):

@@ -75,7 +75,7 @@ class Pictures:
         self._stream = zstandard.ZstdCompressor(level=1).compressobj()
         self._pieces: list[bytes] = []
 
-    def add(self, picture: Any) -> bool:
+    def add(self, picture: Any, /) -> bool:
         """Take one more; False, and nothing is changed, when it is not like the first."""
         if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
             return False
@@ -251,7 +251,7 @@ def join(columns: list[Column]) -> Column:
 # Values that msgpack has no form for.
 
 
-def most_of(compressed: bytes) -> int:
+def most_of(compressed: bytes | memoryview) -> int:
     """The most bytes that a zstd frame can hold, whatever it claims: what it claims is allocated at once."""
     return (len(compressed) // _ZSTD_LEAST_BYTES + 1) * _ZSTD_BLOCK_BYTES
 

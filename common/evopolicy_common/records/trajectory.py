@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import Record
 from evopolicy_common.records import columns
+from evopolicy_common.records.json_text import as_lists
 
 MAGIC = b"evotraj1"
 BLOCK_BYTES = 4 << 20
@@ -44,7 +45,8 @@ _UNCOUNTED_BYTES = 4 << 20
 """The first blocks, up to so many bytes, are decoded without a count of their values."""
 
 _LENGTH = struct.Struct("<I")
-_TERMINATED, _TRUNCATED = 1, 2
+TERMINATED, TRUNCATED = 1, 2
+"""Flags of a row."""
 _QUICK_BYTES = 256 << 10
 """Blocks above this are compressed at level 1: pictures, for which speed matters more."""
 
@@ -84,6 +86,9 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
     infos: list[dict[str, Any]]
     obs_at: Callable[[int], Any]
     """The observation of one step, as `Row.obs`."""
+    files: dict[str, bytes] = {}
+    """Of an episode that was rendered where it was played (`records.rendered`): its feedback files, which alone hold the
+    observations and infos of its steps then."""
 
     def rows(self) -> Iterator[Row]:
         """The steps in order."""
@@ -102,6 +107,12 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
+class PictureSink(Protocol):
+    """Takes large arrays one by one."""
+
+    def add(self, picture: Any, /) -> bool: ...
+
+
 class Recorder:
     """Takes an episode's steps one by one and packs them. Not thread-safe."""
 
@@ -111,7 +122,7 @@ class Recorder:
         self._parts: list[bytes] = [MAGIC, _LENGTH.pack(len(header)), header]
         self._block_rows = 0
         self._n_packed = 0
-        self._pictures: columns.Pictures | None = None
+        self._pictures: PictureSink | None = None
         self._clear()
 
     def append(
@@ -134,7 +145,7 @@ class Recorder:
             self._block_rows = BLOCK_ROWS
         self._actions.append(action)
         self._rewards.append(reward)
-        self._flags.append((terminated and _TERMINATED) | (truncated and _TRUNCATED))
+        self._flags.append((terminated and TERMINATED) | (truncated and TRUNCATED))
         if len(self._rewards) >= self._block_rows:
             self._flush()
 
@@ -145,7 +156,7 @@ class Recorder:
         return b"".join([*self._parts, _LENGTH.pack(0)])
 
     def _begin_block(self, obs: Any) -> None:
-        """Decided by the block's first row alone, so that equal rows give equal bytes."""
+        """What the next block is. Decided by the block's first row alone, so that equal rows give equal bytes."""
         size = max(1, _size(obs))
         is_picture = isinstance(obs, np.ndarray) and size >= PICTURE_BYTES
         self._pictures = columns.Pictures(obs) if is_picture else None
@@ -162,12 +173,18 @@ class Recorder:
         self._infos: list[dict[str, Any]] = []
 
     def _flush(self) -> None:
+        infos = self._infos if any(self._infos) else len(self._infos)
+        self._add_block(self._pack_observations() if self._full else None, infos)
+        self._clear()
+
+    def _add_block(self, obs: list[Any] | None, infos: list[dict[str, Any]] | int) -> bytes:
+        """The block of the rows so far as it was packed, before compression."""
         block = {
-            "obs": self._pack_observations() if self._full else None,
+            "obs": obs,
             "actions": columns.pack(self._actions),
             "rewards": np.array(self._rewards, dtype="<f8").tobytes(),
             "flags": bytes(self._flags),
-            "infos": self._infos if any(self._infos) else len(self._infos),
+            "infos": infos,
         }
         packed = columns.encode(block)
         self._n_packed += len(self._rewards)
@@ -179,10 +196,14 @@ class Recorder:
         level = 1 if len(packed) > _QUICK_BYTES else 3
         compressed = zstandard.ZstdCompressor(level=level).compress(packed)
         self._parts += [_LENGTH.pack(len(compressed)), compressed]
-        self._clear()
+        return packed
 
     def _pack_observations(self) -> list[Any]:
-        return columns.pack(self._obs) if self._pictures is None else self._pictures.packed()
+        return (
+            self._pictures.packed()
+            if isinstance(self._pictures, columns.Pictures)
+            else columns.pack(self._obs)
+        )
 
 
 def decode(data: bytes) -> Trajectory:
@@ -221,7 +242,7 @@ def _decode(data: bytes) -> Trajectory:
     rewards = np.frombuffer(b"".join(block.rewards for block in blocks), dtype="<f8").astype(np.float64)
     infos = [info for block in blocks for info in block.infos]
     n = len(rewards)
-    form = _as_lists if lists else _same
+    form = as_lists if lists else _same
 
     def obs_at(t: int) -> Any:
         return None if observed is None else form(observed.row(t))
@@ -233,8 +254,8 @@ def _decode(data: bytes) -> Trajectory:
         obs=None if observed is None else observed.values(),
         actions=acted.array if isinstance(acted, columns.Arrays) and not acted.scalar else acted.rows(),
         rewards=rewards,
-        terminated=(flags & _TERMINATED) != 0,
-        truncated=(flags & _TRUNCATED) != 0,
+        terminated=(flags & TERMINATED) != 0,
+        truncated=(flags & TRUNCATED) != 0,
         infos=infos,
         obs_at=obs_at,
     )
@@ -318,15 +339,4 @@ def _size(obs: Any) -> int:
 
 
 def _same(value: Any) -> Any:
-    return value
-
-
-def _as_lists(value: Any) -> Any:
-    """What a policy that asked for lists received."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {key: _as_lists(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_as_lists(item) for item in value]
     return value

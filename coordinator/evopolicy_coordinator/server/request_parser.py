@@ -239,6 +239,15 @@ class RequestParser:
 
     # Gateways.
 
+    def _checked_open(self, m: gateway.OpenRun) -> gateway.OpenRun:
+        if not m.reads_rendered:
+            raise RefusedError(
+                Refusal.WRONG_PROTOCOL,
+                "this gateway is of an earlier version, which cannot read what workers report now: install the coordinator's"
+                " version of evopolicy on the agent's host",
+            )
+        return m
+
     def _checked_permit(self, m: gateway.RequestPermit) -> gateway.RequestPermit:
         check_place(m.boot_id, m.machine_id, m.host)
         return m
@@ -458,7 +467,7 @@ _CHECKS: dict[type[Message], Callable[[RequestParser, Any], Message]] = {
     worker.LeaseRequest: RequestParser._as_it_is,
     worker.Heartbeat: RequestParser._as_it_is,
     worker.ReportResults: RequestParser._checked_results,
-    gateway.OpenRun: RequestParser._as_it_is,
+    gateway.OpenRun: RequestParser._checked_open,
     gateway.StateRequest: RequestParser._as_it_is,
     gateway.RequestPermit: RequestParser._checked_permit,
     gateway.Submit: RequestParser._checked_submit,

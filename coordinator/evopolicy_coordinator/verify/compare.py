@@ -10,6 +10,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Iterable
@@ -18,8 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.columns import leaves
+from evopolicy_common.records.rendered import OBSERVATIONS, ROWS, SINGLE, files_of
 from evopolicy_common.records.trajectory import Recorder, Trajectory
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
@@ -50,9 +53,12 @@ def episode_difference(
 def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
     """Where two trajectories part, as `step 3: reward 1.0 and 2.0`; None when they never do.
 
-    Observations and infos are compared only where both have them.
+    Observations and infos are compared only where both have them; as they are spelled in feedback files where one of the two
+    has been rendered as such. A number of one dtype is spelled in one way.
     """
-    full = recorded.record == "full" and replayed.record == "full"
+    whole = recorded.record == "full" and replayed.record == "full"
+    rendered = bool(recorded.files or replayed.files)
+    full = whole and not rendered
     for t in range(min(recorded.n, replayed.n)):
         for what, ours, theirs in (
             ("reward", float(recorded.rewards[t]), float(replayed.rewards[t])),
@@ -67,7 +73,34 @@ def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
             return f"step {t}: the infos differ"
     if recorded.n != replayed.n:
         return f"{recorded.n} and {replayed.n} steps"
-    return None
+    return _rendered_difference(recorded, replayed) if whole and rendered else None
+
+
+def _rendered_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
+    """Where observations or infos part, of which at least one has been rendered."""
+    storage: ObsStorage = "inline"
+    if OBSERVATIONS in recorded.files or OBSERVATIONS in replayed.files:
+        storage = "npz"
+    ours, theirs = (files_of(episode, storage) for episode in (recorded, replayed))
+    if ours == theirs:
+        return None
+    lines = zip(ours[ROWS].splitlines(), theirs[ROWS].splitlines(), strict=True)
+    for t, (one, other) in enumerate(lines):
+        if one != other:
+            left, right = json.loads(one), json.loads(other)
+            if not same(left["obs"], right["obs"]):
+                return f"step {t}: the observations differ"
+            if not same(*_comparable(left["info"], right["info"])):
+                return f"step {t}: the infos differ"
+    found, expected = (_arrays(files.get(OBSERVATIONS)) for files in (ours, theirs))
+    return "the observations differ" if not same(found, expected) else None
+
+
+def _arrays(file: bytes | None) -> dict[str, Any]:
+    if file is None:
+        return {}
+    with np.load(io.BytesIO(file), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
@@ -125,6 +158,8 @@ def files_difference(
 
     `rows` are those of its `trajectory.jsonl`; `actions`: whether `episode` has the very actions that were returned.
     """
+    if episode.files:
+        return _written_difference(folder, rows, episode, actions=actions)
     for t, (told, row) in enumerate(zip(rows, episode.rows(), strict=False)):
         pairs: list[tuple[str, Any]] = [
             ("t", row.t),
@@ -145,6 +180,32 @@ def files_difference(
     if len(rows) != episode.n:
         return f"{len(rows)} and {episode.n} steps"
     return _pictures_difference(folder, rows, episode)
+
+
+def _written_difference(
+    folder: Path, rows: list[dict[str, Any]], episode: Trajectory, *, actions: bool
+) -> str | None:
+    """`files_difference` of an episode that was rendered: its files by their bytes, then by what they say."""
+    lines = episode.files[ROWS].splitlines()
+    if (folder / ROWS).read_bytes() != episode.files[ROWS]:
+        for t, (told, line) in enumerate(zip(rows, lines, strict=False)):
+            ours = json.loads(line)
+            for name in ("t", "reward", "terminated", "truncated", *(("action",) if actions else ()), "obs"):
+                if not same(told.get(name), ours[name]):
+                    return f"step {t}: {name} differs"
+            if not same(*_comparable(told.get("info") or {}, ours["info"])):
+                return f"step {t}: info differs"
+    if len(rows) != len(lines):
+        return f"{len(rows)} and {len(lines)} steps"
+    stored, expected = folder / OBSERVATIONS, episode.files.get(OBSERVATIONS)
+    if expected is None:
+        return None
+    if not stored.exists():
+        return "there is no file of observations"
+    data = stored.read_bytes()
+    if data != expected and not same(_arrays(data), _arrays(expected)):
+        return f"{OBSERVATIONS} differs"
+    return None
 
 
 def reads_as(told: Any, value: Any) -> bool:
@@ -205,6 +266,8 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
     else:
         with stored:
             found = {name: stored[name] for name in stored.files}
+    if list(columns) == [""] and list(found) == [SINGLE]:
+        found = {"": found[SINGLE]}
     if found.keys() != columns.keys():
         return f"{path.name}: holds other columns"
     for name, leaf in columns.items():

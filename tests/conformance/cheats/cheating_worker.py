@@ -7,6 +7,7 @@ same fingerprint, whatever is edited meanwhile.
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Callable
@@ -16,7 +17,8 @@ import msgspec
 
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_common.records.trajectory import Recorder, decode
+from evopolicy_common.records.rendered import ROWS, Renderer, decode
+from evopolicy_common.records.trajectory import Recorder
 from evopolicy_common.wire import codec
 from evopolicy_worker import cli
 from evopolicy_worker.fingerprint import fingerprint
@@ -32,11 +34,15 @@ def forge_rewards(outcome: EpisodeOutcome) -> EpisodeOutcome:
     assert ref is not None
     assert ref.inline is not None
     played = decode(ref.inline)
-    recorder = Recorder(played.record, played.observations)
+    rows = [json.loads(line) for line in played.files.get(ROWS, b"").splitlines()]
+    recorder = (
+        Renderer(played.observations, "inline") if rows else Recorder(played.record, played.observations)
+    )
     total = 0.0
     for row in played.rows():
         reward = row.reward + BONUS
-        recorder.append(row.obs, row.action, reward, row.terminated, row.truncated, row.info)
+        obs, info = (rows[row.t]["obs"], rows[row.t]["info"]) if rows else (row.obs, row.info)
+        recorder.append(obs, row.action, reward, row.terminated, row.truncated, info)
         total += reward
     data = recorder.finish()
     forged = BlobRef(digest=digest_of(data), size=len(data), inline=data)

@@ -12,8 +12,7 @@ import pytest
 
 from evopolicy_common.catalogue import entries, entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
-from evopolicy_common.records.trajectory import Recorder
-from evopolicy_gateway.submits.episode_files import trajectory_files
+from evopolicy_common.records.rendered import Renderer, decode
 from evopolicy_worker.environments import Environment, offered
 from evopolicy_worker.environments.spaces import bounds
 
@@ -54,7 +53,7 @@ def test_a_description_says_what_the_catalogue_says(env_id: str, warm: Warm) -> 
 def test_a_steps_feedback_takes_about_what_the_catalogue_says(env_id: str, warm: Warm) -> None:
     environment = warm(env_id)
     rng = np.random.default_rng(0)
-    recorder = Recorder()
+    recorder = Renderer("arrays", environment.description.obs_storage)
     n, most = 0, 100
     for seed in range(most):
         obs, ended = environment.reset(Case(seed=seed)), False
@@ -64,7 +63,7 @@ def test_a_steps_feedback_takes_about_what_the_catalogue_says(env_id: str, warm:
             ended = step.terminated or step.truncated
             recorder.append(obs, action, step.reward, step.terminated, step.truncated, step.info)
             obs, n = step.obs, n + 1
-    files = trajectory_files(recorder.finish(), environment.description.obs_storage)
+    files = decode(recorder.finish()).files
     assert sum(map(len, files.values())) / n == pytest.approx(entry(env_id).step_bytes, rel=0.25)
 
 

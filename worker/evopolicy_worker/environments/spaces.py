@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evopolicy_common.messages.environment import ObsStorage, SpaceSchema
+from evopolicy_common.records.rendered import MIN_PICTURE_SIDE, is_picture
 
 if TYPE_CHECKING:
     import gymnasium
@@ -29,8 +30,6 @@ VARYING = ("Sequence", "Graph", "OneOf")
 """Spaces whose values differ in form."""
 USUAL_CHARACTERS = frozenset(string.ascii_letters + string.digits)
 """Of which Text is made unless it tells `characters`."""
-MIN_IMAGE_SIDE = 16
-"""A uint8 height × width × {1, 3} array is a picture from this side on; smaller ones are symbolic grids."""
 
 
 def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
@@ -89,9 +88,9 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
 
 def obs_storage(schema: SpaceSchema) -> ObsStorage:
     """Where feedback keeps observations of this space: in the rows, or beside them when they are large or hold a picture."""
-    if varies(schema) or (not _has_image(schema) and _bytes(schema) <= MAX_INLINE_BYTES):
+    if varies(schema) or not (_has_image(schema) or _bytes(schema) > MAX_INLINE_BYTES):
         return "inline"
-    return "npz" if parts(schema) else "npy"
+    return "npz"
 
 
 def varies(schema: SpaceSchema) -> bool:
@@ -170,7 +169,9 @@ def _array_outside(value: NDArray[Any], schema: SpaceSchema) -> str:
 
 
 def _has_image(schema: SpaceSchema) -> bool:
-    return schema["type"] == "Image" or any(_has_image(part) for part in parts(schema))
+    if schema["type"] in ("Box", "Image"):
+        return schema["type"] == "Image" or is_picture(tuple(schema["shape"]), schema["dtype"])
+    return any(_has_image(part) for part in parts(schema))
 
 
 def _bytes(schema: SpaceSchema) -> int:
@@ -186,7 +187,7 @@ def _bytes(schema: SpaceSchema) -> int:
 
 def _box(shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[Any]) -> SpaceSchema:
     name = np.dtype(dtype).name
-    if name == "uint8" and len(shape) == 3 and min(shape[:2]) >= MIN_IMAGE_SIDE and shape[2] in (1, 3):
+    if name == "uint8" and len(shape) == 3 and min(shape[:2]) >= MIN_PICTURE_SIDE and shape[2] in (1, 3):
         return {
             "type": "Image",
             "shape": list(shape),

@@ -45,6 +45,7 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.rendered import Renderer
 from evopolicy_common.records.trajectory import Recorder, decode
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
@@ -380,7 +381,11 @@ class _Episode:
                 policy_cpu_s=ended.cpu_s,
                 wall_s=time.monotonic() - start,
             )
-        recorder = Recorder(job.record, job.observations)
+        recorder = (
+            Renderer(job.observations, self._environment.description.obs_storage)
+            if job.render and job.record == "full"
+            else Recorder(job.record, job.observations)
+        )
         films = job.video and (not job.video_episodes or k < job.video_episodes)
         played = Recorder("actions") if films else None
         total, components, length, terminated, truncated = self._steps(policy, recorder, played)

@@ -49,6 +49,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         },
         observations=template.observations,
         record=template.record,
+        render=job.group.kind == "train",
         video=video,
         video_episodes=1 if template.video == "first" else 0,
         tier=template.tier,

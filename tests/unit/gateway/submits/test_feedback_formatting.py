@@ -12,22 +12,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common.messages.environment import ObservationForm
+from evopolicy_common.messages.environment import ObservationForm, ObsStorage
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure
 from evopolicy_common.messages.gateway import EpisodeFeedback, SubmitDone
+from evopolicy_common.records.json_text import json_bytes
+from evopolicy_common.records.rendered import decode, files_of
 from evopolicy_common.records.summary import decode_summary
 from evopolicy_common.records.trajectory import Recorder
-from evopolicy_gateway.submits.episode_files import episode_files, trajectory_files
+from evopolicy_gateway.submits.episode_files import episode_files
 from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,
     EpisodeScore,
     episode_name,
     failure_line,
-    json_bytes,
     submit_id,
     summary_bytes,
     verdict_line,
 )
+
+
+def trajectory_files(packed: bytes, storage: ObsStorage | None) -> dict[str, bytes]:
+    return files_of(decode(packed), storage)
 
 
 def done(n: int, status: Any = "ok", **fields: Any) -> SubmitDone:
@@ -216,11 +221,11 @@ def packed(observations: list[Any], actions: list[Any] | None = None, form: Any 
 
 def test_rows_observations_and_steps_agree_for_pictures() -> None:
     frames = [np.full((4, 5, 3), t, dtype=np.uint8) for t in range(3)]
-    files = trajectory_files(packed(frames), "npy")
+    files = trajectory_files(packed(frames), "npz")
     rows = [json.loads(line) for line in files["trajectory.jsonl"].splitlines()]
     assert [row["obs"] for row in rows] == [None] * 3
-    stored = np.load(io.BytesIO(files["observations.npy"]), allow_pickle=False)
-    np.testing.assert_array_equal(stored, np.stack(frames))
+    stored = np.load(io.BytesIO(files["observations.npz"]), allow_pickle=False)
+    np.testing.assert_array_equal(stored["observations"], np.stack(frames))
 
 
 def test_dicts_with_pictures_are_stored_by_part() -> None:

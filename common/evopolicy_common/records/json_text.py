@@ -1,0 +1,146 @@
+"""Values as JSON, the same bytes every time.
+
+JSON has no NaN and no infinities, so they are the texts `"NaN"`, `"Inf"` and `"-Inf"` wherever a number may stand.
+numpy numbers are written in the shortest form that reads back as the same number of their own dtype.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+
+
+def json_bytes(value: Any) -> bytes:
+    """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and odd objects as text."""
+    try:
+        data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        pass
+    else:
+        # orjson writes NaN and infinities as null: without one there was none. Nearly every row ends here.
+        if b"null" not in data:
+            return data
+    told = plain(value)
+    try:
+        return orjson.dumps(told, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        # What a hostile policy can make: lone surrogates, integers of more than 64 bits.
+        return json.dumps(_odd(told), ensure_ascii=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def plain(value: Any) -> Any:
+    """`value` with every number that JSON cannot say as text; arrays stay arrays where all of them are finite."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else _name(value)
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, np.ndarray):
+        return _plain_array(value)
+    if isinstance(value, np.generic):
+        return _plain_scalar(value)
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return bytes(value).decode("utf-8", "backslashreplace")
+    return str(value)
+
+
+def _plain_array(array: np.ndarray[Any, Any]) -> Any:
+    if array.ndim == 0:
+        return plain(array[()])
+    if array.dtype.kind == "f":
+        if array.dtype.itemsize > 8:
+            array = array.astype(np.float64)
+        if np.isfinite(array).all():
+            return np.ascontiguousarray(array)
+        return [plain(item) for item in array]
+    if array.dtype.kind in "iub":
+        return np.ascontiguousarray(array)
+    return [plain(item) for item in array.tolist()]
+
+
+def _plain_scalar(value: np.generic) -> Any:
+    if isinstance(value, np.floating):
+        if not np.isfinite(value):
+            return _name(float(value))
+        return float(value) if value.dtype.itemsize > 8 else value
+    return plain(value.item())
+
+
+def _name(value: float) -> str:
+    if math.isnan(value):
+        return "NaN"
+    return "Inf" if value > 0 else "-Inf"
+
+
+def _odd(value: Any) -> Any:
+    """For the standard library's encoder: numpy as lists."""
+    if isinstance(value, dict):
+        return {key: _odd(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_odd(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
+    return value
+
+
+# ---- rows ----
+
+_BETWEEN = b'},{"t":'
+
+
+def rows_text(
+    first: int,
+    obs: Sequence[Any] | None,
+    actions: Iterable[Any],
+    rewards: Iterable[float],
+    terminated: Iterable[bool],
+    truncated: Iterable[bool],
+    infos: Iterable[Any],
+) -> bytes:
+    """Lines of `trajectory.jsonl` from step `first` on: the same bytes as `json_bytes` makes of each, in one go.
+
+    `obs` None: they are stored beside it.
+    """
+    columns = (itertools.repeat(None) if obs is None else obs, actions, rewards, terminated, truncated, infos)
+    rows = [
+        {
+            "t": t,
+            "obs": received,
+            "action": action,
+            "reward": reward,
+            "terminated": ended,
+            "truncated": cut,
+            "info": info,
+        }
+        for t, (received, action, reward, ended, cut, info) in enumerate(zip(*columns, strict=False), first)
+    ]
+    try:
+        text = orjson.dumps(rows, option=orjson.OPT_SERIALIZE_NUMPY)
+    except orjson.JSONEncodeError:
+        text = b""
+    # What looks like the border of two rows may be a policy's text: then there are more of them than borders. The same
+    # goes for null, which stands for NaN too.
+    nulls = len(rows) if obs is None else 0
+    if text and text.count(_BETWEEN) == len(rows) - 1 and text.count(b"null") == nulls:
+        return text[1:-1].replace(_BETWEEN, b'}\n{"t":') + b"\n"
+    return b"".join([json_bytes(row) + b"\n" for row in rows])
+
+
+def as_lists(value: Any) -> Any:
+    """What a policy that asked for lists received."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: as_lists(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [as_lists(item) for item in value]
+    return value

@@ -1,0 +1,137 @@
+"""`.npz` files that are written as their arrays' rows come, which `numpy.load` reads.
+
+Rules that this module owns:
+- Rows are compressed at once; an array is never in memory as a whole. The same rows give the same bytes with one zlib.
+- A member's header tells how many rows there are, which is known at the end only: it is a compressed block of its own, put
+  before the others.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy_common.errors import ProtocolError
+
+LEVEL = 1
+"""Of zlib. Of CarRacing's pictures 1,870 bytes a frame remain of 27,648; level 6 makes it 1,160 and takes 2.6 times as long."""
+MAX_BYTES = (1 << 32) - (1 << 20)
+"""Of a member, unpacked, and of the file: no larger one is made, so that no reader needs ZIP64."""
+
+_LOCAL = struct.Struct("<4sHHHHHLLLHH")
+_CENTRAL = struct.Struct("<4sHHHHHHLLLHHHHHLL")
+_END = struct.Struct("<4sHHHHLLH")
+_VERSION, _UTF8, _DEFLATED, _DAY = 20, 0x800, 8, 0x21
+"""Dated 1980-01-01 whatever the clock says."""
+
+
+class NpzWriter:
+    """One file. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._members: dict[str, _Member] = {}
+        self._texts: dict[str, list[Any]] = {}
+
+    def add(self, name: str, rows: NDArray[Any] | list[Any]) -> None:
+        """More rows of an array, n × its shape, or of texts. ProtocolError where they are not like those before."""
+        if isinstance(rows, list):
+            self._texts.setdefault(name, []).extend(rows)
+            return
+        member = self._members.get(name)
+        if member is None:
+            member = self._members[name] = _Member(rows.dtype, rows.shape[1:])
+        member.add(rows)
+
+    def finish(self) -> bytes:
+        """The file's bytes. The writer is not used afterwards."""
+        for name, texts in self._texts.items():
+            kind = np.str_ if all(isinstance(text, str) for text in texts) else None
+            self.add(name, np.array(texts, dtype=kind))
+        body, directory = bytearray(), bytearray()
+        for name, member in self._members.items():
+            told = f"{name}.npy".encode("utf-8", "backslashreplace")
+            crc, size, packed = member.finish()
+            place = (_UTF8, _DEFLATED, 0, _DAY, crc, len(packed), size, len(told), 0)
+            directory += _CENTRAL.pack(b"PK\1\2", _VERSION, _VERSION, *place, 0, 0, 0, 0, len(body)) + told
+            body += _LOCAL.pack(b"PK\3\4", _VERSION, *place) + told + packed
+        n = len(self._members)
+        end = _END.pack(b"PK\5\6", 0, 0, n, n, len(directory), len(body), 0)
+        if len(body) + len(directory) > MAX_BYTES:
+            raise ProtocolError(f"observations of {len(body):,} bytes; {MAX_BYTES:,} are the limit")
+        return bytes(body + directory) + end
+
+
+class _Member:
+    """One array."""
+
+    def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        if dtype.hasobject:
+            raise ProtocolError(
+                "observations that are neither numbers nor text cannot be stored beside the rows"
+            )
+        self._dtype = dtype
+        self._shape = shape
+        self._n = 0
+        self._n_bytes = 0
+        self._crc = 0
+        self._stream = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
+        self._pieces: list[bytes] = []
+
+    def add(self, rows: NDArray[Any]) -> None:
+        if rows.dtype != self._dtype or rows.shape[1:] != self._shape:
+            raise ProtocolError(
+                f"observations of {rows.dtype} {rows.shape[1:]} follow those of {self._dtype} {self._shape}"
+            )
+        data = np.ascontiguousarray(rows).data
+        self._n += len(rows)
+        self._n_bytes += rows.nbytes
+        if self._n_bytes > MAX_BYTES:
+            raise ProtocolError(f"observations of {self._n_bytes:,} bytes; {MAX_BYTES:,} are the limit")
+        self._crc = zlib.crc32(data, self._crc)
+        self._pieces.append(self._stream.compress(data))
+
+    def finish(self) -> tuple[int, int, bytes]:
+        """Checksum and size of the `.npy` file, and its bytes, deflated."""
+        out = io.BytesIO()
+        told = {
+            "descr": np.lib.format.dtype_to_descr(self._dtype),
+            "fortran_order": False,
+            "shape": (self._n, *self._shape),
+        }
+        np.lib.format.write_array_header_1_0(out, told)
+        header = out.getvalue()
+        first = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
+        # Flushed to a whole byte and not ended: what follows goes on from there.
+        packed = b"".join(
+            [first.compress(header), first.flush(zlib.Z_FULL_FLUSH), *self._pieces, self._stream.flush()]
+        )
+        crc = crc_of_both(zlib.crc32(header), self._crc, self._n_bytes)
+        return crc, len(header) + self._n_bytes, packed
+
+
+def crc_of_both(first: int, second: int, n: int) -> int:
+    """CRC-32 of two texts one after the other, from that of each and the bytes of the second.
+
+    To append n bytes is to multiply by x^8n modulo the polynomial; coefficients stand in reverse, the highest bit is x^0.
+    """
+    factor, power = 1 << 31, 1 << 23  # x^0 and x^8
+    while n:
+        if n & 1:
+            factor = _times(factor, power)
+        power = _times(power, power)
+        n >>= 1
+    return _times(factor, first) ^ second
+
+
+def _times(left: int, right: int) -> int:
+    product = 0
+    for bit in range(31, -1, -1):
+        if left >> bit & 1:
+            product ^= right
+        right = right >> 1 ^ (0xEDB88320 if right & 1 else 0)
+    return product

@@ -1,0 +1,382 @@
+"""An episode as its feedback files, made where it was played: whoever writes them to disk only unpacks and checks them.
+
+Rules that this module owns:
+- The same steps give the same bytes. The rows are those of `json_text.rows_text`; observations that are stored outside
+  them are one `.npz` file.
+- Beside the files stands the log of actions, rewards and flags, as a trajectory with record "actions": from it an audit takes
+  the actions, bit for bit as they were returned. Nothing in it is not in the files too.
+- Rows and pictures are compressed as they come.
+- Nothing is believed of what comes from elsewhere: sizes are held to the limits before anything is unpacked, and the rows to
+  the length and the return that were declared.
+- Layout: `magic, {length, header}, {length, log}, {length, file}…`.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import zstandard
+
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.environment import ObservationForm, ObsStorage
+from evopolicy_common.records import columns, trajectory
+from evopolicy_common.records.json_text import as_lists, rows_text
+from evopolicy_common.records.npz import NpzWriter
+from evopolicy_common.records.trajectory import Recorder, Trajectory
+
+MAGIC = b"evofeed1"
+ROWS: Final = "trajectory.jsonl"
+OBSERVATIONS: Final = "observations.npz"
+SINGLE = "observations"
+"""Name of the array of observations that are one array a step."""
+MAX_ROWS_BYTES = 256 << 20
+"""Of `trajectory.jsonl`. Actions alone cannot make so many: see `ResourceLimits.episode_action_bytes`."""
+MAX_OBSERVATIONS_BYTES = 1 << 30
+"""Of `observations.npz`."""
+MAX_ARRAYS = 4096
+"""In it."""
+MIN_PICTURE_SIDE = 16
+"""Height × width of bytes is a picture from this side on; smaller ones are symbols."""
+
+_LENGTH = struct.Struct("<I")
+_MAX_HEADER_BYTES = 4096
+_STEPS_AT_ONCE = 256
+_ROWS_AT_ONCE = 1 << 20
+"""Bytes of rows that are checked at once."""
+_ODD = (
+    *DECODE_ERRORS,
+    zstandard.ZstdError,
+    zipfile.BadZipFile,
+    struct.error,
+    ValueError,
+    OverflowError,
+    RecursionError,
+)
+
+
+class File(msgspec.Struct, frozen=True, kw_only=True):
+    """One feedback file in the container."""
+
+    name: Literal["trajectory.jsonl", "observations.npz"]
+    size: int
+    """Bytes of the file."""
+    packed: Literal["zstd", "as it is"]
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True):
+    """What follows it."""
+
+    observations: ObservationForm
+    n: int
+    """Steps."""
+    files: tuple[File, ...]
+    left_out: str = ""
+    """Why there are no files; empty where there are."""
+
+
+_headers = msgspec.msgpack.Decoder(Header)
+
+
+class Renderer(Recorder):
+    """A `Recorder` whose bytes are the feedback files and the log of actions."""
+
+    def __init__(self, observations: ObservationForm, storage: ObsStorage) -> None:
+        """`storage`: where observations are kept; all but "inline" is `observations.npz`."""
+        super().__init__("actions", observations)
+        self._form: ObservationForm = observations
+        # Kept for a block, until they are rendered.
+        self._full = True
+        self._npz = None if storage == "inline" else NpzWriter()
+        self._compressor = zstandard.ZstdCompressor(level=1).compressobj()
+        self._rows: list[bytes] = []
+        self._rows_size = 0
+        self._left_out = ""
+
+    def finish(self) -> bytes:
+        """The container's bytes. The recorder is not used afterwards."""
+        log = super().finish()
+        files: list[tuple[File, bytes]] = []
+        if not self._left_out:
+            try:
+                files = list(self._files())
+            except ProtocolError as error:
+                self._left_out = str(error)
+        header = Header(
+            observations=self._form,
+            n=self._n_packed,
+            files=tuple(file for file, _ in files),
+            left_out=self._left_out[:1000],
+        )
+        parts = [columns.encoder.encode(header), log, *(data for _, data in files)]
+        return b"".join([MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(len(part)), part))])
+
+    def _files(self) -> Iterator[tuple[File, bytes]]:
+        rows = b"".join([*self._rows, self._compressor.flush()])
+        yield File(name=ROWS, size=self._rows_size, packed="zstd"), rows
+        if self._npz is not None and self._n_packed:
+            data = self._npz.finish()
+            if len(data) > MAX_OBSERVATIONS_BYTES:
+                raise ProtocolError(
+                    f"{OBSERVATIONS} of {len(data):,} bytes; {MAX_OBSERVATIONS_BYTES:,} are the limit"
+                )
+            yield File(name=OBSERVATIONS, size=len(data), packed="as it is"), data
+
+    def _begin_block(self, obs: Any) -> None:
+        super()._begin_block(obs)
+        # Arrays that are stored outside are compressed at once: a block of pictures would be large.
+        is_single = self._npz is not None and isinstance(obs, np.ndarray)
+        self._pictures = _Single(self._put_observations) if is_single else None
+
+    def _flush(self) -> None:
+        first = self._n_packed
+        block = columns.decoder.decode(self._add_block(None, 0))
+        if not self._left_out:
+            self._render(first, block)
+        self._clear()
+
+    def _render(self, first: int, block: dict[str, Any]) -> None:
+        """Adds the text of the block's rows, and its observations where they are stored beside them."""
+        obs: list[Any] | None = self._obs
+        if self._npz is not None:
+            if self._obs:
+                for name, leaf in columns.leaves(columns.unpack(columns.pack(self._obs)).values()):
+                    self._put_observations(name or SINGLE, leaf)
+            obs = None
+        elif self._form == "lists":
+            obs = as_lists(self._obs)
+        rows = _Rows(
+            obs,
+            columns.unpack(block["actions"]).rows(),
+            self._rewards,
+            [bool(flag & trajectory.TERMINATED) for flag in self._flags],
+            [bool(flag & trajectory.TRUNCATED) for flag in self._flags],
+            self._infos,
+        )
+        try:
+            for text in rows.texts(first, self._rows_size):
+                self._rows_size += len(text)
+                self._rows.append(self._compressor.compress(text))
+        except ProtocolError as error:
+            self._left_out = str(error)
+
+    def _put_observations(self, name: str, rows: Any) -> None:
+        assert self._npz is not None
+        if self._left_out:
+            return
+        try:
+            self._npz.add(name, rows)
+        except (ProtocolError, ValueError) as error:
+            self._left_out = str(error)
+
+
+class _Rows(NamedTuple):
+    """Steps, a list for each part of them."""
+
+    obs: list[Any] | None
+    actions: Sequence[Any]
+    rewards: list[float]
+    terminated: list[bool]
+    truncated: list[bool]
+    infos: list[dict[str, Any]]
+
+    def texts(self, first: int, size: int) -> Iterator[bytes]:
+        """The lines from step `first` on, some at a time; ProtocolError where they and the `size` before are too large.
+
+        Not all at once: an action may be few bytes, and its text many.
+        """
+        for at in range(0, len(self.rewards), _STEPS_AT_ONCE):
+            part = [None if column is None else column[at : at + _STEPS_AT_ONCE] for column in self]
+            text = rows_text(first + at, *part)  # type: ignore[arg-type]
+            size += len(text)
+            if size > MAX_ROWS_BYTES:
+                raise ProtocolError(
+                    f"step {first + at} brings {ROWS} to {size:,} bytes; {MAX_ROWS_BYTES:,} are the limit"
+                )
+            yield text
+
+
+class _Single:
+    """Takes the observations of a block that are one array a step."""
+
+    def __init__(self, put: Callable[[str, Any], None]) -> None:
+        self._put = put
+
+    def add(self, obs: Any, /) -> bool:
+        """False, and nothing is done, where it is no array."""
+        if not isinstance(obs, np.ndarray):
+            return False
+        self._put(SINGLE, obs[np.newaxis])
+        return True
+
+
+class Container:
+    """The parts of a rendered episode. ProtocolError where `data` is none; nothing is unpacked yet."""
+
+    def __init__(self, data: bytes) -> None:
+        try:
+            parts = _parts(data)
+            self.header = _headers.decode(parts[0])
+        except _ODD as error:
+            raise ProtocolError(f"{len(data)} bytes are no rendered episode: {error}") from error
+        if len({file.name for file in self.header.files}) != len(parts) - 2:
+            raise ProtocolError(
+                f"a rendered episode of {len(parts)} parts says that it has {len(self.header.files)} files"
+            )
+        self.log = bytes(parts[1])
+        self._files = dict(zip(self.header.files, parts[2:], strict=True))
+
+    def files(self) -> dict[str, bytes]:
+        """The files by name; ProtocolError where they are left out, too large, or not as large as is said."""
+        if self.header.left_out or not self._files:
+            raise ProtocolError(self.header.left_out or "a rendered episode without files")
+        try:
+            return {file.name: _unpacked(file, data) for file, data in self._files.items()}
+        except _ODD as error:
+            raise ProtocolError(f"the files of a rendered episode cannot be unpacked: {error}") from error
+
+
+def is_rendered(data: bytes) -> bool:
+    """Whether these are the bytes of a rendered episode, by their mark; a trajectory has another."""
+    return data[: len(MAGIC)] == MAGIC
+
+
+def decode(data: bytes) -> Trajectory:
+    """The episode in a trajectory's bytes or a rendered one's; ProtocolError when it is none."""
+    if not is_rendered(data):
+        return trajectory.decode(data)
+    container = Container(data)
+    log = trajectory.decode(container.log)
+    if log.n != container.header.n:
+        raise ProtocolError(f"a rendered episode of {container.header.n} steps has a log of {log.n}")
+    # Without files the log is all there is.
+    files = {} if container.header.left_out else container.files()
+    return msgspec.structs.replace(
+        log, record="full" if files else "actions", observations=container.header.observations, files=files
+    )
+
+
+def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, bytes]:
+    """The feedback files of a rendered episode; ProtocolError where they are not those of one of that length and return."""
+    files = Container(data).files()
+    n, total = 0, 0.0
+    rows = memoryview(files.get(ROWS, b""))
+    at = 0
+    while at < len(rows):
+        end = files[ROWS].rfind(b"\n", at, at + _ROWS_AT_ONCE) + 1 or files[ROWS].find(b"\n", at) + 1
+        try:
+            told = _told.decode_lines(rows[at : end or len(rows)])
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise ProtocolError(f"{ROWS} cannot be read after step {n}: {error}") from error
+        for row in told:
+            if row.t != n:
+                raise ProtocolError(f"row {n} of {ROWS} says that it is of step {row.t}")
+            n += 1
+            # In the order in which the worker has added them up.
+            total += row.reward
+        at = end or len(rows)
+    if (n, total) != (length, episode_return):
+        raise ProtocolError(
+            f"{ROWS} has {n} rows whose rewards come to {total!r}; {length} and {episode_return!r} were declared"
+        )
+    return files
+
+
+class _Told(msgspec.Struct):
+    """What is checked of a row; the rest is skipped."""
+
+    t: int
+    reward: float
+
+
+_told = msgspec.json.Decoder(_Told)
+
+
+def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes]:
+    """The feedback files of an episode, made here unless they were made already.
+
+    `storage` None: as the observations themselves suggest. ProtocolError for more than `trajectory.jsonl` may hold.
+    """
+    if episode.files:
+        return episode.files
+    outside = storage != "inline" if storage is not None else _holds_pictures(episode.obs)
+    found = list(episode.rows())
+    rows = _Rows(
+        None if outside else [row.obs for row in found],
+        [row.action for row in found],
+        [row.reward for row in found],
+        [row.terminated for row in found],
+        [row.truncated for row in found],
+        [row.info for row in found],
+    )
+    files = {ROWS: b"".join(rows.texts(0, 0))}
+    if outside and episode.obs is not None:
+        npz = NpzWriter()
+        for name, leaf in columns.leaves(episode.obs):
+            npz.add(name or SINGLE, leaf)
+        files[OBSERVATIONS] = npz.finish()
+    return files
+
+
+def is_picture(shape: tuple[int, ...], dtype: str) -> bool:
+    """Whether arrays of this shape and dtype are pictures: bytes of height × width, with channels or stacked, or both."""
+    if dtype != "uint8" or not 2 <= len(shape) <= 4:
+        return False
+    channels = len(shape) > 2 and shape[-1] < MIN_PICTURE_SIDE
+    return min(shape[-3:-1] if channels else shape[-2:]) >= MIN_PICTURE_SIDE
+
+
+def _holds_pictures(obs: Any) -> bool:
+    found = [leaf for _, leaf in columns.leaves(obs) if isinstance(leaf, np.ndarray)]
+    return any(is_picture(leaf.shape[1:], leaf.dtype.name) for leaf in found)
+
+
+def _parts(data: bytes) -> list[memoryview]:
+    if not is_rendered(data):
+        raise ValueError("they do not begin with the format's mark")
+    parts: list[memoryview] = []
+    view = memoryview(data)
+    at = len(MAGIC)
+    while at < len(data):
+        (length,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        if at + length > len(data) or len(parts) > 4 or (not parts and length > _MAX_HEADER_BYTES):
+            raise ValueError("cut short, or of too many parts")
+        parts.append(view[at : at + length])
+        at += length
+    if len(parts) < 2:
+        raise ValueError("cut short")
+    return parts
+
+
+def _unpacked(file: File, data: memoryview) -> bytes:
+    most = MAX_ROWS_BYTES if file.name == ROWS else MAX_OBSERVATIONS_BYTES
+    if not 0 <= file.size <= most:
+        raise ValueError(f"{file.name} of {file.size:,} bytes; {most:,} are the limit")
+    if file.packed == "as it is":
+        found = bytes(data)
+    elif not file.size:
+        return b""
+    elif file.size > columns.most_of(data) or zstandard.frame_content_size(data) not in (-1, file.size):
+        raise ValueError(f"{len(data)} bytes cannot hold {file.name} of {file.size:,}")
+    else:
+        found = zstandard.ZstdDecompressor().decompress(data, max_output_size=file.size)
+    if len(found) != file.size:
+        raise ValueError(f"{file.name} has {len(found):,} bytes, {file.size:,} were declared")
+    if file.name == OBSERVATIONS:
+        _check_archive(found)
+    return found
+
+
+def _check_archive(data: bytes) -> None:
+    """Whoever loads the arrays needs no more memory than an episode's may take."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()
+    size = sum(member.file_size for member in members)
+    if len(members) > MAX_ARRAYS or size > trajectory.MAX_BYTES:
+        raise ValueError(f"{OBSERVATIONS} of {len(members)} arrays and {size:,} bytes, unpacked")

@@ -1,0 +1,206 @@
+"""Feedback files that are made where an episode was played: what they hold, and what is believed of them."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.environment import ObservationForm, ObsStorage
+from evopolicy_common.records import columns, rendered, trajectory
+from evopolicy_common.records.npz import NpzWriter, crc_of_both
+from evopolicy_common.records.rendered import OBSERVATIONS, ROWS, Renderer, checked_files, decode, files_of
+from evopolicy_common.records.trajectory import Recorder
+
+odd_actions = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(),
+        st.sampled_from(['},{"t":', "null", "NaN", "\ud800"]),
+        st.builds(
+            lambda values: np.array(values, dtype=np.float32), st.lists(st.floats(width=32), max_size=3)
+        ),
+    ),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.sampled_from(["t", "reward", "null", '},{"t":']), inner, max_size=2),
+    ),
+    max_leaves=5,
+)
+observations = st.one_of(
+    st.builds(lambda x: np.array([x, 1.5], dtype=np.float32), st.floats(width=32)),
+    st.builds(lambda x: {"a": np.full((2, 2), x, dtype=np.uint8), "b": ("go", x)}, st.integers(0, 255)),
+    st.integers(-5, 5),
+)
+steps = st.lists(st.tuples(observations, odd_actions, st.floats(-9, 9)), min_size=1, max_size=6)
+
+
+def recorded(recorder: Recorder, rows: list[tuple[Any, Any, float]]) -> bytes:
+    for t, (obs, action, reward) in enumerate(rows):
+        recorder.append(obs, action, reward, t == len(rows) - 1, False, {"steps": t, "note": 'a},{"t":'})
+    return recorder.finish()
+
+
+@settings(max_examples=150, deadline=None)
+@given(steps, st.sampled_from(["arrays", "lists"]))
+def test_rendered_rows_are_those_of_the_trajectory(
+    rows: list[tuple[Any, Any, float]], form: ObservationForm
+) -> None:
+    then = files_of(trajectory.decode(recorded(Recorder("full", form), rows)), "inline")
+    data = recorded(Renderer(form, "inline"), rows)
+    assert decode(data).files == then
+    assert checked_files(data, len(rows), sum_of(rows)) == then
+
+
+def sum_of(rows: list[tuple[Any, Any, float]]) -> float:
+    total = 0.0
+    for _, _, reward in rows:
+        total += reward
+    return total
+
+
+@settings(max_examples=50, deadline=None)
+@given(steps)
+def test_the_log_holds_the_actions_bit_for_bit(rows: list[tuple[Any, Any, float]]) -> None:
+    ours = decode(recorded(Renderer("arrays", "inline"), rows))
+    theirs = trajectory.decode(recorded(Recorder(), rows))
+    assert columns.encode({"": list(ours.actions)}) == columns.encode({"": list(theirs.actions)})
+    assert ours.rewards.tobytes() == theirs.rewards.tobytes()
+    assert (ours.n, ours.record, ours.terminated.tolist()) == (theirs.n, "full", theirs.terminated.tolist())
+
+
+@pytest.mark.parametrize("shape", [(20, 20), (20, 20, 1), (96, 96, 3), (4, 20, 20)])
+def test_pictures_are_read_with_numpy_alone(shape: tuple[int, ...]) -> None:
+    pictures = np.random.default_rng(0).integers(0, 256, (70, *shape)).astype(np.uint8)
+    files = decode(recorded(Renderer("arrays", "npz"), [(picture, 0, 1.0) for picture in pictures])).files
+    with np.load(io.BytesIO(files[OBSERVATIONS]), allow_pickle=False) as stored:
+        assert stored.files == ["observations"]
+        np.testing.assert_array_equal(stored["observations"], pictures)
+    assert all(json.loads(line)["obs"] is None for line in files[ROWS].splitlines())
+
+
+def test_parts_of_an_observation_are_arrays_of_their_own_over_many_blocks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(trajectory, "BLOCK_BYTES", 4000)
+    rows = [
+        ({"eye": np.full((20, 20), t, dtype=np.uint8), "n": t, "text": f"go {t}"}, t, 0.5) for t in range(40)
+    ]
+    data = recorded(Renderer("arrays", "npz"), rows)
+    assert checked_files(data, 40, 20.0) == decode(data).files
+    with np.load(io.BytesIO(decode(data).files[OBSERVATIONS])) as stored:
+        assert stored["eye"][:, 3, 3].tolist() == list(range(40))
+        assert stored["n"].tolist() == list(range(40))
+        assert stored["text"].tolist() == [f"go {t}" for t in range(40)]
+    assert [json.loads(line)["t"] for line in decode(data).files[ROWS].splitlines()] == list(range(40))
+
+
+def test_an_archive_is_whole_and_the_same_every_time() -> None:
+    def file() -> bytes:
+        writer = NpzWriter()
+        for t in range(30):
+            writer.add("a/b", np.full((1, 9, 9), t, dtype=np.int16))
+            writer.add("text", [f"ä{t}"])
+        return writer.finish()
+
+    assert file() == file()
+    assert zipfile.ZipFile(io.BytesIO(file())).testzip() is None
+
+
+@given(st.binary(max_size=50), st.binary(max_size=300))
+def test_a_checksum_of_two_texts_follows_from_theirs(first: bytes, second: bytes) -> None:
+    assert crc_of_both(zlib.crc32(first), zlib.crc32(second), len(second)) == zlib.crc32(first + second)
+
+
+def episode(n: int = 3) -> bytes:
+    return recorded(Renderer("arrays", "inline"), [(np.zeros(3), t, 0.5) for t in range(n)])
+
+
+@pytest.mark.parametrize(("length", "total"), [(2, 1.5), (3, 1.0), (4, 1.5)])
+def test_an_episode_of_another_length_or_return_is_not_believed(length: int, total: float) -> None:
+    assert ROWS in checked_files(episode(), 3, 1.5)
+    with pytest.raises(ProtocolError, match="were declared"):
+        checked_files(episode(), length, total)
+
+
+@given(st.integers(0, 400), st.binary(min_size=1, max_size=3))
+def test_damaged_bytes_are_an_error_of_the_protocol(at: int, wrong: bytes) -> None:
+    whole = episode()
+    for data in (
+        whole[: at % len(whole)],
+        whole[: at % len(whole)] + wrong + whole[at % len(whole) + len(wrong) :],
+    ):
+        try:
+            checked_files(data, 3, 1.5)
+            decode(data)
+        except ProtocolError:
+            pass
+
+
+def container(files: list[tuple[dict[str, Any], bytes]], n: int = 3) -> bytes:
+    header = {"observations": "arrays", "n": n, "files": [told for told, _ in files]}
+    parts = [msgspec.msgpack.encode(header), recorded(Recorder("actions"), [(None, 0, 0.5)] * n)]
+    parts += [data for _, data in files]
+    return rendered.MAGIC + b"".join(len(part).to_bytes(4, "little") + part for part in parts)
+
+
+@pytest.mark.parametrize("told", [10, 1 << 40, -1, 1 << 27])
+def test_a_bomb_is_refused_before_it_is_unpacked(told: int) -> None:
+    bomb = zstandard.ZstdCompressor().compress(bytes(64 << 20))
+    with pytest.raises(ProtocolError):
+        checked_files(container([({"name": ROWS, "size": told, "packed": "zstd"}, bomb)]), 3, 1.5)
+
+
+def test_only_feedback_files_come_out_of_a_container() -> None:
+    told = {"name": "../policy.py", "size": 1, "packed": "as it is"}
+    with pytest.raises(ProtocolError):
+        checked_files(container([(told, b"x")]), 3, 1.5)
+    twice = ({"name": ROWS, "size": 1, "packed": "as it is"}, b"x")
+    with pytest.raises(ProtocolError):
+        checked_files(container([twice, twice]), 3, 1.5)
+
+
+def test_an_archive_that_unpacks_to_more_than_an_episode_is_refused() -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("a.npy", "b.npy"):
+            archive.writestr(name, b"x" * 1000)
+    data = out.getvalue()
+    member = (1000).to_bytes(4, "little")
+    lying = data.replace(member, (0xFFFFFFFF).to_bytes(4, "little"))
+    rows = zstandard.ZstdCompressor().compress(decode(episode()).files[ROWS])
+    size = len(decode(episode()).files[ROWS])
+    files = [({"name": ROWS, "size": size, "packed": "zstd"}, rows)]
+    assert OBSERVATIONS in checked_files(
+        container([*files, ({"name": OBSERVATIONS, "size": len(data), "packed": "as it is"}, data)]), 3, 1.5
+    )
+    with pytest.raises(ProtocolError):
+        checked_files(
+            container([*files, ({"name": OBSERVATIONS, "size": len(lying), "packed": "as it is"}, lying)]),
+            3,
+            1.5,
+        )
+
+
+@pytest.mark.parametrize("storage", ["inline", "npz"])
+def test_files_that_cannot_be_made_are_left_out_and_the_log_stays(
+    storage: ObsStorage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendered, "MAX_ROWS_BYTES", 100)
+    data = recorded(Renderer("arrays", storage), [(np.zeros(3), t, 0.5) for t in range(3)])
+    assert (decode(data).n, decode(data).record, decode(data).files) == (3, "actions", {})
+    with pytest.raises(ProtocolError, match="100 are the limit"):
+        checked_files(data, 3, 1.5)
