@@ -12,8 +12,9 @@ import gateway_double
 import pytest
 from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
 
+from evopolicy_common.records import rendered
 from evopolicy_gateway.run.layout import RunFolder
-from evopolicy_gateway.submits import episode_files, formatting
+from evopolicy_gateway.submits import formatting
 from evopolicy_gateway.submits.journal import Died, Journal, SetAside
 
 BODY = {"env_instances": [1, 2, 3]}
@@ -37,7 +38,7 @@ def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
     real = packed_episode
     junk = {"junk": b"junk", "too long": packed_episode(3, n_steps=500)}[kind]
     monkeypatch.setattr(gateway_double, "packed_episode", lambda case: junk if case == 3 else real(case))
-    monkeypatch.setattr(episode_files, "MAX_TRAJECTORY_BYTES", 5000)
+    monkeypatch.setattr(rendered, "MAX_ROWS_BYTES", 5000)
 
     async def main() -> None:
         async with served(tmp_path) as s:
@@ -75,6 +76,7 @@ import asyncio, os, signal, sys
 from pathlib import Path
 from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.run.gateway import Gateway
+from evopolicy_common.records import rendered
 from evopolicy_gateway.run.layout import RunFolder
 
 real = submits.episode_files

@@ -89,7 +89,7 @@ def test_the_first_policy_of_a_long_action_stays_readable() -> None:
 def test_the_rules_name_every_file_verdict_and_bound() -> None:
     text = agents_md(opened(episode_budget=128, max_episodes_per_submit=500, min_episodes_per_submit=4), URLS)
     for needed in (
-        *("trajectory.jsonl", "observations.npy", "error.txt", "errors.txt", "summary.json", "video.mp4"),
+        *("trajectory.jsonl", "observations.npz", "error.txt", "errors.txt", "summary.json", "video.mp4"),
         *("missing_policy", "denied_import", "import_error", "init_error", "rollout_timeout"),
         *(
             "budget_invalid",
