@@ -89,12 +89,12 @@ def episode_files(episode, *args, **options):
 submits.episode_files = episode_files
 
 async def main():
-    gateway = Gateway(RunFolder(Path(sys.argv[1])), on_ready=lambda urls, desk: None, on_change=on_change,
+    gateway = Gateway(RunFolder(Path(sys.argv[1])), on_ready=lambda urls, pipeline: None, on_change=on_change,
                       alone=True)
     await gateway.run()
 
-def on_change(desk):
-    if desk.tickets and desk.tickets[0].done.is_set():
+def on_change(pipeline):
+    if pipeline.tickets and pipeline.tickets[0].done.is_set():
         os._exit(0)
 
 asyncio.run(main())

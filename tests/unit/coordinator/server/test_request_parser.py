@@ -1,4 +1,4 @@
-"""The intake: which requests become events, and why the others do not."""
+"""Parsed requests: which requests become events, and why the others do not."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class SupervisorProcess:
             event = child_messages.event_of(data)
             if isinstance(event, kind):
                 return event
-        raise AssertionError(f"the keeper ended without {kind.__name__}")
+        raise AssertionError(f"the supervisor ended without {kind.__name__}")
 
     def holds_its_lock(self) -> bool:
         with self.lock.open() as file:
