@@ -75,6 +75,14 @@ PLACES = {
         f"{_COORDINATOR}.verify:app",
         "Play a run's recorded actions again and compare rewards, observations and returns bit for bit.",
     ),
+    "publish": Place(
+        f"{_COORDINATOR}.publish:app",
+        "Write finished runs into one signed file that anyone can check, and make their cases public.",
+    ),
+    "check": Place(
+        f"{_COORDINATOR}.publish:check_app",
+        "Check published results: signature, digests, commitments, journal, selection, scores, and with --replay the environments.",
+    ),
     "data": Place(
         f"{_COORDINATOR}.data:app",
         "Make and check the split files of environments (hidden cases: keep them from agents).",

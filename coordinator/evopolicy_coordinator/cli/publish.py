@@ -1,0 +1,246 @@
+"""`evopolicy publish`, `evopolicy check`: results that others can check, and the check.
+
+Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a replay that
+was asked for could not be done.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import re
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
+from evopolicy_common.commands import App
+from evopolicy_common.console import table, terminal
+from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.processes.local_cluster import local_cluster
+from evopolicy_common.terminal import one_line, say, say_json
+from evopolicy_common.wire import credentials, transport
+from evopolicy_coordinator.publish import replay as replays
+from evopolicy_coordinator.publish import rules
+from evopolicy_coordinator.publish.archive import Archive
+from evopolicy_coordinator.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
+from evopolicy_coordinator.publish.contents import Listed
+from evopolicy_coordinator.publish.rules import KINDS, Checked
+
+FAILED, NOT_REPLAYED = 1, 3
+_SHOWN = 20
+
+app = App(name="publish")
+check_app = App(name="check")
+
+
+@app.command(name="publish", epilog="Example: evopolicy publish runs/evolve --out evolve.evp --local")
+def publish(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUNS...", help="Finished runs' directories, or folders of them.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, such as results.evp.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Bring up the coordinator of local runs for this command.")
+    ] = False,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --local: the state folder that the runs were made with; default: that of `evopolicy local`."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
+) -> None:
+    """Write finished runs into one signed file that anyone can check, and make their cases public.
+
+    Their epoch is revealed for good: no new run plays its cases (see `evopolicy-coordinator epoch`). Paths, hosts, users, variables and
+    tokens are taken out and searched for; the file says what was removed.
+    """
+    if not local and state is not None:
+        fail("--state goes with --local")
+    if local and (connect or file is not None):
+        fail("--local brings up its own coordinator: it does not go with --connect or --credentials")
+    if out.exists():
+        fail(f"--out {out} is there already; name a new file")
+    if not out.absolute().parent.is_dir():
+        fail(f"--out {out}: there is no folder {out.parent}")
+
+    async def work() -> Published:
+        end_on_sigterm()
+        found = find_runs(runs)
+        async with _link(tuple(connect or ()), file, local, state) as link:
+            needles = needles_of_this_machine(link, *runs, *([state] if state else []))
+            publisher = Publisher(link, lambda text: say(one_line(text), err=True), needles)
+            return await publisher.publish(found, out)
+
+    with fail_on_our_errors():
+        done = asyncio.run(work())
+    if as_json:
+        say_json(done)
+        return
+    say(f"{done.path}: {done.runs} runs, {done.bytes:,} bytes, signed by {done.signer}")
+    say(f"journal head: {done.journal_head}")
+    _say_listing("left out, of the same entries:", done.left_out)
+    say(f"{len(done.removed)} things were removed; removed.json in the file lists them")
+    say(f"next: evopolicy check {done.path} --identity {done.signer}")
+
+
+@check_app.command(name="check", epilog="Example: evopolicy check results.evp --replay 5% --identity KEY")
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Published results.", show_default=False)],
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Play recorded actions again: `5%` of the episodes, drawn at random, or `all`.",
+            show_default=False,
+        ),
+    ] = None,
+    identity: Annotated[
+        str | None,
+        typer.Option(
+            help="The public key that the signer must have, as the publisher tells it elsewhere.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Of the draw; default: another one each time.", show_default=False)
+    ] = None,
+    slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes at once.")] = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all findings as JSON.")] = False,
+) -> None:
+    """Check published results: signature, digests, commitments, journal, selection, scores, and with --replay the environments.
+
+    Nothing of the file is executed. Exit codes: 0 nothing contradicts, 1 something does, 2 wrong usage or no such file, 3 a replay
+    could not be done.
+    """
+    if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
+        fail(
+            f"--identity {identity!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them"
+        )
+    share = None
+    if replay is not None:
+        try:
+            share = replays.share_of(replay)
+        except ValueError:
+            fail(f"--replay {replay!r}: say a share such as 5%, or all")
+    drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
+    with fail_on_our_errors():
+        try:
+            with Archive(file) as archive:
+                checked = rules.check(archive, identity or "")
+                if share is None:
+                    checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
+                elif not checked.failed:
+                    asyncio.run(_replay(archive, checked, share, drawn, slots))
+                else:
+                    checked.add("replay", "open", "not played, as the file contradicts itself")
+        except ProtocolError as error:
+            raise ConfigError(f"{file}: {error}") from error
+        except OSError as error:
+            raise ConfigError(f"{file}: {error.strerror or error}") from error
+    if as_json:
+        told = {
+            "file": str(file),
+            "ok": not checked.failed,
+            "signer": checked.signer,
+            "findings": checked.findings,
+            "listing": checked.listing,
+            "removed": checked.removed,
+        }
+        say_json(told)
+    else:
+        _print(checked)
+    replayed = share is None or not any(
+        each.kind == "replay" and each.state == "open" for each in checked.findings
+    )
+    raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
+
+
+async def _replay(archive: Archive, checked: Checked, share: float, seed: int, slots: int) -> None:
+    end_on_sigterm()
+    console = terminal(stderr=True)
+    with console.status("replay") as status:
+
+        def tell(played: int, total: int) -> None:
+            status.update(f"replay: {played} of {total} episodes")
+
+        await replays.replay(archive, checked, share, seed, slots, tell)
+
+
+@contextlib.asynccontextmanager
+async def _link(
+    connect: tuple[str, ...], file: Path | None, local: bool, state: Path | None
+) -> AsyncIterator[transport.Link]:
+    async with contextlib.AsyncExitStack() as stack:
+        if local:
+            folder = state or credentials.local_state_dir()
+            if not folder.is_dir():
+                raise ConfigError(f"--state {folder}: there is no such state folder")
+            cluster = await stack.enter_async_context(local_cluster("publish", state=folder))
+            file = cluster.operator_file
+        found = credentials.find("operator", connect, file)
+        yield await stack.enter_async_context(transport.connect(found))
+
+
+def _print(checked: Checked) -> None:
+    """One page: a line a kind; where something fails or cannot be shown, what and where."""
+    marks = {"ok": "ok    ", "open": "open  ", "failed": "FAILED"}
+    for kind, meaning in KINDS.items():
+        of_kind = [each for each in checked.findings if each.kind == kind]
+        if not of_kind:
+            continue
+        for state in ("failed", "open"):
+            lines: dict[str, list[str]] = {}
+            for each in of_kind:
+                if each.state == state:
+                    lines.setdefault(each.text, []).append(each.run)
+            for text, named in list(lines.items())[:_SHOWN]:
+                where = (
+                    "" if not named[0] else f" [{named[0]}]" if len(named) == 1 else f" [{len(named)} runs]"
+                )
+                say(one_line(f"{marks[state]} {kind}: {text}{where}"))
+            if len(lines) > _SHOWN:
+                say(f"{marks[state]} {kind}: … and {len(lines) - _SHOWN} more (--json tells all)")
+        if all(each.state == "ok" for each in of_kind):
+            n = len({each.run for each in of_kind if each.run})
+            say(one_line(f"{marks['ok']} {kind}: " + (f"{meaning} ({n} runs)" if n else of_kind[0].text)))
+    _say_listing(
+        "left out, of the same entries:", [each for each in checked.listing if each.state != "published"]
+    )
+    shown = (
+        "something in this file contradicts itself or what you expect"
+        if checked.failed
+        else "nothing in this file contradicts itself"
+    )
+    known = any(each.kind == "identity" and each.state == "ok" for each in checked.findings)
+    say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
+
+
+def _say_listing(heading: str, listed: list[Listed] | tuple[Listed, ...]) -> None:
+    if not listed:
+        return
+    say(heading)
+    shown = table("run", "entry", "environment", "experiment", "repeat", "attempt", "state", "replaced by")
+    for each in listed[:_SHOWN]:
+        shown.add_row(
+            each.run,
+            each.entry,
+            each.env,
+            each.exp_id,
+            str(each.repeat),
+            str(each.attempt),
+            each.state,
+            each.replaced_by,
+        )
+    terminal().print(shown)
+    if len(listed) > _SHOWN:
+        say(f"… and {len(listed) - _SHOWN} more")

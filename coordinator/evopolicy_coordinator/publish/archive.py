@@ -1,0 +1,161 @@
+"""The file of published results: a zip archive of the plainest kind, written reproducibly and read as if an enemy had made it.
+
+Rules that this module owns:
+- Files are stored as they are, not compressed, so an archive is never larger inside than outside. Names are plain: lower-case
+  letters, digits, `.`, `-`, `_`, folders by `/`. No links, no comments, no extra fields, no zip64, no duplicates, no gaps.
+- The reader parses the archive itself and refuses whatever the writer would not have made, before it reads any content.
+  What it holds in memory is the names, and one file at a time.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from evopolicy_common.errors import ProtocolError
+
+MAX_BYTES = (1 << 32) - (1 << 20)
+MAX_FILES = 65_000
+_MAX_NAME = 120
+_NAME = re.compile(r"[a-z0-9_][a-z0-9._-]*(/[a-z0-9_][a-z0-9._-]*){0,4}")
+_END = struct.Struct("<4sHHHHIIH")
+_ENTRY = struct.Struct("<4sHHHHHHIIIHHHHHII")
+_LOCAL = struct.Struct("<4sHHHHHIIIHH")
+_FILE_MODE = 0o100644
+
+
+class Writer:
+    """Writes files in the order given; the same files give the same bytes."""
+
+    def __init__(self, path: Path) -> None:
+        self._zip = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=False)
+
+    def add(self, name: str, data: bytes) -> None:
+        """Adds a file. ProtocolError for a name that the reader would refuse."""
+        _check_name(name)
+        info = zipfile.ZipInfo(name)  # dated 1980-01-01
+        info.create_system = 3
+        info.external_attr = _FILE_MODE << 16
+        self._zip.writestr(info, data)
+
+    def close(self) -> None:
+        self._zip.close()
+
+
+class Archive:
+    """An archive that was looked through as a whole: its names are known, its files can be read."""
+
+    def __init__(self, path: Path) -> None:
+        """ProtocolError naming the first thing that is not as it should be; OSError when the file cannot be read."""
+        self._file: BinaryIO = path.open("rb")
+        try:
+            self._places = _places(self._file)
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Of all files."""
+        return frozenset(self._places)
+
+    def read(self, name: str, most: int) -> bytes:
+        """A file's bytes. ProtocolError when there is none of that name, it is damaged, or longer than `most`."""
+        place = self._places.get(name)
+        if place is None:
+            raise ProtocolError(f"there is no {name}")
+        start, size, crc = place
+        if size > most:
+            raise ProtocolError(f"{name} has {size:,} bytes, {most:,} are allowed")
+        self._file.seek(start)
+        data = self._file.read(size)
+        if len(data) != size or zlib.crc32(data) != crc:
+            raise ProtocolError(f"{name} is damaged")
+        return data
+
+    def __enter__(self) -> Archive:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def _places(file: BinaryIO) -> dict[str, tuple[int, int, int]]:
+    """Name to start, size and CRC of each file's content."""
+    total = file.seek(0, 2)
+    if total > MAX_BYTES:
+        raise ProtocolError(f"{total:,} bytes; no results of more than {MAX_BYTES:,} are read")
+    if total < _END.size:
+        raise ProtocolError("not published results: too short")
+    file.seek(total - _END.size)
+    magic, disk, first_disk, n_here, n, size, start, comment = _END.unpack(file.read(_END.size))
+    if magic != b"PK\5\6" or comment:
+        raise ProtocolError("not published results: the file does not end as they do")
+    if disk or first_disk or n_here != n or n > MAX_FILES:
+        raise ProtocolError(f"{n} files, {MAX_FILES:,} are allowed, in one part")
+    if start + size != total - _END.size or size > n * (_ENTRY.size + _MAX_NAME):
+        raise ProtocolError("its list of files is not where it should be")
+    file.seek(start)
+    listed = file.read(size)
+    places: dict[str, tuple[int, int, int]] = {}
+    at, expected = 0, 0
+    for _ in range(n):
+        if at + _ENTRY.size > len(listed):
+            raise ProtocolError("its list of files is cut off")
+        (
+            mark,
+            made,
+            _,
+            flags,
+            method,
+            _,
+            _,
+            crc,
+            packed,
+            length,
+            n_name,
+            n_extra,
+            n_comment,
+            part,
+            _,
+            mode,
+            offset,
+        ) = _ENTRY.unpack_from(listed, at)
+        raw = listed[at + _ENTRY.size : at + _ENTRY.size + n_name]
+        at += _ENTRY.size + n_name
+        name = raw.decode("ascii", "backslashreplace")
+        _check_name(name)
+        if mark != b"PK\1\2" or n_extra or n_comment or part or flags:
+            raise ProtocolError(f"{name}: an entry with extras, which published results do not have")
+        if made >> 8 != 3 or mode != _FILE_MODE << 16:
+            raise ProtocolError(f"{name} is a link, a folder or another special file")
+        if method or packed != length:
+            raise ProtocolError(f"{name} is compressed, which published results never are")
+        if name in places:
+            raise ProtocolError(f"{name} is there twice")
+        if offset != expected or offset + _LOCAL.size + n_name + length > start:
+            raise ProtocolError(f"{name} overlaps another file, or leaves a gap")
+        file.seek(offset)
+        head = _LOCAL.unpack(file.read(_LOCAL.size))
+        if (head[0], head[2], head[3], head[6:]) != (b"PK\3\4", 0, 0, (crc, length, length, n_name, 0)) or (
+            file.read(n_name) != raw
+        ):
+            raise ProtocolError(f"{name}: its two headers differ")
+        begin = offset + _LOCAL.size + n_name
+        places[name] = (begin, length, crc)
+        expected = begin + length
+    if at != len(listed) or expected != start:
+        raise ProtocolError("there are bytes that belong to no file")
+    return places
+
+
+def _check_name(name: str) -> None:
+    if len(name) > _MAX_NAME or not _NAME.fullmatch(name):
+        raise ProtocolError(f"{name[:_MAX_NAME]!a} is no name of a file of published results")

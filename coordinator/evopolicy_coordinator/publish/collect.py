@@ -1,0 +1,266 @@
+"""Collects what is published of runs: from their directories and from the coordinator that made them.
+
+Rules that this module owns:
+- The coordinator is asked to disclose the runs' cases before anything of them is read: it refuses while it must.
+- What is collected depends on the runs and the journal alone, and is written in a fixed order: publishing again gives the same bytes.
+- Every file goes through the search of `scrub` before it is written.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import socket
+from collections.abc import AsyncIterator, Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.records import journal
+from evopolicy_common.records.checkpoints import bundle_of
+from evopolicy_common.records.journal import Result, SubmitResult
+from evopolicy_common.records.run_record import RunRecord, decode_run_record, encode_run_record
+from evopolicy_common.records.trajectory import Recorder, Trajectory, decode
+from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
+from evopolicy_common.wire.transport import Link
+from evopolicy_coordinator.publish import contents, scrub
+from evopolicy_coordinator.publish.archive import Writer
+from evopolicy_coordinator.publish.contents import Episode, Group, Listed, Manifest, Removed
+
+Tell = Callable[[str], None]
+
+_NEVER = (
+    Removed(what="logs/", why="agents' and programs' logs name paths, hosts and variables"),
+    Removed(
+        what="workspace/", why="feedback follows from the recorded actions; the final policy is a checkpoint"
+    ),
+    Removed(what="replays/", why="videos are not published"),
+    Removed(what="notes, agent_host", why="the operator's own labels and machines"),
+    Removed(
+        what="observations, stdout, stderr", why="they follow from the recorded actions, or are free text"
+    ),
+)
+
+
+class Published(msgspec.Struct, frozen=True, kw_only=True):
+    """What was published."""
+
+    path: str
+    bytes: int
+    runs: int
+    signer: str
+    journal_head: str
+    removed: tuple[Removed, ...]
+    left_out: tuple[Listed, ...]
+    """Runs of the same entries that are not in the file."""
+
+
+def find_runs(paths: Sequence[Path]) -> list[tuple[Path, RunRecord]]:
+    """The finished runs in and below these folders, in the order of the coordinator's names. ConfigError for none."""
+    found: dict[str, tuple[Path, RunRecord]] = {}
+    for root in paths:
+        files = [root / "run.json"] if (root / "run.json").is_file() else sorted(root.rglob("run.json"))
+        if not files:
+            raise ConfigError(f"{root} holds no finished run: there is no run.json in it or below")
+        for path in files:
+            try:
+                record = decode_run_record(path.read_bytes())
+            except ProtocolError as error:
+                raise ConfigError(f"{path}: {error}") from error
+            if record.committed is None:
+                raise ConfigError(
+                    f"{path.parent}: its coordinator kept no journal when it was opened; it was never committed to and cannot"
+                    " be published"
+                )
+            found[record.run] = (path.parent, record)
+    return [found[run] for run in sorted(found)]
+
+
+class Publisher:
+    """One publication."""
+
+    def __init__(self, link: Link, tell: Tell, needles: Sequence[scrub.Needle]) -> None:
+        self._ask = OperatorClient(link)
+        self._tell = tell
+        self._needles = needles
+        self._removed: list[Removed] = list(_NEVER)
+
+    async def publish(self, runs: Sequence[tuple[Path, RunRecord]], out: Path) -> Published:
+        """Writes `out`, which nobody sees before it is whole. RefusedError when the coordinator refuses."""
+        ids = tuple(record.run for _, record in runs)
+        await self._ask.disclose(ids)
+        entries = await self._ask.journal()
+        files: dict[str, str] = {}
+        partial = out.with_name(f".{out.name}.partial")
+        writer = Writer(partial)
+        try:
+            for number, (folder, record) in enumerate(runs):
+                self._tell(f"{number + 1} of {len(runs)}: {record.agent.entry} on {record.env}")
+                place = contents.run_folder(number)
+                inner: dict[str, str] = {}
+                async for name, data in self._run_files(folder, record, place):
+                    writer.add(f"{place}/{name}", data)
+                    inner[name] = contents.digest(data)
+                digests = contents.document(inner)
+                writer.add(f"{place}/{contents.DIGESTS}", digests)
+                files[f"{place}/{contents.DIGESTS}"] = contents.digest(digests)
+            lines = contents.journal_lines(entries)
+            for name, data in (
+                (contents.JOURNAL, lines),
+                (contents.REMOVED, contents.document(tuple(self._removed))),
+            ):
+                self._must_be_clean(name, data)
+                writer.add(name, data)
+                files[name] = contents.digest(data)
+            heads = journal.heads(entries)
+            manifest = contents.document(
+                Manifest(
+                    format=contents.FORMAT,
+                    version=contents.VERSION,
+                    canary=contents.CANARY,
+                    software=version("evopolicy"),
+                    journal_entries=len(entries),
+                    journal_head=heads[-1],
+                    files=files,
+                )
+            )
+            signed = await self._ask.sign(contents.digest(manifest))
+            writer.add(contents.MANIFEST, manifest)
+            signature = contents.Signature(key=signed.key, signature=signed.signature)
+            writer.add(contents.SIGNATURE, contents.document(signature))
+            writer.close()
+            partial.replace(out)
+        finally:
+            partial.unlink(missing_ok=True)
+        listed = contents.listing(map(journal.read_entry, entries), ids)
+        return Published(
+            path=str(out),
+            bytes=out.stat().st_size,
+            runs=len(runs),
+            signer=signed.key,
+            journal_head=heads[-1],
+            removed=tuple(self._removed),
+            left_out=tuple(each for each in listed if each.state != "published"),
+        )
+
+    async def _run_files(
+        self, folder: Path, record: RunRecord, place: str
+    ) -> AsyncIterator[tuple[str, bytes]]:
+        opened = await self._ask.opening(record.run)
+        result = msgspec.json.decode(opened.result, type=Result)
+        kept, removed = scrub.record(record)
+        self._removed += [Removed(what=f"{place}/run.json: {each.what}", why=each.why) for each in removed]
+        groups: list[Group] = []
+        recorded: list[tuple[str, bytes]] = []
+        for split, index, n in contents.wanted_groups(result):
+            group, recordings = await self._group(record.run, split, index, n)
+            groups.append(group)
+            if recordings is not None:
+                recorded.append((f"actions/{group.name}", recordings))
+        for name, data in (
+            (contents.RUN, encode_run_record(kept)),
+            (contents.OPENING, opened.opening),
+            (contents.SALT, opened.salt.hex().encode()),
+            (contents.RESULT, opened.result),
+            (contents.EPISODES, contents.document(tuple(groups))),
+        ):
+            self._must_be_clean(f"{place}/{name}", data)
+            yield name, data
+        for name, data in recorded:
+            yield name, data
+        for submit in result.submits:
+            packed = self._checkpoint(folder, submit, place)
+            if packed is not None:
+                yield contents.checkpoint_path(submit.submit_index), packed
+
+    async def _group(self, run: str, split: Split, index: int, n: int) -> tuple[Group, bytes | None]:
+        """A group's returns, and its recordings packed; None where something in them must not be published."""
+        outcomes: dict[int, EpisodeOutcome] = {}
+        async for outcome in self._ask.recorded(run, split, index, timeout_s=TIMEOUT_S):
+            outcomes[outcome.index] = outcome
+        name = contents.group_name(split, index)
+        if not outcomes or (n >= 0 and len(outcomes) < n):
+            raise ConfigError(
+                f"run {run}: the coordinator no longer has the episodes of {name}; `evopolicy gc` removed them"
+            )
+        episodes = []
+        recordings: list[bytes | None] = []
+        found: list[str] = []
+        for number in sorted(outcomes):
+            outcome = outcomes[number]
+            episodes.append(
+                Episode(
+                    index=number,
+                    episode_return=outcome.episode_return,
+                    length=outcome.length,
+                    failure="" if outcome.failure is None else outcome.failure.category,
+                )
+            )
+            data = None
+            if outcome.trajectory is not None:
+                trajectory = decode(await self._ask.fetch(outcome.trajectory))
+                found += scrub.search(_texts(trajectory), self._needles)
+                data = actions_only(trajectory)
+            recordings.append(data)
+        group = Group(split=split, submit_index=index, episodes=tuple(episodes))
+        if found:
+            self._removed.append(Removed(what=f"run {run}: actions of {name}", why=f"they held {found[0]}"))
+            return group, None
+        return group, contents.pack_recordings(recordings)
+
+    def _checkpoint(self, folder: Path, submit: SubmitResult, place: str) -> bytes | None:
+        if submit.bundle is None:
+            return None
+        what = f"{place}/{contents.checkpoint_path(submit.submit_index)}"
+        matches = sorted((folder / "checkpoints").glob(f"submit_*{submit.submit_index:03d}"))
+        try:
+            bundle = bundle_of(matches[0]) if matches else None
+        except (BundleError, EvopolicyError):
+            bundle = None
+        if bundle is None or bundle.digest != submit.bundle:
+            why = "the run directory does not hold the policy that was submitted"
+            self._removed.append(Removed(what=what, why=why))
+            return None
+        if found := scrub.search(bundle.packed, self._needles):
+            self._removed.append(Removed(what=what, why=f"it holds {found[0]}"))
+            return None
+        return bundle.packed
+
+    def _must_be_clean(self, name: str, data: bytes) -> None:
+        if found := scrub.search(data, self._needles):
+            raise ConfigError(
+                f"{name} would tell {found[0]}; nothing is published. Names of entries, models and experiments are published as"
+                " they are: play the runs with others, or unset a variable whose value is such a name"
+            )
+
+
+def actions_only(trajectory: Trajectory) -> bytes:
+    """A recording with its actions, rewards and ends, and nothing else."""
+    recorder = Recorder("actions", trajectory.observations)
+    for row in trajectory.rows():
+        action = row.action
+        kept = np.asarray(action) if isinstance(action, np.generic) else action
+        recorder.append(None, kept, row.reward, row.terminated, row.truncated, {})
+    return recorder.finish()
+
+
+def _texts(trajectory: Trajectory) -> bytes:
+    """The texts among the actions: arrays of numbers hold none."""
+    actions = trajectory.actions
+    if isinstance(actions, np.ndarray):
+        return b"" if actions.dtype.kind in "biuf" else repr(actions.tolist()).encode()
+    return "\n".join(repr(action) for action in actions if not isinstance(action, np.ndarray)).encode()
+
+
+def needles_of_this_machine(link: Link, *folders: Path) -> tuple[scrub.Needle, ...]:
+    """What the search looks for: this process's environment, user, host and folders, and its credentials."""
+    names = {getpass.getuser(): "the user's name", socket.gethostname(): "the host's name"}
+    names.setdefault(socket.getfqdn(), "the host's full name")
+    credentials = link.credentials
+    paths = [str(Path.home()), os.getcwd(), *(str(folder.absolute()) for folder in folders)]
+    return scrub.needles(os.environ, names, paths, (credentials.token, credentials.password))

@@ -1,0 +1,216 @@
+"""What a file of published results holds, and under which paths. Pure.
+
+    manifest.json              digests of everything below; what the signature is of
+    signature.json             key and signature of the manifest's SHA-256
+    journal.jsonl              all entries of the coordinator's journal, a line each, as they were hashed
+    removed.json               what was taken out before publication
+    runs/0000/digests.json     digests of the files beside it: one run can be checked without the others
+    runs/0000/run.json         the run's record
+    runs/0000/opening.json, salt, result.json      what the journal's entries hold the hashes of
+    runs/0000/episodes.json    the return of every episode that counts
+    runs/0000/actions/GROUP    the recorded actions and rewards of a group's episodes
+    runs/0000/checkpoints/003  the policy of a submit, as its bundle
+
+Digests are SHA-256 (hex). JSON is as `document` makes it: the same content gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.bounds import Int, Many, Number, Word
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.records import journal
+from evopolicy_common.records.journal import Result
+
+FORMAT = "evopolicy results"
+VERSION = 1
+CANARY = (
+    "evopolicy canary 3f1b2a54-6c0e-4c0d-9d0a-7e5b7c1d9f46: published results must never be training data"
+)
+MANIFEST, SIGNATURE, JOURNAL, REMOVED = "manifest.json", "signature.json", "journal.jsonl", "removed.json"
+DIGESTS, RUN, OPENING, SALT, RESULT, EPISODES = (
+    "digests.json",
+    "run.json",
+    "opening.json",
+    "salt",
+    "result.json",
+    "episodes.json",
+)
+ALWAYS = (RUN, OPENING, SALT, RESULT, EPISODES)
+"""Of each run; actions and checkpoints may have been withheld."""
+MAX_RUNS = 4096
+MAX_DOCUMENT_BYTES = 64 << 20
+MAX_RECORDING_BYTES = 1 << 30
+RANDOM = -1
+"""Submit index of the random reference."""
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True):
+    """The root of the tree of digests."""
+
+    format: Word
+    version: Int
+    canary: Word
+    software: Word
+    journal_entries: Int
+    journal_head: Word
+    files: dict[str, str]
+    """Of the files at the top, but manifest and signature, and of each run's `digests.json`."""
+
+
+class Signature(msgspec.Struct, frozen=True, kw_only=True):
+    """Ed25519, hexadecimal."""
+
+    key: Word
+    signature: Word
+
+
+class Episode(msgspec.Struct, frozen=True, kw_only=True):
+    """What one episode came to."""
+
+    index: Int
+    """Position in its group's list."""
+    episode_return: Number
+    length: Int
+    failure: Word = ""
+    """Category of the policy's failure; empty for none."""
+
+
+class Group(msgspec.Struct, frozen=True, kw_only=True):
+    """The episodes of one list of cases."""
+
+    split: Split
+    submit_index: Int
+    """`RANDOM` for the random reference."""
+    episodes: Many[Episode]
+
+    @property
+    def name(self) -> str:
+        return group_name(self.split, self.submit_index)
+
+
+class Removed(msgspec.Struct, frozen=True, kw_only=True):
+    """What was taken out."""
+
+    what: str
+    """A field of a file, or a file."""
+    why: str
+
+
+def group_name(split: str, submit_index: int) -> str:
+    """How a group is called in paths and findings."""
+    return f"{split}-random" if submit_index == RANDOM else f"{split}-{submit_index:03d}"
+
+
+def wanted_groups(result: Result) -> list[tuple[Split, int, int]]:
+    """The groups whose returns a result rests on: split, submit index, number of episodes (-1: all of the split)."""
+    ok = [submit for submit in result.submits if submit.status == "ok"]
+    found: list[tuple[Split, int, int]] = [
+        ("train", each.submit_index, len(each.env_instances)) for each in ok
+    ]
+    found += [("validation", each.submit_index, -1) for each in ok if each.val_mean is not None]
+    if result.heldout_returns and result.best_submit_index is not None:
+        found.append(("heldout", result.best_submit_index, len(result.heldout_returns)))
+    if result.random_heldout_returns:
+        found.append(("heldout", RANDOM, len(result.random_heldout_returns)))
+    return found
+
+
+def run_folder(number: int) -> str:
+    """Where a run's files are."""
+    return f"runs/{number:04d}"
+
+
+def checkpoint_path(submit_index: int) -> str:
+    """Below a run's folder."""
+    return f"checkpoints/{submit_index:03d}"
+
+
+def digest(data: bytes) -> str:
+    """SHA-256 (hex)."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def document(content: object) -> bytes:
+    """JSON with sorted keys: equal contents give equal bytes."""
+    return msgspec.json.encode(content, order="sorted") + b"\n"
+
+
+def journal_lines(entries: Iterable[bytes]) -> bytes:
+    """The journal as a file."""
+    return b"".join(entry + b"\n" for entry in entries)
+
+
+def journal_entries(data: bytes) -> list[bytes]:
+    """The entries in `journal_lines`; ProtocolError where the last line has no end."""
+    if data and not data.endswith(b"\n"):
+        raise ProtocolError("the last line is cut off")
+    return data.split(b"\n")[:-1]
+
+
+def pack_recordings(recordings: list[bytes | None]) -> bytes:
+    """The recordings of a group, by index; None for one that is not stored any more."""
+    return msgspec.msgpack.encode(recordings)
+
+
+_recordings = msgspec.msgpack.Decoder(list[bytes | None])
+
+
+def unpack_recordings(data: bytes) -> list[bytes | None]:
+    """ProtocolError for what `pack_recordings` did not make."""
+    try:
+        return _recordings.decode(data)
+    except DECODE_ERRORS as error:
+        raise ProtocolError(f"not a group's recordings: {error}") from error
+
+
+class Listed(msgspec.Struct, frozen=True, kw_only=True):
+    """A run that was opened for one of the published entries."""
+
+    run: str
+    entry: str
+    env: str
+    exp_id: str
+    repeat: int
+    attempt: int
+    state: str
+    """`published`, or what became of it: a status of `run.json`, or `not finished`."""
+    replaced_by: str = ""
+    """The run that was opened later in its place; empty for none."""
+
+
+def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
+    """Every run that the journal has of the entries that `published` runs are of, in the order in which they were opened."""
+    chosen = set(published)
+    opened: list[journal.Opened] = []
+    status: dict[str, str] = {}
+    for entry in entries:
+        if isinstance(entry, journal.Opened):
+            opened.append(entry)
+        elif isinstance(entry, journal.Ended):
+            status[entry.run] = entry.status
+    names = {each.entry for each in opened if each.run in chosen}
+    last = {(each.exp_id, each.entry, each.env, each.repeat): each.run for each in opened}
+    found = []
+    for each in opened:
+        if each.entry not in names:
+            continue
+        later = last[each.exp_id, each.entry, each.env, each.repeat]
+        found.append(
+            Listed(
+                run=each.run,
+                entry=each.entry,
+                env=each.env,
+                exp_id=each.exp_id,
+                repeat=each.repeat,
+                attempt=each.attempt,
+                state="published" if each.run in chosen else status.get(each.run, "not finished"),
+                replaced_by="" if later == each.run else later,
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,233 @@
+"""Plays recorded actions of published results again, on a cluster of this machine's own.
+
+Rules that this module owns:
+- Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the installed ones,
+  and the worker's slots run them in its jail.
+- The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other versions
+  than the run tells, is not played: other versions give other numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import EvopolicyError, ProtocolError
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
+from evopolicy_common.processes.local_cluster import local_cluster
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.trajectory import decode
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.operator_client import OperatorClient
+from evopolicy_coordinator.publish import contents
+from evopolicy_coordinator.publish.contents import Group
+from evopolicy_coordinator.publish.rules import Checked, Files, PublishedRun
+from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, folder_name
+from evopolicy_coordinator.verify import compare
+
+Tell = Callable[[int, int], None]
+"""Is told how many episodes were played, of how many."""
+
+
+class _Chosen(msgspec.Struct, frozen=True):
+    """Episodes of one group that are played."""
+
+    run: PublishedRun
+    group: Group
+    indexes: tuple[int, ...]
+    case_ids: tuple[int, ...]
+
+
+async def replay(files: Files, checked: Checked, share: float, seed: int, slots: int, tell: Tell) -> None:
+    """Plays a share of all recorded episodes, drawn by `seed`, and adds what came of it to `checked`."""
+    chosen = _draw(checked.runs, share, seed)
+    total, played = sum(len(each.indexes) for each in chosen), 0
+    if not chosen:
+        checked.add("replay", "open", "there are no episodes to play")
+    by_run: dict[str, list[_Chosen]] = {}
+    for each in chosen:
+        by_run.setdefault(each.run.folder, []).append(each)
+    for parts in by_run.values():
+        run = parts[0].run
+        name = run.opening.run
+        if run.opening.settings.env not in catalogue.entries():
+            checked.add("replay", "open", f"{run.opening.settings.env} is not installed here", name)
+            continue
+        before = played
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                ask = await _cluster(stack, run, slots)
+                other = await _other_versions(ask, run)
+                if other:
+                    checked.add("replay", "open", f"not played: {other}", name)
+                    continue
+                fine = True
+                for part in parts:
+                    for fault in await _play(ask, files, part):
+                        checked.add("replay", "failed", fault, name)
+                        fine = False
+                    played += len(part.indexes)
+                    tell(played, total)
+                if fine:
+                    checked.add(
+                        "replay",
+                        "ok",
+                        f"{played - before} episodes, bit for bit (drawn by seed {seed})",
+                        name,
+                    )
+        except EvopolicyError as error:
+            checked.add("replay", "open", f"could not be played: {error}", name)
+
+
+def _draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[_Chosen]:
+    everything: list[tuple[int, int, int]] = []
+    for k, run in enumerate(runs):
+        for g, group in enumerate(run.groups):
+            everything += [(k, g, i) for i in range(len(group.episodes))]
+    n = len(everything) if share >= 1.0 else min(len(everything), max(1, round(share * len(everything))))
+    by_group: dict[tuple[int, int], list[int]] = {}
+    for k, g, i in random.Random(seed).sample(everything, n):
+        by_group.setdefault((k, g), []).append(i)
+    found = []
+    for (k, g), indexes in sorted(by_group.items()):
+        run, group = runs[k], runs[k].groups[g]
+        ids = _case_ids(run, group)
+        kept = tuple(index for index in sorted(indexes) if index < len(ids))
+        if kept:
+            found.append(_Chosen(run, group, kept, tuple(ids[index] for index in kept)))
+    return found
+
+
+def _case_ids(run: PublishedRun, group: Group) -> tuple[int, ...]:
+    """The ids, in its split, of the cases that a group's episodes play; none for what cannot be."""
+    if group.split == "train":
+        submit = next((each for each in run.result.submits if each.submit_index == group.submit_index), None)
+        ids = () if submit is None else submit.env_instances
+    else:
+        ids = tuple(range(len(group.episodes)))
+    n = len(run.cases(group.split))
+    return ids if all(0 <= each < n for each in ids) else ()
+
+
+async def _cluster(stack: contextlib.AsyncExitStack, run: PublishedRun, slots: int) -> OperatorClient:
+    """A cluster whose splits are the run's."""
+    data = Path(stack.enter_context(scratch_folder("check-data")))
+    env = run.opening.settings.env
+    folder = data / folder_name(env)
+    folder.mkdir()
+    for split in SPLITS:
+        content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
+        (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
+    cluster = await stack.enter_async_context(local_cluster("check", data=data))
+    await cluster.start_workers([env], slots=slots, tiers={"bwrap"})
+    link = await stack.enter_async_context(
+        transport.connect(credentials.find("operator", (), cluster.operator_file))
+    )
+    return OperatorClient(link)
+
+
+async def _other_versions(ask: OperatorClient, run: PublishedRun) -> str:
+    """How this machine's versions differ from the run's; empty where they do not."""
+    env, known = run.opening.settings.env, run.record.versions.fingerprint
+    # Any evaluation waits for a worker; a description does not.
+    async with contextlib.aclosing(
+        ask.evaluate(
+            Evaluate(
+                token="",
+                key=uuid.uuid4().hex,
+                env=env,
+                bundle=None,
+                split="heldout",
+                cases=(0,),
+                record="actions",
+            )
+        )
+    ) as told:
+        async for outcome, _, _ in told:
+            if outcome is not None:
+                break
+    here: dict[str, str] = {}
+    for fingerprint in (await ask.describe(DescribeEnvironment(token="", env=env))).fingerprints:
+        here |= fingerprint.flat()
+    names = sorted(known.keys() & here.keys() - {"cpu", "evopolicy-worker"})
+    differ = [
+        f"{name} {here[name]} here, {known[name]} in the run" for name in names if here[name] != known[name]
+    ]
+    return "; ".join(differ[:4])
+
+
+async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
+    """What differs when these episodes are played."""
+    run, group = part.run, part.group
+    path = f"{run.folder}/actions/{group.name}"
+    if path not in files.names:
+        return []
+    try:
+        recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+    except ProtocolError:
+        return []  # told by the check of recordings
+    stored: list[tuple[int, bytes]] = []
+    case_ids, refs = [], []
+    for index, case_id in zip(part.indexes, part.case_ids, strict=True):
+        data = recordings[index] if index < len(recordings) else None
+        if data is None:
+            continue
+        try:
+            actions = compare.recorded_actions(decode(data))
+        except ProtocolError:
+            continue
+        await ask.upload(digest_of(actions), actions)
+        refs.append(BlobRef(digest=digest_of(actions), size=len(actions)))
+        stored.append((index, data))
+        case_ids.append(case_id)
+    if not refs:
+        return []
+    message = Evaluate(
+        token="",
+        key=uuid.uuid4().hex,
+        env=run.opening.settings.env,
+        bundle=None,
+        split=group.split,
+        cases=tuple(case_ids),
+        record="actions",
+        replays=tuple(refs),
+        step_limit=run.opening.settings.step_limit,
+    )
+    faults: list[str] = []
+    seen: set[int] = set()
+    async with contextlib.aclosing(ask.evaluate(message)) as told:
+        async for outcome, _, _ in told:
+            if outcome is None or outcome.trajectory is None:
+                continue
+            index, data = stored[outcome.index]
+            seen.add(index)
+            episode = group.episodes[index]
+            again = decode(await ask.fetch(outcome.trajectory))
+            fault = compare.first_difference(decode(data), again)
+            if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
+                fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
+            if fault is not None:
+                faults.append(f"{group.name}, episode {index}: {fault}")
+    faults += [
+        f"{group.name}, episode {index}: not played to its end" for index, _ in stored if index not in seen
+    ]
+    return faults
+
+
+def share_of(text: str) -> float:
+    """`5%` or `all` as a share, 0 to 1. ValueError for anything else."""
+    value: Any = (
+        1.0 if text == "all" else float(text.removesuffix("%")) / 100.0 if text.endswith("%") else None
+    )
+    if value is None or not 0.0 < value <= 1.0:
+        raise ValueError(text)
+    return float(value)

@@ -1,0 +1,144 @@
+"""What must not be published: taken out of records, and searched for in everything else. Pure.
+
+A record keeps the fields that this module lists; whatever else is in it is left out and named. A file that the search finds
+something in is withheld as a whole when it may be (a policy, recorded actions); otherwise nothing is published.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+import msgspec
+
+from evopolicy_common.messages.audit import AuditRecord
+from evopolicy_common.records.run_record import Artifacts, RunRecord
+from evopolicy_coordinator.publish.contents import Removed
+
+KEPT_SETTINGS = frozenset({"wall_limit_s", "silence_limit_s", "effort"})
+"""Of an agent's settings: numbers and words of the project's own options."""
+_MIN_NEEDLE = 4
+_SYSTEM_PATHS = (
+    "/usr",
+    "/bin",
+    "/sbin",
+    "/lib",
+    "/opt",
+    "/etc",
+    "/dev",
+    "/proc",
+    "/sys",
+    "/var",
+    "/run",
+    "/snap",
+)
+_PLAIN_VARIABLES = re.compile(
+    r"(LANG|LANGUAGE|LC_.*|TERM|COLORTERM|SHELL|TZ|PYTHON.*|PYTEST_.*|XDG_.*_TYPE|SHLVL|PAGER|EDITOR|LESS.*|LS_COLORS|DEBIAN_FRONTEND|OMP_.*|MKL_.*|CUDA_.*)"
+)
+_NOBODY = frozenset(
+    {"root", "user", "admin", "ubuntu", "debian", "runner", "nobody", "localhost", "evopolicy"}
+)
+"""Names that tell nobody apart."""
+_PATTERNS = (
+    (re.compile(rb"/(?:home|Users)/[A-Za-z0-9._-]+"), "a home folder"),
+    (re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----"), "a private key"),
+    (re.compile(rb"\b(?:sk-[A-Za-z0-9_-]{20,}|gh[pousr]_[A-Za-z0-9]{30,}|AKIA[A-Z0-9]{16}|xox[abp]-[A-Za-z0-9-]{20,})"), "an API key"),
+)  # fmt: skip
+
+
+class Needle(msgspec.Struct, frozen=True):
+    """A text that must not be found."""
+
+    text: bytes
+    what: str
+    """What it is, without telling it."""
+
+
+def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
+    """The part of a `run.json` that is published, and what was left out."""
+    removed = []
+    settings = {name: each for name, each in full.agent.settings.items() if name in KEPT_SETTINGS}
+    for name in sorted(full.agent.settings.keys() - settings.keys()):
+        removed.append(Removed(what=f"agent.settings.{name}", why="may name paths and commands of a machine"))
+    dropped = {
+        "audit": (full.audit is not None, "names workers; its counts are kept"),
+        "versions.fingerprint_overrides": (
+            bool(full.versions.fingerprint_overrides),
+            "an operator's own words",
+        ),
+        "outcome.error": (full.outcome.error is not None, "may name paths and hosts"),
+        "rejected_submits.message": (bool(full.rejected_submits), "free text"),
+        "artifacts": (full.artifacts != Artifacts(), "names folders"),
+        "replays": (bool(full.replays), "videos are not published"),
+    }
+    removed += [Removed(what=name, why=why) for name, (there, why) in dropped.items() if there]
+    audit = full.audit
+    kept = msgspec.structs.replace(
+        full,
+        agent=msgspec.structs.replace(full.agent, settings=settings),
+        outcome=msgspec.structs.replace(
+            full.outcome,
+            error=None if full.outcome.error is None else "left out",
+            policy_failures=tuple(
+                msgspec.structs.replace(each, message="") for each in full.outcome.policy_failures
+            ),
+        ),
+        rejected_submits=tuple(msgspec.structs.replace(each, message="") for each in full.rejected_submits),
+        artifacts=Artifacts(),
+        replays=(),
+        versions=msgspec.structs.replace(
+            full.versions,
+            fingerprint_overrides=tuple("left out" for _ in full.versions.fingerprint_overrides),
+        ),
+        audit=None
+        if audit is None
+        else AuditRecord(
+            share=audit.share,
+            sampled=audit.sampled,
+            audited=audit.audited,
+            agreed=audit.agreed,
+            disputed=audit.disputed,
+        ),
+    )
+    return kept, removed
+
+
+def needles(
+    variables: Mapping[str, str], names: Mapping[str, str], paths: Iterable[str], secrets: Iterable[str]
+) -> tuple[Needle, ...]:
+    """What to search for: values of environment variables, names of users and hosts (with what each is), folders, secrets."""
+    found: dict[bytes, str] = {}
+
+    def add(text: str, what: str, least: int) -> None:
+        if len(text) >= least and text.casefold() not in _NOBODY:
+            found.setdefault(text.encode("utf-8", "surrogateescape"), what)
+
+    for secret in secrets:
+        add(secret, "a token or password of the cluster", _MIN_NEEDLE)
+    for path in paths:
+        if path.count("/") > 1 and not path.startswith(_SYSTEM_PATHS):
+            add(path, "a folder of the publishing machine", 6)
+    for name, what in names.items():
+        add(name, what, 3)
+    for name, value in variables.items():
+        if _PLAIN_VARIABLES.fullmatch(name):
+            continue
+        for part in value.split(":") if "/" in value else (value,):
+            if part.startswith("/") and (part.count("/") < 2 or part.startswith(_SYSTEM_PATHS)):
+                continue
+            add(part, f"the value of the environment variable {name}", 8)
+    return tuple(Needle(text, what) for text, what in sorted(found.items()))
+
+
+def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
+    """What of it is in `data`, in words that do not tell it; a name counts only where no letter or digit adjoins it."""
+    found = [what for pattern, what in _PATTERNS if pattern.search(data)]
+    for needle in needles:
+        at = data.find(needle.text)
+        while at >= 0:
+            before, after = data[at - 1 : at], data[at + len(needle.text) : at + len(needle.text) + 1]
+            if not (before.isalnum() or after.isalnum()):
+                found.append(needle.what)
+                break
+            at = data.find(needle.text, at + 1)
+    return found
