@@ -206,10 +206,10 @@ class Recorder:
         )
 
 
-def decode(data: bytes) -> Trajectory:
-    """The episode in `data`; ProtocolError when it is none."""
+def decode(data: bytes, max_bytes: int = MAX_BYTES) -> Trajectory:
+    """The episode in `data`; ProtocolError when it is none, or more than `max_bytes` unpacked."""
     try:
-        return _decode(data)
+        return _decode(data, max_bytes)
     except (
         msgspec.DecodeError,
         zstandard.ZstdError,
@@ -226,13 +226,13 @@ def decode(data: bytes) -> Trajectory:
         raise ProtocolError(f"{len(data)} bytes are not a trajectory: {error}") from error
 
 
-def _decode(data: bytes) -> Trajectory:
+def _decode(data: bytes, max_bytes: int) -> Trajectory:
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("they do not begin with the format's mark")
     frames = _frames(data)
     header = columns.decoder.decode(next(frames, b"")[:_MAX_HEADER_BYTES])
     full = header["record"] == "full"
-    blocks = _blocks(frames, full)
+    blocks = _blocks(frames, full, max_bytes)
     lists = header["observations"] == "lists"
     observed = (
         columns.join([block.obs for block in blocks if block.obs is not None]) if full and blocks else None
@@ -271,7 +271,7 @@ class _Block(NamedTuple):
     infos: list[dict[str, Any]]
 
 
-def _blocks(frames: Iterator[bytes], full: bool) -> list[_Block]:
+def _blocks(frames: Iterator[bytes], full: bool, max_bytes: int) -> list[_Block]:
     """The blocks in `frames`, of which nothing is taken at its word: sizes and counts are held to the limits first."""
     decompressor = zstandard.ZstdDecompressor()
     blocks: list[_Block] = []
@@ -281,6 +281,8 @@ def _blocks(frames: Iterator[bytes], full: bool) -> list[_Block]:
         if not 0 < size <= min(MAX_BLOCK_BYTES, columns.most_of(frame)):
             raise ValueError(f"a block of {len(frame)} bytes claims {size}")
         n_bytes += size
+        if n_bytes > max_bytes:
+            raise ValueError(f"more than {max_bytes:,} bytes")
         packed = decompressor.decompress(frame)
         if n_bytes > _UNCOUNTED_BYTES:
             n_values += columns.count_values(packed, MAX_VALUES - n_values)
@@ -294,8 +296,8 @@ def _blocks(frames: Iterator[bytes], full: bool) -> list[_Block]:
         obs = columns.unpack(block["obs"], pictures=True) if full else None
         if block["obs"] and block["obs"][0] == "pictures" and isinstance(obs, columns.Arrays):
             n_bytes += obs.array.nbytes
-        if n_bytes > MAX_BYTES:
-            raise ValueError(f"more than {MAX_BYTES:,} bytes")
+        if n_bytes > max_bytes:
+            raise ValueError(f"more than {max_bytes:,} bytes")
         actions = columns.unpack(block["actions"])
         infos = block["infos"]
         if isinstance(infos, int):

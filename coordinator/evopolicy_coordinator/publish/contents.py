@@ -26,6 +26,7 @@ from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Result
+from evopolicy_common.records.trajectory import Trajectory, decode
 
 FORMAT = "evopolicy results"
 VERSION = 1
@@ -46,6 +47,9 @@ ALWAYS = (RUN, OPENING, SALT, RESULT, EPISODES)
 MAX_RUNS = 4096
 MAX_DOCUMENT_BYTES = 64 << 20
 MAX_RECORDING_BYTES = 1 << 30
+"""Of a group's recordings together, packed."""
+MAX_EPISODE_BYTES = 256 << 20
+"""Of one recording, unpacked."""
 RANDOM = -1
 """Submit index of the random reference."""
 
@@ -167,6 +171,14 @@ def unpack_recordings(data: bytes) -> list[bytes | None]:
         return _recordings.decode(data)
     except DECODE_ERRORS as error:
         raise ProtocolError(f"not a group's recordings: {error}") from error
+
+
+def recording(data: bytes) -> Trajectory:
+    """A published recording; ProtocolError for what is none, or holds more than actions and rewards."""
+    found = decode(data, MAX_EPISODE_BYTES)
+    if found.record != "actions":
+        raise ProtocolError("it holds more than actions and rewards")
+    return found
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True):

@@ -182,7 +182,7 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
         if data is None:
             continue
         try:
-            actions = compare.recorded_actions(decode(data))
+            actions = compare.recorded_actions(contents.recording(data))
         except ProtocolError:
             continue
         await ask.upload(digest_of(actions), actions)
@@ -212,7 +212,7 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
             seen.add(index)
             episode = group.episodes[index]
             again = decode(await ask.fetch(outcome.trajectory))
-            fault = compare.first_difference(decode(data), again)
+            fault = compare.first_difference(contents.recording(data), again)
             if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
                 fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
             if fault is not None:

@@ -21,7 +21,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import bundles, journal
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
-from evopolicy_common.records.trajectory import Trajectory, decode
+from evopolicy_common.records.trajectory import Trajectory
 from evopolicy_coordinator.pki.identity import signed_by
 from evopolicy_coordinator.publish import contents
 from evopolicy_coordinator.publish.contents import Group, Listed, Manifest, Removed, Signature
@@ -595,7 +595,7 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
     """Where a recording contradicts what is told of its episode; None when it does not."""
     try:
-        recording = decode(data)
+        recording = contents.recording(data)
     except ProtocolError as error:
         return str(error)
     total = return_of(recording)

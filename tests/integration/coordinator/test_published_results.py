@@ -1,0 +1,519 @@
+"""Results that were really played and published: untouched they hold, and each kind of tampering is named.
+
+Most forgers here are strong: they make all digests, the journal's head and the signature anew, with a key of their own. What they
+cannot make anew is what follows from something else.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records import bundles, journal
+from evopolicy_common.records.bundles import BundleFile
+from evopolicy_common.records.trajectory import Recorder, decode
+from evopolicy_coordinator.publish import contents, rules
+from evopolicy_coordinator.publish.archive import Archive, Writer
+
+ENV = "toy/line"
+AGENT = """
+import json, os, urllib.request
+def submit(scale, ids):
+    with open("system/policy.py", "w") as file:
+        file.write(f'''
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        pass
+    def reset(self, episode_index):
+        pass
+    def act(self, obs):
+        return {scale}
+''')
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
+    )
+    urllib.request.urlopen(request).read()
+submit(1, [0, 1])
+submit(0, [2, 0, 1])
+"""
+
+
+def evopolicy(cwd: Path, *args: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "evopolicy_gateway.cli", *args],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+class Results:
+    """A state folder with two runs of one entry, and files of published results."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        (root / "agent.py").write_text(AGENT)
+        for exp_id in ("first", "second"):
+            done = evopolicy(
+                root,
+                *(
+                    "local",
+                    "--env",
+                    ENV,
+                    "--budget",
+                    "5",
+                    "--validation",
+                    "2",
+                    "--heldout",
+                    "3",
+                    "--state",
+                    "st",
+                ),
+                *(
+                    "--agent",
+                    f"command:{sys.executable} {root / 'agent.py'}",
+                    "--entry",
+                    "mine",
+                    "--exp-id",
+                    exp_id,
+                ),
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+        self.told = self.publish("all.evp", "runs")
+        self.files = self.read("all.evp")
+
+    def publish(self, out: str, *runs: str) -> dict[str, Any]:
+        done = evopolicy(self.root, "publish", *runs, "--out", out, "--local", "--state", "st", "--json")
+        assert done.returncode == 0, done.stdout + done.stderr
+        told: dict[str, Any] = json.loads(done.stdout)
+        return told
+
+    def read(self, name: str) -> dict[str, bytes]:
+        with Archive(self.root / name) as archive:
+            return {each: archive.read(each, 1 << 30) for each in archive.names}
+
+    def run_folder(self, exp_id: str) -> str:
+        return str(next(self.root.glob(f"runs/*/*/{exp_id}")).relative_to(self.root))
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return Results(tmp_path_factory.mktemp("published"))
+
+
+class Held:
+    """Files in memory."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = files
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(self.files)
+
+    def read(self, name: str, most: int) -> bytes:
+        if name not in self.files:
+            raise ProtocolError(f"there is no {name}")
+        return self.files[name]
+
+
+class Forger:
+    """Changes published files."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = dict(files)
+
+    def json(self, name: str, change: Callable[[Any], Any]) -> None:
+        """Changes a document in place, or into what `change` returns."""
+        told = json.loads(self.files[name])
+        new = change(told)
+        self.files[name] = json.dumps(told if new is None else new).encode()
+
+    def text(self, name: str, before: bytes, after: bytes) -> None:
+        assert before in self.files[name]
+        self.files[name] = self.files[name].replace(before, after, 1)
+
+    def entries(self, change: Callable[[list[bytes]], list[bytes]]) -> None:
+        """Changes the journal, and what `run.json` tells of it, as its owner could who begins another."""
+        lines = change(contents.journal_entries(self.files[contents.JOURNAL]))
+        self.files[contents.JOURNAL] = contents.journal_lines(lines)
+
+    def sign(self) -> None:
+        """Makes digests, head and signature anew."""
+        folders = sorted({name[:9] for name in self.files if name.startswith("runs/")})
+        manifest = json.loads(self.files[contents.MANIFEST])
+        manifest["files"] = {}
+        for folder in folders:
+            own = {
+                name.removeprefix(f"{folder}/"): contents.digest(data)
+                for name, data in self.files.items()
+                if name.startswith(f"{folder}/") and not name.endswith(contents.DIGESTS)
+            }
+            self.files[f"{folder}/{contents.DIGESTS}"] = contents.document(own)
+            manifest["files"][f"{folder}/{contents.DIGESTS}"] = contents.digest(contents.document(own))
+        for name in (contents.JOURNAL, contents.REMOVED):
+            manifest["files"][name] = contents.digest(self.files[name])
+        lines = contents.journal_entries(self.files[contents.JOURNAL])
+        manifest["journal_entries"], manifest["journal_head"] = len(lines), journal.heads(lines)[-1]
+        self.files[contents.MANIFEST] = contents.document(msgspec.convert(manifest, contents.Manifest))
+        key = Ed25519PrivateKey.from_private_bytes(b"f" * 32)
+        digest = contents.digest(self.files[contents.MANIFEST])
+        signature = contents.Signature(
+            key=key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex(),
+            signature=key.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex(),
+        )
+        self.files[contents.SIGNATURE] = contents.document(signature)
+
+
+RUN, RESULT, OPENING, EPISODES, SALT = (
+    f"runs/0000/{name}"
+    for name in (contents.RUN, contents.RESULT, contents.OPENING, contents.EPISODES, contents.SALT)
+)
+
+
+def put(*path: str | int, value: Any) -> Callable[[Any], None]:
+    """Sets a part of a document."""
+
+    def change(told: Any) -> None:
+        for step in path[:-1]:
+            told = told[step]
+        assert told[path[-1]] != value
+        told[path[-1]] = value
+
+    return change
+
+
+def rerecorded(forger: Forger, group: str = "heldout-001", reward: float = 100.0) -> None:
+    """Another reward in a recording."""
+    name = f"runs/0000/actions/{group}"
+    recordings = contents.unpack_recordings(forger.files[name])
+    assert recordings[0] is not None
+    recorder = Recorder("actions")
+    for row in decode(recordings[0]).rows():
+        recorder.append(None, row.action, reward, row.terminated, row.truncated, {})
+    forger.files[name] = contents.pack_recordings([recorder.finish(), *recordings[1:]])
+
+
+def swap_policy(forger: Forger) -> None:
+    bundle = bundles.pack([BundleFile("policy.py", False, b"class Policy: pass")])
+    forger.files["runs/0000/checkpoints/001"] = bundle.packed
+
+
+def swap_policy_and_result(forger: Forger) -> None:
+    swap_policy(forger)
+    digest = contents.digest(forger.files["runs/0000/checkpoints/001"])
+    forger.json(RESULT, put("submits", 1, "bundle", value=digest))
+
+
+def drop_run(forger: Forger) -> None:
+    forger.files = {name: data for name, data in forger.files.items() if not name.startswith("runs/0001/")}
+
+
+def double_run(forger: Forger) -> None:
+    for name, data in list(forger.files.items()):
+        if name.startswith("runs/0000/"):
+            forger.files[name.replace("runs/0000", "runs/0002")] = data
+
+
+def entry_edited(lines: list[bytes]) -> list[bytes]:
+    return [lines[0].replace(b'"entry":"mine"', b'"entry":"ours"'), *lines[1:]]
+
+
+def better_result(forger: Forger) -> None:
+    """All that the forger can raise consistently."""
+    for name, path in ((RESULT, ("heldout_returns",)), (RUN, ("outcome", "heldout_returns"))):
+        told = json.loads(forger.files[name])
+        part = told
+        for step in path[:-1]:
+            part = part[step]
+        part[path[-1]] = [0.0, 0.0, 0.0]
+        (told if name == RESULT else told["outcome"])["final_score"] = 0.0
+        forger.files[name] = json.dumps(told).encode()
+
+
+Edit = Callable[[Forger], None]
+SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
+    "a changed held-out return": (lambda f: f.json(EPISODES, put(4, "episodes", 0, "episode_return", value=99.0)), "scores", "not those of the result"),
+    "a changed train return": (lambda f: f.json(EPISODES, put(0, "episodes", 0, "episode_return", value=99.0)), "scores", "have the mean"),
+    "a changed validation return": (lambda f: f.json(EPISODES, put(2, "episodes", 1, "episode_return", value=99.0)), "scores", "have the mean"),
+    "a dropped episode": (lambda f: f.json(EPISODES, lambda told: told[4]["episodes"].pop() and None), "scores", "instead of"),
+    "a dropped list of episodes": (lambda f: f.json(EPISODES, lambda told: told[:-1]), "scores", "are not there"),
+    "a doubled list of episodes": (lambda f: f.json(EPISODES, lambda told: [*told, told[0]]), "scores", "twice"),
+    "a swapped checkpoint": (swap_policy, "checkpoints", "another policy"),
+    "a swapped checkpoint and its digest": (swap_policy_and_result, "result", "not the result"),
+    "an edited setting": (lambda f: f.json(RUN, put("experiment_dimensions", "policy_scope", value="submit")), "record", "policy_scope"),
+    "an edited setting in the opening too": (lambda f: f.json(OPENING, put("settings", "policy_scope", value="submit")), "commitment", "not those that were committed to"),
+    "an edited budget": (lambda f: f.json(OPENING, put("budget", value=500)), "commitment", "not those that were committed to"),
+    "splits that do not match the commitment": (lambda f: f.json(OPENING, put("heldout", 0, "seed", value=7)), "commitment", "not those that were committed to"),
+    "a held-out case that is a train case": (lambda f: f.json(OPENING, lambda told: told["heldout"].__setitem__(0, told["train"][0])), "commitment", "not disjoint"),
+    "another salt": (lambda f: f.files.__setitem__(SALT, b"00" * 32), "commitment", "not those that were committed to"),
+    "a salt of no length": (lambda f: f.files.__setitem__(SALT, b""), "commitment", "0 bytes instead of 32"),
+    "another hash of the splits": (lambda f: f.json(RUN, put("versions", "cases_hashes", "heldout", value="sha256:00")), "record", "heldout cases"),
+    "public cases called secret": (lambda f: f.json(RUN, put("versions", "data_secret", value=False)), "record", "data_secret"),
+    "a raised score": (lambda f: f.json(RUN, put("outcome", "final_score", value=1000.0)), "record", "final_score"),
+    "a raised score everywhere": (better_result, "result", "not the result"),
+    "a smaller spread": (lambda f: f.json(RUN, put("outcome", "heldout_std_return", value=0.001)), "record", "heldout_std_return"),
+    "a weaker random reference": (lambda f: f.json(RUN, put("outcome", "random_reference", "mean_return", value=-1e6)), "record", "random actions"),
+    "a validation mean edited": (lambda f: f.json(RUN, put("outcome", "val_scores", "0", value=1e6)), "record", "val_scores"),
+    "another selected checkpoint": (lambda f: f.json(RESULT, lambda told: put("best_submit_index", value=1 - told["best_submit_index"])(told)), "selection", "has the best validation mean"),
+    "reordered submits": (lambda f: f.json(RESULT, lambda told: told["submits"].reverse()), "budget", "not in order"),
+    "a submit left out": (lambda f: f.json(RESULT, lambda told: told["submits"].pop() and None), "budget", "episodes"),
+    "a submit of more episodes than granted": (lambda f: f.json(RESULT, lambda told: told["submits"][0]["env_instances"].extend([0] * 9)), "budget", "were granted"),
+    "a submit on a case that is not one of train": (lambda f: f.json(RESULT, put("submits", 0, "env_instances", 0, value=10**6)), "budget", "not one of train"),
+    "a failed run called completed": (lambda f: f.json(RUN, put("outcome", "status", value="no_ok_submit")), "record", "status"),
+    "another agent's name": (lambda f: f.json(RUN, put("agent", "entry", value="theirs")), "record", "agent.entry"),
+    "another environment": (lambda f: f.json(RUN, put("env", value="gym/acrobot")), "record", "env"),
+    "another repeat": (lambda f: f.json(RUN, put("repeat", value=5)), "record", "repeat"),
+    "another place in the journal": (lambda f: f.json(RUN, put("committed", "opened_head", value="00" * 32)), "record", "another commitment or head"),
+    "no place in the journal": (lambda f: f.json(RUN, put("committed", value=None)), "record", "another commitment or head"),
+    "recorded rewards edited": (rerecorded, "recordings", "rewards come to"),
+    "a recording left out": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([])), "recordings", "0 recordings"),
+    "a recording that is none": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([b"evotraj1", b"x"])), "recordings", "not a trajectory"),
+    "a run's first entry cut off": (lambda f: f.entries(lambda lines: lines[1:]), "journal", "without being open"),
+    "a journal begun anew": (lambda f: f.entries(lambda lines: lines[2:]), "journal", "no entry of this run"),
+    "entries in another order": (lambda f: f.entries(lambda lines: [lines[2], *lines[:2], *lines[3:]]), "journal", "older than"),
+    "an entry edited": (lambda f: f.entries(entry_edited), "commitment", "another entry"),
+    "an entry that is none": (lambda f: f.entries(lambda lines: [*lines, b'{"kind":"paid"}']), "journal", "not an entry"),
+    "a disclosure left out": (lambda f: f.entries(lambda lines: lines[:-1]), "disclosure", "was not revealed"),
+    "a run twice": (double_run, "digests", "twice"),
+    "no run at all": (lambda f: [f.files.pop(name) for name in list(f.files) if name.startswith("runs/")] and None, "format", "no run"),
+    "a number that is none": (lambda f: f.text(EPISODES, b'"episode_return":', b'"episode_return":NaN,"x":'), "format", "damaged"),
+    "a number without end": (lambda f: f.text(EPISODES, b'"episode_return":', b'"episode_return":1e999,"x":'), "format", "damaged"),
+    "a length beyond all numbers": (lambda f: f.text(EPISODES, b'"length":', b'"length":' + b"9" * 400 + b',"x":'), "format", "damaged"),
+    "text that is no UTF-8": (lambda f: f.text(RUN, b'"model": "', b'"model": "\xff\xfe'), "format", "not a run record"),
+    "a document nested without end": (lambda f: f.files.__setitem__(OPENING, b"[" * 100_000), "format", "damaged"),
+    "a record of a later version": (lambda f: f.json(RUN, put("record_version", value=99)), "format", "update evopolicy"),
+    "a document of another kind": (lambda f: f.files.__setitem__(RESULT, b"[]"), "format", "damaged"),
+}  # fmt: skip
+"""Of forgers who sign anew."""
+NOT_SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
+    "a changed file": (lambda f: f.json(EPISODES, put(0, "episodes", 0, "episode_return", value=99.0)), "digests", "episodes.json was changed"),
+    "a dropped run": (drop_run, "digests", "is missing"),
+    "a file added": (lambda f: f.files.__setitem__("runs/0000/notes", b"x"), "digests", "was added"),
+    "a dropped file": (lambda f: f.files.pop("runs/0000/checkpoints/000") and None, "digests", "is missing"),
+    "an edited manifest": (lambda f: f.text(contents.MANIFEST, b'"software":"', b'"software":"9'), "signature", "not a signature"),
+    "a manifest with a field twice": (lambda f: f.text(contents.MANIFEST, b"{", b'{"version":1,'), "format", "added or doubled"),
+    "a signature that is none": (lambda f: f.json(contents.SIGNATURE, put("signature", value="zz")), "signature", "not a signature"),
+    "no signature": (lambda f: f.files.pop(contents.SIGNATURE) and None, "format", "there is no signature.json"),
+    "a later format": (lambda f: f.json(contents.MANIFEST, put("version", value=2)), "format", "reads 'evopolicy results' version 1"),
+    "a journal that is cut": (lambda f: f.entries(lambda lines: lines[:-1]), "journal", "not the signed one"),
+    "a journal without an end of line": (lambda f: f.files.__setitem__(contents.JOURNAL, b"{"), "journal", "cut off"),
+}  # fmt: skip
+
+
+def found(files: dict[str, bytes], identity: str = "") -> list[rules.Finding]:
+    return [each for each in rules.check(Held(files), identity).findings if each.state == "failed"]
+
+
+def named(findings: list[rules.Finding], kind: str, text: str) -> bool:
+    return any(each.kind == kind and text in each.text for each in findings)
+
+
+def test_untouched_results_hold(results: Results) -> None:
+    checked = rules.check(Held(results.files), results.told["signer"])
+    assert [each for each in checked.findings if each.state == "failed"] == []
+    assert {each.kind for each in checked.findings if each.state == "open"} == {"order", "policies"}
+    assert {each.kind for each in checked.findings} == rules.KINDS.keys() - {"replay"}
+    assert [each.state for each in checked.listing] == ["published", "published"]
+
+
+@pytest.mark.parametrize("kind", SIGNED_ANEW)
+def test_tampering_is_named_though_all_is_signed_anew(results: Results, kind: str) -> None:
+    edit, finding, text = SIGNED_ANEW[kind]
+    forger = Forger(results.files)
+    edit(forger)
+    forger.sign()
+    findings = found(forger.files)
+    assert named(findings, finding, text), findings
+    assert named(found(forger.files, results.told["signer"]), "identity", "another signer")
+
+
+@pytest.mark.parametrize("kind", NOT_SIGNED_ANEW)
+def test_tampering_with_what_was_signed_is_named(results: Results, kind: str) -> None:
+    edit, finding, text = NOT_SIGNED_ANEW[kind]
+    forger = Forger(results.files)
+    edit(forger)
+    assert named(found(forger.files), finding, text), found(forger.files)
+
+
+def test_signing_anew_alone_is_another_signer(results: Results) -> None:
+    forger = Forger(results.files)
+    forger.sign()
+    assert found(forger.files) == []
+    assert [each.kind for each in found(forger.files, results.told["signer"])] == ["identity"]
+
+
+def test_selected_runs_show_what_they_were_selected_from(results: Results) -> None:
+    told = results.publish("one.evp", results.run_folder("second"))
+    assert [(each["exp_id"], each["state"]) for each in told["left_out"]] == [("first", "completed")]
+    checked = rules.check(Held(results.read("one.evp")))
+    assert not checked.failed
+    assert [each.text for each in checked.findings if each.kind == "completeness"] == [
+        "1 of 2 runs of these entries are left out (1 completed): these runs were selected"
+    ]
+
+
+def test_publishing_again_gives_the_same_bytes(results: Results) -> None:
+    results.publish("again.evp", "runs")
+    assert (results.root / "again.evp").read_bytes() == (results.root / "all.evp").read_bytes()
+
+
+def test_nothing_of_this_machine_is_in_what_is_published(results: Results) -> None:
+    identity = json.loads((results.root / "st" / "identity.json").read_bytes())
+    secrets = [*identity["passwords"].values(), identity["worker_token"], identity["operator_token"]]
+    everything = b"".join(results.files.values())
+    for text in (str(results.root), "agent.py", sys.executable, *secrets):
+        assert text.encode() not in everything
+    removed = {each["what"] for each in json.loads(results.files[contents.REMOVED])}
+    assert {"logs/", "workspace/", "runs/0000/run.json: agent.settings.agent"} <= removed
+
+
+def test_a_policy_that_tells_of_the_machine_is_withheld(results: Results) -> None:
+    folder = results.root / results.run_folder("first")
+    code = (folder / "checkpoints" / "submit_000" / "policy.py").read_text()
+    assert "class Policy" in code
+    target = results.root / "leaky"
+    (target / "agent.py").parent.mkdir()
+    done = evopolicy(
+        results.root,
+        *(
+            "local",
+            "--env",
+            ENV,
+            "--budget",
+            "1",
+            "--validation",
+            "2",
+            "--heldout",
+            "2",
+            "--state",
+            "leaky-st",
+        ),
+        *("--agent", f"replay:{_policy(results.root)}", "--runs", "leaky"),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    args = ("publish", "leaky", "--out", "leaky.evp", "--local", "--state", "leaky-st", "--json")
+    told = json.loads(evopolicy(results.root, *args).stdout)
+    assert any("checkpoints/000" in each["what"] for each in told["removed"])
+    files = results.read("leaky.evp")
+    assert not any("checkpoints" in name for name in files)
+    checked = rules.check(Held(files))
+    assert not checked.failed
+    assert any(each.kind == "checkpoints" and each.state == "open" for each in checked.findings)
+
+
+def _policy(root: Path) -> Path:
+    folder = root / "leaky-policy"
+    folder.mkdir()
+    (folder / "policy.py").write_text(
+        f"# written in {root}\n"
+        "class Policy:\n"
+        "    def __init__(self, obs_space, action_space, env_meta): pass\n"
+        "    def reset(self, episode_index): pass\n"
+        "    def act(self, obs): return 0\n"
+    )
+    return folder
+
+
+def test_the_command_checks_and_replays(results: Results) -> None:
+    identity = results.told["signer"]
+    done = evopolicy(results.root, "check", "all.evp", "--replay", "all", "--identity", identity)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "ok     replay" in done.stdout
+    assert "the signer is the one that you named" in done.stdout
+    plain = evopolicy(results.root, "check", "all.evp", "--json")
+    told = json.loads(plain.stdout)
+    assert (plain.returncode, told["ok"], told["signer"]) == (0, True, identity)
+
+
+def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(results: Results) -> None:
+    """A forger who begins a journal anew with rewards of his own: only the environment contradicts him."""
+    forger = Forger(results.files)
+    drop_run(forger)
+    rerecorded(forger, reward=1.0)
+    recording = contents.unpack_recordings(forger.files["runs/0000/actions/heldout-001"])[0]
+    assert recording is not None
+    value = rules.return_of(decode(recording))
+    result = json.loads(forger.files[RESULT])
+    if result["best_submit_index"] != 1:
+        pytest.fail("the second policy is the better one")
+    result["heldout_returns"][0] = value
+    result["final_score"] = math.fsum(result["heldout_returns"]) / 3
+    forger.files[RESULT] = json.dumps(result).encode()
+    forger.json(EPISODES, put(4, "episodes", 0, "episode_return", value=value))
+
+    def told(record: Any) -> None:
+        returns = result["heldout_returns"]
+        mean = result["final_score"]
+        std = math.sqrt(math.fsum((each - mean) * (each - mean) for each in returns) / 3)
+        outcome = record["outcome"]
+        outcome |= {
+            "heldout_returns": returns,
+            "final_score": mean,
+            "heldout_mean_return": mean,
+            "heldout_std_return": std,
+        }
+
+    def rewritten(lines: list[bytes]) -> list[bytes]:
+        run = result["run"]
+        kept = [json.loads(line) for line in lines]
+        kept = [each for each in kept if each.get("run") == run or each["kind"] == "revealed"]
+        for each in kept:
+            if each["kind"] == "ended":
+                each["result"] = contents.digest(forger.files[RESULT])
+        return [json.dumps(each).encode() for each in kept]
+
+    forger.json(RUN, told)
+    forger.entries(rewritten)
+    heads = journal.heads(contents.journal_entries(forger.files[contents.JOURNAL]))
+    places = {"opened": 0, "opened_head": heads[0], "ended": 1, "ended_head": heads[1]}
+    forger.json(RUN, lambda record: record["committed"].update(places))
+    forger.sign()
+    assert found(forger.files) == []
+    path = results.root / "forged.evp"
+    writer = Writer(path)
+    for name, data in forger.files.items():
+        writer.add(name, data)
+    writer.close()
+    done = evopolicy(results.root, "check", "forged.evp", "--replay", "all")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "FAILED replay: heldout-001, episode 0" in done.stdout
+
+
+def test_wrong_usage_ends_with_2(results: Results) -> None:
+    (results.root / "text.evp").write_text("hello")
+    for args, reason in (
+        (("check", "text.evp"), "not published results"),
+        (("check", "none.evp"), "No such file"),
+        (("check", "all.evp", "--identity", "abc"), "64 hexadecimal digits"),
+        (("check", "all.evp", "--replay", "200%"), "say a share"),
+        (("publish", "runs", "--out", "all.evp", "--local", "--state", "st"), "there already"),
+        (("publish", "st", "--out", "x.evp", "--local", "--state", "st"), "no finished run"),
+    ):
+        done = evopolicy(results.root, *args)
+        assert (done.returncode, reason in done.stderr) == (2, True), done.stderr
+
+
+def test_a_hundred_thousand_entries_are_checked_in_seconds(results: Results) -> None:
+    forger = Forger(results.files)
+    last = json.loads(contents.journal_entries(results.files[contents.JOURNAL])[-1])
+    more = [json.dumps({**last, "epoch": str(number)}).encode() for number in range(100_000)]
+    forger.entries(lambda lines: [*lines, *more])
+    forger.sign()
+    began = time.process_time()
+    assert found(forger.files) == []
+    assert time.process_time() - began < 60

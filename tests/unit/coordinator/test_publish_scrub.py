@@ -1,0 +1,54 @@
+"""What must not be published is found wherever it stands, and what tells nobody apart is not."""
+
+from __future__ import annotations
+
+import pytest
+
+from evopolicy_coordinator.publish import scrub
+
+VARIABLES = {
+    "HOME": "/home/marie",
+    "PATH": "/usr/local/bin:/usr/bin:/srv/marie/tools",
+    "API_KEY": "k-0123456789",
+    "LANG": "en_US.UTF-8",
+    "SHORT": "yes",
+    "PWD": "/data/lab7/work",
+}
+
+
+def needles() -> tuple[scrub.Needle, ...]:
+    names = {"marie": "the user's name", "gpu-lab7": "the host's name", "root": "the user's name"}
+    return scrub.needles(VARIABLES, names, ["/data/lab7/work"], ["tok3n-of-the-operator"])
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("# written by marie", "the user's name"),
+        ("on gpu-lab7:", "the host's name"),
+        ("open('/data/lab7/work/x')", "a folder"),
+        ("token tok3n-of-the-operator", "a token"),
+        ("key = 'k-0123456789'", "variable API_KEY"),
+        ("/srv/marie/tools/run", "variable PATH"),
+        ("/home/jean/policy.py", "a home folder"),
+        ("sk-" + "a1B2" * 8, "an API key"),
+        ("-----BEGIN OPENSSH PRIVATE KEY-----", "a private key"),
+    ],
+)
+def test_what_tells_of_a_machine_is_found(text: str, what: str) -> None:
+    data = b"\x93\x00" + text.encode() + b"\xff"
+    assert any(what in found for found in scrub.search(data, needles()))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["summaries of rootless trees", "#!/usr/bin/env python3", "yes, en_US.UTF-8", "roots = np.roots(x)"],
+)
+def test_what_tells_nobody_apart_is_no_find(text: str) -> None:
+    assert scrub.search(text.encode(), needles()) == []
+
+
+def test_a_find_does_not_repeat_what_it_found() -> None:
+    found = scrub.search(b"marie tok3n-of-the-operator k-0123456789", needles())
+    assert len(found) == 3
+    assert not any("marie" in text or "tok3n" in text or "k-01" in text for text in found)
