@@ -31,7 +31,7 @@ from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_coordinator.publish import contents
 from evopolicy_coordinator.publish.contents import Group
 from evopolicy_coordinator.publish.rules import Checked, Files, PublishedRun
-from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, folder_name
+from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_coordinator.verify import compare
 
 Tell = Callable[[int, int], None]
@@ -55,37 +55,75 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
         checked.add("replay", "open", "there are no episodes to play")
     by_run: dict[str, list[_Chosen]] = {}
     for each in chosen:
-        by_run.setdefault(each.run.folder, []).append(each)
-    for parts in by_run.values():
-        run = parts[0].run
-        name = run.opening.run
-        if run.opening.settings.env not in catalogue.entries():
-            checked.add("replay", "open", f"{run.opening.settings.env} is not installed here", name)
-            continue
-        before = played
+        env, name = each.run.opening.settings.env, each.run.opening.run
+        # A name that is not of an installed environment could be that of a module to import.
+        if catalogue.is_shipped(env) or env in catalogue.plugins():
+            by_run.setdefault(each.run.folder, []).append(each)
+        else:
+            checked.add("replay", "open", f"{env} is not installed here", name)
+    for layer in _layers([parts[0].run for parts in by_run.values()]):
         try:
             async with contextlib.AsyncExitStack() as stack:
-                ask = await _cluster(stack, run, slots)
-                other = await _other_versions(ask, run)
-                if other:
-                    checked.add("replay", "open", f"not played: {other}", name)
-                    continue
-                fine = True
-                for part in parts:
-                    for fault in await _play(ask, files, part):
-                        checked.add("replay", "failed", fault, name)
-                        fine = False
-                    played += len(part.indexes)
-                    tell(played, total)
-                if fine:
-                    checked.add(
-                        "replay",
-                        "ok",
-                        f"{played - before} episodes, bit for bit (drawn by seed {seed})",
-                        name,
+                ask = await _cluster(stack, layer, slots)
+                for run in layer:
+                    played = await _play_run(
+                        ask, files, run, by_run[run.folder], checked, lambda n: tell(n, total), played, seed
                     )
         except EvopolicyError as error:
-            checked.add("replay", "open", f"could not be played: {error}", name)
+            checked.add("replay", "open", f"could not be played: {error}")
+
+
+def _layers(runs: Sequence[PublishedRun]) -> list[list[PublishedRun]]:
+    """The runs in groups in which no two have other cases of one environment: a cluster has one set of cases of each."""
+    layers: list[tuple[dict[str, str], list[PublishedRun]]] = []
+    for run in runs:
+        env, cases = (
+            run.opening.settings.env,
+            cases_hash(case for split in SPLITS for case in run.cases(split)),
+        )
+        for known, members in layers:
+            if known.setdefault(env, cases) == cases:
+                members.append(run)
+                break
+        else:
+            layers.append(({env: cases}, [run]))
+    return [members for _, members in layers]
+
+
+async def _play_run(
+    ask: OperatorClient,
+    files: Files,
+    run: PublishedRun,
+    parts: Sequence[_Chosen],
+    checked: Checked,
+    tell: Callable[[int], None],
+    played: int,
+    seed: int,
+) -> int:
+    """Plays the chosen episodes of one run; `played` with their number added."""
+    name = run.opening.run
+    other, other_cpu = await _other_versions(ask, run)
+    if other:
+        checked.add("replay", "open", f"not played: {other}", name)
+        return played
+    before, faults = played, []
+    for part in parts:
+        n, found = await _play(ask, files, part)
+        faults += found
+        played += n
+        tell(played)
+    for fault in faults:
+        if other_cpu:
+            text = f"{fault}; this machine's processor has other features than the run's, which can change numbers"
+            checked.add("replay", "open", text, name)
+        else:
+            checked.add("replay", "failed", fault, name)
+    if played == before:
+        checked.add("replay", "open", "no episode was played: none that was drawn has a recording here", name)
+    elif not faults:
+        text = f"{played - before} episodes, bit for bit (drawn by seed {seed})"
+        checked.add("replay", "ok", text, name)
+    return played
 
 
 def _draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[_Chosen]:
@@ -118,40 +156,34 @@ def _case_ids(run: PublishedRun, group: Group) -> tuple[int, ...]:
     return ids if all(0 <= each < n for each in ids) else ()
 
 
-async def _cluster(stack: contextlib.AsyncExitStack, run: PublishedRun, slots: int) -> OperatorClient:
-    """A cluster whose splits are the run's."""
+async def _cluster(
+    stack: contextlib.AsyncExitStack, runs: Sequence[PublishedRun], slots: int
+) -> OperatorClient:
+    """A cluster whose splits are those of the runs."""
     data = Path(stack.enter_context(scratch_folder("check-data")))
-    env = run.opening.settings.env
-    folder = data / folder_name(env)
-    folder.mkdir()
-    for split in SPLITS:
-        content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
-        (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
+    by_env = {run.opening.settings.env: run for run in runs}
+    for env, run in by_env.items():
+        folder = data / folder_name(env)
+        folder.mkdir()
+        for split in SPLITS:
+            content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
+            (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
     cluster = await stack.enter_async_context(local_cluster("check", data=data))
-    await cluster.start_workers([env], slots=slots, tiers={"bwrap"})
+    await cluster.start_workers(sorted(by_env), slots=slots, tiers={"bwrap"})
     link = await stack.enter_async_context(
         transport.connect(credentials.find("operator", (), cluster.operator_file))
     )
     return OperatorClient(link)
 
 
-async def _other_versions(ask: OperatorClient, run: PublishedRun) -> str:
-    """How this machine's versions differ from the run's; empty where they do not."""
+async def _other_versions(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]:
+    """How this machine's versions differ from the run's, empty where they do not; and whether its processor's features do."""
     env, known = run.opening.settings.env, run.record.versions.fingerprint
     # Any evaluation waits for a worker; a description does not.
-    async with contextlib.aclosing(
-        ask.evaluate(
-            Evaluate(
-                token="",
-                key=uuid.uuid4().hex,
-                env=env,
-                bundle=None,
-                split="heldout",
-                cases=(0,),
-                record="actions",
-            )
-        )
-    ) as told:
+    first = Evaluate(
+        token="", key=uuid.uuid4().hex, env=env, bundle=None, split="heldout", cases=(0,), record="actions"
+    )
+    async with contextlib.aclosing(ask.evaluate(first)) as told:
         async for outcome, _, _ in told:
             if outcome is not None:
                 break
@@ -162,19 +194,19 @@ async def _other_versions(ask: OperatorClient, run: PublishedRun) -> str:
     differ = [
         f"{name} {here[name]} here, {known[name]} in the run" for name in names if here[name] != known[name]
     ]
-    return "; ".join(differ[:4])
+    return "; ".join(differ[:4]), here.get("cpu") != known.get("cpu")
 
 
-async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
-    """What differs when these episodes are played."""
+async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> tuple[int, list[str]]:
+    """How many of these episodes were played, and what differed."""
     run, group = part.run, part.group
     path = f"{run.folder}/actions/{group.name}"
     if path not in files.names:
-        return []
+        return 0, []
     try:
         recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
     except ProtocolError:
-        return []  # told by the check of recordings
+        return 0, []  # told by the check of recordings
     stored: list[tuple[int, bytes]] = []
     case_ids, refs = [], []
     for index, case_id in zip(part.indexes, part.case_ids, strict=True):
@@ -190,7 +222,7 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
         stored.append((index, data))
         case_ids.append(case_id)
     if not refs:
-        return []
+        return 0, []
     message = Evaluate(
         token="",
         key=uuid.uuid4().hex,
@@ -217,10 +249,9 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> list[str]:
                 fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
             if fault is not None:
                 faults.append(f"{group.name}, episode {index}: {fault}")
-    faults += [
-        f"{group.name}, episode {index}: not played to its end" for index, _ in stored if index not in seen
-    ]
-    return faults
+    missing = [index for index, _ in stored if index not in seen]
+    faults += [f"{group.name}, episode {index}: not played to its end" for index in missing]
+    return len(stored), faults
 
 
 def share_of(text: str) -> float:

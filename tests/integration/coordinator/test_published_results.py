@@ -6,6 +6,7 @@ cannot make anew is what follows from something else.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import subprocess
@@ -25,6 +26,7 @@ from evopolicy_common.records import bundles, journal
 from evopolicy_common.records.bundles import BundleFile
 from evopolicy_common.records.trajectory import Recorder, decode
 from evopolicy_coordinator.publish import contents, rules
+from evopolicy_coordinator.publish import replay as replays
 from evopolicy_coordinator.publish.archive import Archive, Writer
 
 ENV = "toy/line"
@@ -492,6 +494,22 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
     done = evopolicy(results.root, "check", "forged.evp", "--replay", "all")
     assert done.returncode == 1, done.stdout + done.stderr
     assert "FAILED replay: heldout-001, episode 0" in done.stdout
+
+
+def test_no_module_that_a_file_names_is_imported(
+    results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil_env.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    checked = rules.check(Held(results.files))
+    run = checked.runs[0]
+    settings = msgspec.structs.replace(run.opening.settings, env="evil_env:Glider-v0")
+    opening = msgspec.structs.replace(run.opening, settings=settings)
+    checked.runs = [msgspec.structs.replace(run, opening=opening)]
+    asyncio.run(replays.replay(Held(results.files), checked, 1.0, 0, 1, lambda n, total: None))
+    told = {each.text for each in checked.findings if each.kind == "replay"}
+    assert told == {"evil_env:Glider-v0 is not installed here"}
+    assert not (tmp_path / "imported").exists()
 
 
 def test_wrong_usage_ends_with_2(results: Results) -> None:
