@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-NAMES = ("examples/policies", "examples/agents", "deploy", "docs", "constraints.txt")
+NAMES = ("examples/policies", "examples/agents", "examples/notebooks", "deploy", "docs", "constraints.txt")
 """What is shipped, by its path in the repository; `pyproject.toml` puts it into the package under the same one."""
 _NOT_TEXT = ("images", "_site", "__pycache__")
 

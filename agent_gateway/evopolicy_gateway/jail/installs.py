@@ -83,7 +83,7 @@ def hidden_below(folder: str) -> Iterator[str]:
 
 
 def _our_python(needs: Needs) -> None:
-    """The interpreter with its standard library, numpy, and the agents that come with this package; nothing else."""
+    """The interpreter with its standard library, numpy, cloudpickle, and the agents that come with this package; nothing else."""
     prefix, base = os.path.abspath(sys.prefix), os.path.abspath(sys.base_prefix)
     needs.path(base)
     if os.path.realpath(base) != base:
@@ -103,12 +103,13 @@ def our_packages() -> Iterator[tuple[str, str]]:
     if os.path.abspath(sys.prefix) == os.path.abspath(sys.base_prefix):
         return
     site = sysconfig.get_path("platlib")
-    spec = importlib.util.find_spec("numpy")
-    if spec is not None and spec.submodule_search_locations:
-        folder = Path(next(iter(spec.submodule_search_locations)))
-        for source in (folder, folder.with_name("numpy.libs")):
-            if source.is_dir():
-                yield str(source), f"{site}/{source.name}"
+    for package in ("numpy", "cloudpickle"):
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            folder = Path(next(iter(spec.submodule_search_locations)))
+            for source in (folder, folder.with_name(f"{package}.libs")):
+                if source.is_dir():
+                    yield str(source), f"{site}/{source.name}"
     ours = Path(__file__).parents[1]
     yield str(ours / "__init__.py"), f"{site}/{ours.name}/__init__.py"
     yield str(ours / "agents"), f"{site}/{ours.name}/agents"

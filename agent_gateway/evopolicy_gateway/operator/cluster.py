@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -13,7 +14,7 @@ from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_common.processes.local_cluster import local_cluster
+from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
@@ -50,20 +51,24 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
-@contextlib.asynccontextmanager
-async def connected(
-    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
-) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
-    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+class Reached(NamedTuple):
+    """A cluster that answers."""
 
-    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
-    """
-    end_on_sigterm()
+    operations: Operations
+    gateway: Credentials
+    """The gateways'."""
+    local: LocalCluster | None
+    """One that was brought up here; it has no workers yet."""
+
+
+@contextlib.asynccontextmanager
+async def reached(where: Cluster) -> AsyncIterator[Reached]:
+    """A link to the cluster, which is brought up where it is a local one."""
     async with contextlib.AsyncExitStack() as stack:
-        failed: asyncio.Future[None] | None = None
+        local: LocalCluster | None = None
         file, opened = where.file, None
         if where.local_slots is not None:
-            cluster = await stack.enter_async_context(
+            local = await stack.enter_async_context(
                 local_cluster(
                     "local",
                     state=where.state,
@@ -73,10 +78,24 @@ async def connected(
                     unjailed=where.unjailed,
                 )
             )
-            if cluster.note:
-                say(f"note: {cluster.note}", err=True)
-            await cluster.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
-            file, failed, opened = cluster.operator_file, cluster.failed, cluster.opened
+            if local.note:
+                say(f"note: {local.note}", err=True)
+            file, opened = local.operator_file, local.opened
         operator, gateway = find_credentials(where.connect, file)
         link = await stack.enter_async_context(transport.connect(operator))
-        yield Operations(link, opened), gateway, failed
+        yield Reached(Operations(link, opened), gateway, local)
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
+) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
+    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+
+    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
+    """
+    end_on_sigterm()
+    async with reached(where) as (operations, gateway, local):
+        if local is not None and where.local_slots is not None:
+            await local.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
+        yield operations, gateway, None if local is None else local.failed

@@ -81,7 +81,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
 async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
-    bundle = _bundle(trial.policy)
+    bundle = policy_bundle(trial.policy)
     check_writable(trial.out, "--out")
     console = terminal(stderr=as_json)
     results: list[TrialResult] = []
@@ -202,7 +202,8 @@ def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
         (target / name).write_bytes(data)
 
 
-def _bundle(policy: Path) -> bundles.Bundle:
+def policy_bundle(policy: Path) -> bundles.Bundle:
+    """The policy in a folder, or in `system/` below it. ConfigError where there is none that can be sent."""
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
         raise ConfigError(f"{policy} holds no policy.py")

@@ -8,8 +8,6 @@ scores. Policies are parsed, never run. Runs of the published software are read 
 from __future__ import annotations
 
 import math
-import os
-import re
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -19,6 +17,7 @@ import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.checkpoints import policy_folder, read_meta
+from evopolicy_common.records.run_files import run_folders, submit_indices
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
@@ -32,7 +31,6 @@ from evopolicy_coordinator.analysis.simulators.look import Flag, flags_of
 
 Files = Mapping[str, bytes]
 
-_SUBMIT = re.compile(r"submit_([0-9]{1,9})")
 _MAX_REASON_CHARS = 1000
 _PARALLEL_FROM = 40
 """Runs from which reading in several processes pays for starting them."""
@@ -53,31 +51,12 @@ class UnreadableRunError(Exception):
 
 
 def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
-    """Run directories at or under `paths`, sorted, without repeats, and paths under which there is none.
-
-    A folder with a `run.json`, or one that was begun (`workspace/` beside `logs/` or `checkpoints/`), is a run
-    directory, and is not searched further. Links below the given paths are not followed.
-    """
-    found: set[Path] = set()
-    missing: list[LeftOut] = []
-    for path in paths:
-        root = path.resolve()
-        if root.is_file() and root.name == "run.json":
-            found.add(root.parent)
-            continue
-        before = len(found)
-        is_repeat = False
-        for folder, names, files in os.walk(root):
-            begun = "workspace" in names and ("logs" in names or "checkpoints" in names)
-            if "run.json" in files or begun:
-                is_repeat = is_repeat or Path(folder) in found
-                found.add(Path(folder))
-                names.clear()
-            names[:] = [name for name in names if not name.startswith(".")]
-        if len(found) == before and not is_repeat:
-            reason = "no run directory here" if root.is_dir() else "no such folder"
-            missing.append(LeftOut(path=path, reason=reason))
-    return sorted(found), missing
+    """As `run_folders`; paths under which there is no run directory with the reason."""
+    found, without = run_folders(paths)
+    return found, [
+        LeftOut(path=path, reason="no run directory here" if path.is_dir() else "no such folder")
+        for path in without
+    ]
 
 
 def load_runs(
@@ -194,7 +173,7 @@ def _read_record(folder: Path) -> RunRecord:
 def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
     feedback = folder / (record.artifacts.workspace or "workspace") / "feedback"
     checkpoints = folder / (record.artifacts.checkpoints or "checkpoints")
-    indices = sorted(_indices(feedback) | _indices(checkpoints))
+    indices = sorted(submit_indices(feedback) | submit_indices(checkpoints))
     budget = record.experiment_dimensions.episode_budget
     submits: list[Submit] = []
     previous: Files | None = None
@@ -240,13 +219,6 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
             )
         )
     return tuple(submits)
-
-
-def _indices(folder: Path) -> set[int]:
-    if not folder.is_dir():
-        return set()
-    matches = (_SUBMIT.fullmatch(child.name) for child in folder.iterdir())
-    return {int(match[1]) for match in matches if match}
 
 
 def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary | None:

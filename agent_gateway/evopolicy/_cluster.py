@@ -1,0 +1,440 @@
+"""Clusters, and what is played on them: policies on train cases, and whole runs."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import importlib.util
+import os
+import shlex
+import sys
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self, TypeVar
+
+from rich.progress import Progress
+
+from evopolicy._evaluation import Episode, Evaluation, episode_of
+from evopolicy._loop import awaited, call, loop
+from evopolicy._runs import Run, read_run
+from evopolicy_common.console import terminal
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+from evopolicy_common.messages.gateway import VideoOption
+from evopolicy_common.messages.operator import Evaluate
+from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.processes.preflight import check_installed
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.wire.credentials import local_state_dir
+from evopolicy_gateway import shipped
+from evopolicy_gateway.agents.function import Workspace
+from evopolicy_gateway.cli.options import default_exp_id, limits_of, one_environment
+from evopolicy_gateway.cli.run_options import RunOptions
+from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.operator import cluster as operator
+from evopolicy_gateway.operator.trials import policy_bundle
+from evopolicy_gateway.operator.watch import RunView
+from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.plan import WALL_S, Plan
+
+T = TypeVar("T")
+
+AgentFunction = Callable[[Workspace], Any]
+Limits = Mapping[str, float]
+
+
+class Cluster:
+    """A coordinator with workers: this machine's own for a while (`Cluster.local`), or one that runs (`Cluster.connect`).
+
+    A context manager, `with` or `async with`; in notebooks also `open()` and `close()`. Calls may be made from several threads or tasks at once.
+    """
+
+    def __init__(self, where: operator.Cluster) -> None:
+        """Private: use `Cluster.local` or `Cluster.connect`."""
+        self._where = where
+        self._reached: operator.Reached | None = None
+        self._end = asyncio.Event()
+        self._held: asyncio.Task[None] | None = None
+        self._offered: set[str] = set()
+        self._offering = asyncio.Lock()
+
+    @classmethod
+    def local(
+        cls,
+        slots: int = 2,
+        *,
+        state: str | os.PathLike[str] | None = None,
+        fresh: bool = False,
+        data: str | os.PathLike[str] | None = None,
+    ) -> Cluster:
+        """A cluster of this machine, inside the `with`.
+
+        `slots`: episodes at once, of each environment that is played. `state`: the folder of what it keeps; default: the one
+        of all local commands, so that the same ids are the same cases. `fresh`: a state that is thrown away. `data`: folder of
+        split files. Nothing is started before the `with`.
+        """
+        if slots < 1:
+            raise ConfigError(f"slots is {slots}: at least 1")
+        if fresh and state is not None:
+            raise ConfigError(f"fresh and state {os.fspath(state)}: leave out one of them")
+        kept = None if fresh else Path(state) if state is not None else local_state_dir()
+        return cls(operator.Cluster(local_slots=slots, state=kept, data=None if data is None else Path(data)))
+
+    @classmethod
+    def connect(cls, *endpoints: str, credentials: str | os.PathLike[str] | None = None) -> Cluster:
+        """A running cluster, such as `Cluster.connect("tls/host:7447", credentials="operator-me")`.
+
+        `credentials`: the folder of `evopolicy-coordinator certs issue operator`. Without arguments: this machine's own.
+        """
+        return cls(
+            operator.Cluster(connect=endpoints, file=None if credentials is None else Path(credentials))
+        )
+
+    def open(self) -> Self:
+        """Starts it, for notebooks; `close` ends it, as the end of the process does."""
+        call(self._open())
+        atexit.register(self.close)
+        return self
+
+    def close(self) -> None:
+        """Ends what was started. A second close does nothing."""
+        atexit.unregister(self.close)
+        call(self._close())
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    async def __aenter__(self) -> Self:
+        await awaited(self._open())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await awaited(self._close())
+
+    def evaluate(
+        self,
+        policy: str | os.PathLike[str],
+        *,
+        env: str,
+        cases: Iterable[int] = range(4),
+        tier: Tier = "bwrap",
+        limits: Limits | None = None,
+        progress: bool = True,
+    ) -> Evaluation:
+        """Plays the policy in a folder on train cases, each policy in a sandbox; outside any run, without a budget.
+
+        `policy`: a folder with a `policy.py`. `env`: a suite id, such as `gym/acrobot`. `cases`: train ids; the same ids are the
+        same cases in each call on the same state. `limits`: the policy's, such as `{"act_wall_s": 5}`. `progress`: a bar on a
+        terminal, and in a notebook where ipywidgets is installed. ConfigError for wrong arguments, and for what this machine
+        lacks, with the remedy.
+        """
+        return call(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
+
+    async def evaluate_async(
+        self,
+        policy: str | os.PathLike[str],
+        *,
+        env: str,
+        cases: Iterable[int] = range(4),
+        tier: Tier = "bwrap",
+        limits: Limits | None = None,
+        progress: bool = True,
+    ) -> Evaluation:
+        """As `evaluate`."""
+        return await awaited(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
+
+    def run(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
+        """As `evopolicy.run`, on this cluster."""
+        return call(self._run(env, agent, **options))
+
+    async def run_async(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
+        """As `run`."""
+        return await awaited(self._run(env, agent, **options))
+
+    # On the one loop.
+
+    async def _open(self) -> None:
+        if self._held is not None:
+            raise ConfigError("this cluster is open already, or was closed: make another")
+        opened: asyncio.Future[operator.Reached] = loop().create_future()
+        # One task enters and leaves everything, whichever tasks or threads call.
+        self._held = asyncio.create_task(self._hold(opened))
+        try:
+            both: list[asyncio.Future[Any]] = [opened, self._held]
+            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            await self._close()
+            raise
+        if not opened.done():
+            await self._held
+        self._reached = opened.result()
+
+    async def _hold(self, opened: asyncio.Future[operator.Reached]) -> None:
+        async with operator.reached(self._where) as reached:
+            opened.set_result(reached)
+            await self._end.wait()
+
+    async def _close(self) -> None:
+        self._reached = None
+        self._end.set()
+        if self._held is not None:
+            await asyncio.wait([self._held])
+
+    async def _on(self, env: str, tier: Tier, work: Callable[[operator.Reached], Awaitable[T]]) -> T:
+        """What `work` gives; the local cluster's error when that fails first."""
+        reached = self._reached
+        if reached is None:
+            raise ConfigError("this cluster is not open: use it inside `with Cluster.local() as cluster:`")
+        results: list[T] = []
+
+        async def kept() -> None:
+            results.append(await work(reached))
+
+        if reached.local is not None and self._where.local_slots is not None:
+            async with self._offering:
+                if env not in self._offered:
+                    await reached.local.start_workers([env], slots=self._where.local_slots, tiers={tier})
+                    self._offered.add(env)
+        failed = None if reached.local is None else reached.local.failed
+        await unless_failed(asyncio.create_task(kept()), failed)
+        return results[0]
+
+    async def _evaluate(
+        self,
+        policy: str | os.PathLike[str],
+        env: str,
+        cases: tuple[int, ...],
+        tier: Tier,
+        limits: Limits,
+        progress: bool,
+    ) -> Evaluation:
+        if not cases:
+            raise ConfigError("cases is empty: name train ids, such as range(8)")
+        env = one_environment(env)
+        bundle = await asyncio.to_thread(policy_bundle, shipped.found(Path(policy), Path.cwd()))
+        message = Evaluate(
+            token="",
+            key=uuid.uuid4().hex,
+            env=env,
+            bundle=bundle.digest,
+            split="train",
+            cases=cases,
+            sandbox_tier=tier,
+            limits=limits_of([f"{name}={value}" for name, value in limits.items()]),
+            step_limit="published",
+        )
+
+        async def work(reached: operator.Reached) -> Evaluation:
+            await reached.operations.upload(bundle.digest, bundle.packed)
+            outcomes: list[EpisodeOutcome] = []
+            with _bar(progress) as bar:
+                task = bar.add_task(env, total=len(cases))
+                async for outcome, _, _ in reached.operations.evaluate(message):
+                    if outcome is not None:
+                        outcomes.append(outcome)
+                        bar.update(task, completed=len(outcomes))
+            episodes: list[Episode] = []
+            for outcome, case in zip(sorted(outcomes, key=lambda one: one.index), cases, strict=True):
+                ref = outcome.trajectory
+                packed = None if ref is None else await reached.operations.fetch(ref)
+                episodes.append(await asyncio.to_thread(episode_of, case, outcome, packed))
+            return Evaluation(env, episodes)
+
+        return await self._on(env, tier, work)
+
+    async def _run(
+        self,
+        env: str,
+        agent: str | AgentFunction,
+        *,
+        budget: int | None = None,
+        runs: str | os.PathLike[str] = "runs",
+        exp_id: str | None = None,
+        entry: str | None = None,
+        model: str | None = None,
+        repeat: int = 0,
+        validation: int | None = None,
+        heldout: int | None = None,
+        profile: Literal["published"] | None = None,
+        replays: VideoOption | None = None,
+        tier: Tier = "bwrap",
+        agent_wall_s: float = WALL_S,
+        overwrite: bool = False,
+        progress: bool = True,
+    ) -> Run:
+        check_installed("gateway")
+        env = one_environment(env)
+        with contextlib.ExitStack() as stack:
+            if callable(agent):
+                entry = entry or _name_of(agent)
+                folder = stack.enter_context(scratch_folder("function"))
+                agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
+            given = RunOptions(
+                agent=agent,
+                budget=budget,
+                runs=Path(runs),
+                exp_id=exp_id or default_exp_id(),
+                entry=entry,
+                model=model,
+                repeat=repeat,
+                validation=validation,
+                heldout=heldout,
+                profile=profile,
+                replays=replays,
+                tier=tier,
+            )
+            plan = Plan(
+                settings=given.settings(env, given.exp_id or ""),
+                agent=agent,
+                runs=given.runs,
+                started_in=Path.cwd(),
+                wall_limit_s=agent_wall_s,
+                silence_s=given.agent_silence_s,
+                overwrite=overwrite,
+                jail=JailSettings(),
+            )
+            await asyncio.to_thread(plan.check)
+            self._where.check_cases([plan.settings])
+
+            async def work(reached: operator.Reached) -> Run:
+                with RunView(terminal(stderr=True) if progress else None).shown() as watch:
+                    await RunLifecycle(plan, reached.operations, reached.gateway, watch).play()
+                return await asyncio.to_thread(read_run, plan.folder.root)
+
+            return await self._on(env, tier, work)
+
+
+def evaluate(
+    policy: str | os.PathLike[str],
+    *,
+    env: str,
+    cases: Iterable[int] = range(4),
+    slots: int = 2,
+    tier: Tier = "bwrap",
+    limits: Limits | None = None,
+    progress: bool = True,
+) -> Evaluation:
+    """`Cluster.evaluate` on a local cluster of its own. For several calls, one `Cluster.local` saves starting it each time."""
+    wanted = (policy, env, tuple(cases), slots, tier, limits or {}, progress)
+    return call(_evaluated(*wanted))
+
+
+async def evaluate_async(
+    policy: str | os.PathLike[str],
+    *,
+    env: str,
+    cases: Iterable[int] = range(4),
+    slots: int = 2,
+    tier: Tier = "bwrap",
+    limits: Limits | None = None,
+    progress: bool = True,
+) -> Evaluation:
+    """As `evaluate`."""
+    return await awaited(_evaluated(policy, env, tuple(cases), slots, tier, limits or {}, progress))
+
+
+def run(
+    *,
+    env: str,
+    agent: str | AgentFunction,
+    budget: int | None = None,
+    runs: str | os.PathLike[str] = "runs",
+    slots: int = 2,
+    **options: Any,
+) -> Run:
+    """Plays one whole run on a local cluster of its own, to its score.
+
+    `agent`: a function of a `Workspace`, which runs in a process of its own in the agent's jail, or a text as `--agent` of
+    `evopolicy run` takes it. In the jail a function can import the standard library and numpy; its own module goes with it.
+    It returns what JSON can say, which `Run.value` reads back. `budget`: train episodes; default: the suite's. `runs`: the
+    folder of run directories. Further `options`: `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`,
+    `replays`, `tier`, `agent_wall_s`, `overwrite`, `progress`, as the options of `evopolicy run` of these names.
+
+    ConfigError for wrong arguments, and for what this machine lacks, with the remedy. Ctrl-C cancels the run; its folder says so.
+    """
+    return call(_ran(slots, env, agent, budget=budget, runs=runs, **options))
+
+
+async def run_async(
+    *,
+    env: str,
+    agent: str | AgentFunction,
+    budget: int | None = None,
+    runs: str | os.PathLike[str] = "runs",
+    slots: int = 2,
+    **options: Any,
+) -> Run:
+    """As `run`."""
+    return await awaited(_ran(slots, env, agent, budget=budget, runs=runs, **options))
+
+
+async def _evaluated(
+    policy: str | os.PathLike[str],
+    env: str,
+    cases: tuple[int, ...],
+    slots: int,
+    tier: Tier,
+    limits: Limits,
+    progress: bool,
+) -> Evaluation:
+    async with _opened(Cluster.local(slots)) as cluster:
+        return await cluster._evaluate(policy, env, cases, tier, limits, progress)
+
+
+async def _ran(slots: int, env: str, agent: str | AgentFunction, **options: Any) -> Run:
+    async with _opened(Cluster.local(slots)) as cluster:
+        return await cluster._run(env, agent, **options)
+
+
+@contextlib.asynccontextmanager
+async def _opened(cluster: Cluster) -> AsyncIterator[Cluster]:
+    await cluster._open()
+    try:
+        yield cluster
+    finally:
+        await cluster._close()
+
+
+def _bar(wanted: bool) -> Progress:
+    console = terminal(stderr=True)
+    widgets = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
+    return Progress(
+        console=console, transient=True, disable=not wanted or not (console.is_terminal or widgets)
+    )
+
+
+def _name_of(function: AgentFunction) -> str:
+    name = getattr(function, "__name__", type(function).__name__)
+    return name if name.isidentifier() else "function"
+
+
+def _pickled(function: AgentFunction, file: Path) -> str:
+    """Writes the function for the jail; the agent that calls it there, as `--agent` takes it."""
+    import cloudpickle
+
+    # Importable here, and not in the jail: such a module goes with its function.
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    by_value = module is not None and module.__name__ != "__main__" and not _is_installed(module)
+    if by_value:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        file.write_bytes(cloudpickle.dumps(function))
+    except Exception as error:
+        raise ConfigError(f"agent {_name_of(function)} cannot be sent to its jail: {error}") from error
+    finally:
+        if by_value:
+            cloudpickle.unregister_pickle_by_value(module)
+    file.chmod(0o644)
+    words: Sequence[str] = (sys.executable, "-P", "-m", "evopolicy_gateway.agents.function", str(file))
+    return f"command:{shlex.join(words)}"
+
+
+def _is_installed(module: Any) -> bool:
+    """Part of Python, or of a package in site-packages."""
+    place = getattr(module, "__file__", None)
+    return place is None or any(part in ("site-packages", "dist-packages") for part in Path(place).parts)

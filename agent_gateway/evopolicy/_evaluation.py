@@ -1,0 +1,141 @@
+"""What playing a policy on cases came to."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from evopolicy._records import Records, bars, table
+from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.records.trajectory import decode
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One episode, with its trajectory."""
+
+    case: int
+    """Train id."""
+    episode_return: float | None
+    """Sum of rewards; None where nothing was played, since the first case showed that there is no Policy."""
+    length: int
+    """Steps."""
+    terminated: bool
+    truncated: bool
+    failure: str | None
+    """How the policy failed; uniform random actions played from that step on."""
+    observations: Any
+    """What the policy received at each step: arrays of shape (length, …), in dicts and tuples as the space has them."""
+    actions: Any
+    """What it returned: an array of shape (length, …), or a list where actions differ in form."""
+    rewards: NDArray[np.float64]
+    """Shape (length,)."""
+    infos: list[dict[str, Any]]
+    stdout: str
+    stderr: str
+
+
+class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """An episode without its trajectory, for data frames."""
+
+    case: int
+    episode_return: float | None
+    length: int
+    terminated: bool
+    truncated: bool
+    failure: str | None
+
+
+class Evaluation(Sequence[Episode]):
+    """Episodes in the order of the cases."""
+
+    def __init__(self, env: str, episodes: Sequence[Episode]) -> None:
+        self.env = env
+        self.episodes = tuple(episodes)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.episodes[index]
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """Shape (episodes,); NaN where nothing was played."""
+        return np.array(
+            [math.nan if one.episode_return is None else one.episode_return for one in self.episodes]
+        )
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Steps, shape (episodes,)."""
+        return np.array([one.length for one in self.episodes], dtype=np.int64)
+
+    @property
+    def mean_return(self) -> float | None:
+        """Over the cases in which the policy did not fail; None where there is none."""
+        known = [
+            one.episode_return
+            for one in self.episodes
+            if one.failure is None and one.episode_return is not None
+        ]
+        return math.fsum(known) / len(known) if known else None
+
+    @property
+    def records(self) -> Records[EvaluationRecord]:
+        """The episodes without their trajectories."""
+        names = EvaluationRecord.__struct_fields__
+        made = [EvaluationRecord(**{name: getattr(one, name) for name in names}) for one in self.episodes]
+        return Records(EvaluationRecord, made)
+
+    def to_pandas(self) -> Any:
+        """`records` as a pandas.DataFrame."""
+        return self.records.to_pandas()
+
+    def to_polars(self) -> Any:
+        """`records` as a polars.DataFrame."""
+        return self.records.to_polars()
+
+    def __repr__(self) -> str:
+        mean = "none" if self.mean_return is None else f"{self.mean_return:.4g}"
+        return f"<Evaluation of {self.env}: {len(self)} episodes, mean return {mean}>"
+
+    def _repr_html_(self) -> str:
+        shown = self.records
+        rows = [[getattr(one, name) for name in shown.columns] for one in shown]
+        plot = bars([one.episode_return for one in self.episodes], "returns")
+        return f"<p>{html.escape(repr(self))}</p>{plot}{table(shown.columns, rows)}"
+
+
+def episode_of(case: int, outcome: EpisodeOutcome, packed: bytes | None) -> Episode:
+    """`packed`: the trajectory's bytes."""
+    failed = outcome.failure
+    played = None if packed is None else decode(packed)
+    failure = None
+    if failed is not None:
+        at = "" if failed.step_index is None else f" at step {failed.step_index}"
+        failure = f"{failed.category}{at}: {failed.message}"
+    return Episode(
+        case=case,
+        episode_return=outcome.episode_return if outcome.length else None,
+        length=outcome.length,
+        terminated=outcome.terminated,
+        truncated=outcome.truncated,
+        failure=failure,
+        observations=None if played is None else played.obs,
+        actions=[] if played is None else played.actions,
+        rewards=np.zeros(0) if played is None else played.rewards,
+        infos=[] if played is None else played.infos,
+        stdout=outcome.stdout.decode("utf-8", "replace"),
+        stderr=outcome.stderr.decode("utf-8", "replace"),
+    )

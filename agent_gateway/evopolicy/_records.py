@@ -1,0 +1,105 @@
+"""Typed records in a row, as a table where somebody wants one."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+from typing import Any, Generic, TypeVar, overload
+
+import msgspec
+
+R = TypeVar("R", bound=msgspec.Struct)
+
+_SHOWN = 20
+"""Rows that a notebook shows."""
+
+
+class Records(Sequence[R], Generic[R]):
+    """Records of one kind, in order; `to_pandas` and `to_polars` make data frames where these are installed."""
+
+    def __init__(self, kind: type[R], records: Sequence[R]) -> None:
+        self._kind = kind
+        self._records = tuple(records)
+
+    @overload
+    def __getitem__(self, index: int) -> R: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Records[R]: ...
+
+    def __getitem__(self, index: int | slice) -> R | Records[R]:
+        if isinstance(index, slice):
+            return Records(self._kind, self._records[index])
+        return self._records[index]
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __iter__(self) -> Iterator[R]:
+        return iter(self._records)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} {self._kind.__name__}>"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The records' fields."""
+        return self._kind.__struct_fields__
+
+    def to_dicts(self) -> list[dict[str, Any]]:
+        """One dict a record."""
+        return [{name: getattr(one, name) for name in self.columns} for one in self]
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame. ModuleNotFoundError where pandas is not installed."""
+        import pandas
+
+        return pandas.DataFrame(self.to_dicts(), columns=list(self.columns))
+
+    def to_polars(self) -> Any:
+        """A polars.DataFrame. ModuleNotFoundError where polars is not installed."""
+        import polars
+
+        return polars.DataFrame({name: [getattr(one, name) for one in self] for name in self.columns})
+
+    def _repr_html_(self) -> str:
+        return table(self.columns, [[getattr(one, name) for name in self.columns] for one in self])
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """An HTML table of the first rows."""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>"
+        for row in rows[:_SHOWN]
+    )
+    more = f"<p>… {len(rows) - _SHOWN} more rows</p>" if len(rows) > _SHOWN else ""
+    return f"<table><tr>{head}</tr>{body}</table>{more}"
+
+
+def _text(value: Any) -> str:
+    return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def bars(values: Sequence[float | None], title: str) -> str:
+    """Values as an SVG of bars from zero, the first at the left; gaps for None."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    low, high = min(0.0, *known), max(0.0, *known)
+    span = (high - low) or 1.0
+    width, height = 12, 120
+
+    def y(value: float) -> float:
+        return height * (high - value) / span
+
+    drawn = "".join(
+        f'<rect x="{width * index + 1}" y="{min(y(value), y(0.0)):.1f}" width="{width - 2}"'
+        f' height="{max(1.0, abs(y(value) - y(0.0))):.1f}" fill="#4477aa"><title>{index}: {value:.4g}</title></rect>'
+        for index, value in enumerate(values)
+        if value is not None
+    )
+    return (
+        f"<p>{html.escape(title)}: {min(known):.4g} to {max(known):.4g}</p>"
+        f'<svg width="{width * len(values)}" height="{height}" role="img">{drawn}</svg>'
+    )

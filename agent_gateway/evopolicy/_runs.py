@@ -1,0 +1,316 @@
+"""Finished runs, read from their folders as typed records."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import os
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy._records import Records, bars, table
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
+from evopolicy_common.records.run_files import run_folders, submit_indices
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_gateway.agents.function import RESULT
+
+_MAX_RESULT_BYTES = 1 << 20
+_MAX_SHOWN_VIDEO_BYTES = 4 << 20
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """A run in a row."""
+
+    run: str
+    """Its folder."""
+    env: str
+    entry: str
+    model: str
+    repeat: int
+    status: str
+    """`completed`, `no_ok_submit`, `error`, `cancelled`."""
+    score: float | None
+    """Held-out mean return of the selected checkpoint."""
+    random_score: float | None
+    """Of uniform random actions on the same cases."""
+    best_submit: int | None
+    budget: int
+    budget_used: int
+    """Train episodes."""
+    closed_reason: str
+    wall_s: float
+    in_question: bool
+    """Audits found results of it disputed, or a forger among those who played it."""
+
+
+class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A submit in a row."""
+
+    run: str
+    env: str
+    entry: str
+    submit: int
+    status: str
+    n_episodes: int
+    mean_return: float | None
+    std_return: float | None
+    """Population standard deviation."""
+    remaining_budget: int
+    validation: float | None
+    """Mean return on the hidden validation cases, known once the run is finished."""
+    selected: bool
+
+
+class EpisodeRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """An episode in a row: of a submit (`train`), or of the score (`heldout`)."""
+
+    run: str
+    env: str
+    entry: str
+    split: str
+    submit: int | None
+    """Of a held-out episode, the selected one."""
+    episode: int
+    """Counted in the submit, or among the held-out episodes."""
+    case: int | None
+    """Train id; None for held-out episodes, whose cases have no ids."""
+    episode_return: float
+    length: int | None
+    """Steps; None for held-out episodes."""
+    failed: bool | None
+    """Whether the policy failed; None for held-out episodes."""
+
+
+class Run:
+    """A finished run."""
+
+    def __init__(self, folder: Path, record: RunRecord, summaries: Sequence[Summary]) -> None:
+        self.folder = folder
+        self._record = record
+        self._summaries = tuple(summaries)
+
+    @property
+    def summary(self) -> RunSummary:
+        """All that fits a row."""
+        told, outcome = self._record, self._record.outcome
+        return RunSummary(
+            run=str(self.folder),
+            env=told.env,
+            entry=told.agent.entry,
+            model=told.model,
+            repeat=told.repeat,
+            status=outcome.status,
+            score=outcome.score,
+            random_score=None if outcome.random_reference is None else outcome.random_reference.mean_return,
+            best_submit=outcome.best_submit_index,
+            budget=told.experiment_dimensions.episode_budget,
+            budget_used=outcome.budget_used,
+            closed_reason=outcome.closed_reason,
+            wall_s=told.timing.wall_time_seconds,
+            in_question=told.audit is not None and told.audit.in_question,
+        )
+
+    @property
+    def score(self) -> float | None:
+        """Held-out mean return of the selected checkpoint; None where no submit was ok."""
+        return self._record.outcome.score
+
+    @property
+    def status(self) -> str:
+        """`completed`, `no_ok_submit`, `error`, `cancelled`."""
+        return self._record.outcome.status
+
+    @property
+    def value(self) -> Any:
+        """What an agent function returned, read as JSON; None for nothing, or other agents.
+
+        ConfigError when the file is none that the function's program writes: an agent can write anything there.
+        """
+        data = _bounded(self.folder / "workspace" / RESULT)
+        if data is None:
+            return None
+        try:
+            return msgspec.json.decode(data)
+        except DECODE_ERRORS as error:
+            raise ConfigError(f"{self.folder}/workspace/{RESULT} is no JSON: {error}") from error
+
+    @property
+    def submits(self) -> Records[SubmitRecord]:
+        """In order."""
+        outcome = self._record.outcome
+        validated = outcome.val_scores or {}
+        return Records(
+            SubmitRecord,
+            [
+                SubmitRecord(
+                    run=str(self.folder),
+                    env=self._record.env,
+                    entry=self._record.agent.entry,
+                    submit=one.submit_index,
+                    status=one.status,
+                    n_episodes=one.n_episodes,
+                    mean_return=one.mean_return,
+                    std_return=one.std_return,
+                    remaining_budget=one.remaining_budget,
+                    validation=validated.get(str(one.submit_index)),
+                    selected=one.submit_index == outcome.best_submit_index,
+                )
+                for one in self._summaries
+            ],
+        )
+
+    @property
+    def episodes(self) -> Records[EpisodeRecord]:
+        """Train episodes of submits that were ok, then the held-out ones."""
+        known = {"run": str(self.folder), "env": self._record.env, "entry": self._record.agent.entry}
+        found = []
+        for one in self._summaries:
+            failed = set(one.errors or ())
+            cases, lengths = one.env_instances or (), one.episode_lengths or ()
+            for index, value in enumerate(one.returns or ()):
+                found.append(
+                    EpisodeRecord(
+                        **known,
+                        split="train",
+                        submit=one.submit_index,
+                        episode=index,
+                        case=cases[index] if index < len(cases) else None,
+                        episode_return=value,
+                        length=lengths[index] if index < len(lengths) else None,
+                        failed=index in failed,
+                    )
+                )
+        outcome = self._record.outcome
+        for index, value in enumerate(outcome.heldout_returns):
+            found.append(
+                EpisodeRecord(
+                    **known,
+                    split="heldout",
+                    submit=outcome.best_submit_index,
+                    episode=index,
+                    case=None,
+                    episode_return=value,
+                    length=None,
+                    failed=None,
+                )
+            )
+        return Records(EpisodeRecord, found)
+
+    @property
+    def replays(self) -> list[Path]:
+        """Videos of held-out episodes, where the run made any (`replays="first"` or `"all"`)."""
+        return [self.folder / one.path for one in self._record.replays if (self.folder / one.path).is_file()]
+
+    def __repr__(self) -> str:
+        score = "no score" if self.score is None else f"score {self.score:.4g}"
+        return f"<Run of {self._record.agent.entry} on {self._record.env}: {self.status}, {score}>"
+
+    def _repr_html_(self) -> str:
+        shown = self.submits
+        plot = bars([one.mean_return for one in shown], "mean return of each submit")
+        rows = [[getattr(one, name) for name in shown.columns[3:]] for one in shown]
+        return f"<p>{html.escape(repr(self))}</p>{plot}{table(shown.columns[3:], rows)}{self._video()}"
+
+    def _video(self) -> str:
+        for path in self.replays[:1]:
+            if path.suffix == ".mp4" and path.stat().st_size <= _MAX_SHOWN_VIDEO_BYTES:
+                data = base64.b64encode(path.read_bytes()).decode()
+                return f'<video controls width="400" src="data:video/mp4;base64,{data}"></video>'
+        return ""
+
+
+class Runs(Sequence[Run]):
+    """Finished runs in order of their folders."""
+
+    def __init__(self, runs: Sequence[Run], left_out: Sequence[tuple[Path, str]]) -> None:
+        self._runs = tuple(runs)
+        self.left_out = tuple(left_out)
+        """Folders that could not be read, with the reasons."""
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._runs[index]
+
+    def __len__(self) -> int:
+        return len(self._runs)
+
+    def __iter__(self) -> Iterator[Run]:
+        return iter(self._runs)
+
+    def summaries(self) -> Records[RunSummary]:
+        """A row a run."""
+        return Records(RunSummary, [run.summary for run in self._runs])
+
+    def submits(self) -> Records[SubmitRecord]:
+        """A row a submit."""
+        return Records(SubmitRecord, [one for run in self._runs for one in run.submits])
+
+    def episodes(self) -> Records[EpisodeRecord]:
+        """A row an episode."""
+        return Records(EpisodeRecord, [one for run in self._runs for one in run.episodes])
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} runs" + (f", {len(self.left_out)} left out>" if self.left_out else ">")
+
+    def _repr_html_(self) -> str:
+        return self.summaries()._repr_html_()
+
+
+def load_runs(*paths: str | os.PathLike[str]) -> Runs:
+    """All runs of evopolicy at or below these folders. ConfigError where there is none at all.
+
+    Runs of the published software are left out; `evopolicy report` reads them.
+    """
+    if not paths:
+        raise ConfigError("load_runs needs a folder, such as runs/")
+    found, without = run_folders(map(Path, paths))
+    if without:
+        raise ConfigError(f"{without[0]}: no run directory here")
+    runs, left_out = [], []
+    for folder in found:
+        try:
+            runs.append(read_run(folder))
+        except (ProtocolError, OSError) as error:
+            left_out.append((folder, str(error)))
+    return Runs(runs, left_out)
+
+
+def read_run(folder: Path) -> Run:
+    """The run in `folder`. ProtocolError or OSError when there is none that is finished."""
+    record = decode_run_record((folder / "run.json").read_bytes())
+    feedback = folder / "workspace" / "feedback"
+    return Run(folder, record, list(_summaries(feedback, sorted(submit_indices(feedback)))))
+
+
+def _summaries(feedback: Path, indices: Iterable[int]) -> Iterator[Summary]:
+    for index in indices:
+        path = feedback / f"submit_{index:03d}" / "summary.json"
+        if path.is_file():
+            summary = decode_summary(path.read_bytes())
+            if all(map(math.isfinite, summary.returns or ())):
+                yield summary
+
+
+def _bounded(path: Path) -> bytes | None:
+    """The bytes of a regular file that an agent may have written; None where there is none. ConfigError for other things."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"{path} is no regular file: {error.strerror}") from error
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise ConfigError(f"{path} is no regular file")
+    with os.fdopen(fd, "rb") as file:
+        data = file.read(_MAX_RESULT_BYTES + 1)
+    if len(data) > _MAX_RESULT_BYTES:
+        raise ConfigError(
+            f"{path} is larger than {_MAX_RESULT_BYTES:,} bytes, the most that an agent function may return"
+        )
+    return data

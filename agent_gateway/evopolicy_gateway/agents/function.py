@@ -1,0 +1,100 @@
+"""A Python function as agent: `python -m evopolicy_gateway.agents.function FILE`, in the workspace, inside the jail.
+
+FILE holds the function as cloudpickle wrote it on the host. It is called with a `Workspace`. What it returns is written as
+JSON to `result.json`: nothing that an agent wrote is ever unpickled on the host.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+
+RESULT = "result.json"
+
+
+class SubmitRefusedError(Exception):
+    """A submit was refused and cost nothing; `status` and the message say why."""
+
+    def __init__(self, status: str, message: str) -> None:
+        super().__init__(f"{status}: {message}")
+        self.status = status
+
+
+class Workspace:
+    """What an agent function works with: the workspace's files, the task, and submits."""
+
+    def __init__(self, client: Client, folder: Path) -> None:
+        self._client = client
+        self.folder = folder
+        """The workspace. `system/` is the policy, `feedback/` what came of submits."""
+        self.n_submits = 0
+        """Submits that were charged so far."""
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What the run's `/info` says now: spaces, environment, bounds, state."""
+        return self._client.info()
+
+    @property
+    def task(self) -> str:
+        """The task's text, Markdown."""
+        return self._client.task()
+
+    @property
+    def remaining_budget(self) -> int:
+        """Episodes left."""
+        return int(self.info["state"]["remaining_budget"])
+
+    def write(self, policy: str | Mapping[str, str]) -> None:
+        """Writes `system/policy.py`, or several files below `system/` by their paths."""
+        files = {"policy.py": policy} if isinstance(policy, str) else policy
+        for name, text in files.items():
+            path = self.folder / "system" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+
+    def submit(self, cases: Iterable[int]) -> dict[str, Any]:
+        """Plays `system/` as it is now on these train ids, and waits: the content of the submit's `summary.json`.
+
+        Raises SubmitRefusedError when it is refused (the budget is too small, an id is unknown, the run is closed).
+        """
+        verdict = self._client.submit([int(case) for case in cases])
+        if isinstance(verdict, Refusal):
+            raise SubmitRefusedError(verdict.status, verdict.message)
+        self.n_submits += 1
+        return verdict.summary
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"function: {message}", file=sys.stderr)
+    raise SystemExit(1)
+
+
+def main() -> None:
+    """Plays in the current directory. Exit code 0 when a submit was taken and the function returned what JSON can say."""
+    import cloudpickle
+
+    try:
+        function = cloudpickle.loads(Path(sys.argv[1]).read_bytes())
+    except ModuleNotFoundError as error:
+        _fail(f"{error}: in the jail there are the standard library, numpy and the function's own code")
+    workspace = Workspace(Client.from_environment(), Path.cwd())
+    try:
+        value = function(workspace)
+    except ProtocolError as error:
+        _fail(str(error))
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError) as error:
+        _fail(f"the function's value is not JSON ({error}); return numbers, texts, lists and dicts of them")
+    (Path.cwd() / RESULT).write_text(text, encoding="utf-8")
+    raise SystemExit(0 if workspace.n_submits else 1)
+
+
+if __name__ == "__main__":
+    main()

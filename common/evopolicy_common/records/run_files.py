@@ -1,0 +1,45 @@
+"""Where finished runs are below some folders, and which submits a run's folder holds."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+_SUBMIT = re.compile(r"submit_([0-9]{1,9})")
+
+
+def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """Run directories at or under `paths`, sorted, without repeats, and those of `paths` under which there is none.
+
+    A folder with a `run.json`, or one that was begun (`workspace/` beside `logs/` or `checkpoints/`), is a run
+    directory, and is not searched further. Links below the given paths are not followed.
+    """
+    found: set[Path] = set()
+    without: list[Path] = []
+    for path in paths:
+        root = path.resolve()
+        if root.is_file() and root.name == "run.json":
+            found.add(root.parent)
+            continue
+        before = len(found)
+        is_repeat = False
+        for folder, names, files in os.walk(root):
+            begun = "workspace" in names and ("logs" in names or "checkpoints" in names)
+            if "run.json" in files or begun:
+                is_repeat = is_repeat or Path(folder) in found
+                found.add(Path(folder))
+                names.clear()
+            names[:] = [name for name in names if not name.startswith(".")]
+        if len(found) == before and not is_repeat:
+            without.append(path)
+    return sorted(found), without
+
+
+def submit_indices(folder: Path) -> set[int]:
+    """Of the folders `submit_NNN` in `folder`; empty where there is none."""
+    if not folder.is_dir():
+        return set()
+    matches = (_SUBMIT.fullmatch(child.name) for child in folder.iterdir())
+    return {int(match[1]) for match in matches if match}

@@ -1,0 +1,211 @@
+"""The public package at work: a policy, a run with a function as agent, the page and the notebook as they are written."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import evopolicy as evp
+
+ROOT = Path(__file__).parents[3]
+PAGE = ROOT / "docs" / "how-to" / "python.md"
+NOTEBOOK = ROOT / "examples" / "notebooks" / "tutorial.ipynb"
+POLICY = """
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        pass
+
+    def reset(self, episode_index):
+        print("episode", episode_index)
+
+    def act(self, obs):
+        return [{gain} * (obs[2] - obs[0])]
+"""
+CELLS = """
+import ast, asyncio, json, sys
+
+async def main():  # as in a notebook, the main thread has a running loop
+    names = {"__name__": "__main__"}
+    for cell in json.load(open(sys.argv[1]))["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        tree = ast.parse("".join(cell["source"]))
+        last = ast.Expression(tree.body.pop().value) if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, "cell", "exec"), names)
+        if last is not None:
+            value = eval(compile(last, "cell", "eval"), names)
+            shown = value._repr_html_() if hasattr(value, "_repr_html_") else repr(value)
+            print(shown)
+
+asyncio.run(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[evp.Cluster]:
+    with evp.Cluster.local(slots=2, fresh=True) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    folder = tmp_path / "policy"
+    folder.mkdir()
+    (folder / "policy.py").write_text(POLICY.replace("{gain}", "0.3"))
+    return folder
+
+
+def test_a_policy_is_played_and_its_trajectories_are_arrays(cluster: evp.Cluster, policy: Path) -> None:
+    result = cluster.evaluate(policy, env="toy/line", cases=[3, 1])
+    assert [one.case for one in result] == [3, 1]
+    assert result.returns.shape == result.lengths.shape == (2,)
+    assert result.mean_return == pytest.approx(result.returns.mean())
+    for one in result:
+        assert one.observations.shape == (one.length, 3)
+        assert one.rewards.shape == (one.length,)
+        assert one.rewards.sum() == pytest.approx(one.episode_return)
+        assert one.stdout.startswith("episode ")
+    assert list(result.to_pandas()["case"]) == [3, 1]
+    assert "<svg" in result._repr_html_()
+
+
+def test_async_twins_play_at_once_and_give_the_same(cluster: evp.Cluster, policy: Path) -> None:
+    async def both() -> list[evp.Evaluation]:
+        calls = (cluster.evaluate_async(policy, env="toy/line", cases=[case]) for case in (0, 1))
+        return await asyncio.gather(*calls)
+
+    one, two = asyncio.run(both())
+    together = cluster.evaluate(policy, env="toy/line", cases=[0, 1])
+    assert [*one.returns, *two.returns] == [*together.returns]
+
+
+def test_a_failing_policy_is_a_result(cluster: evp.Cluster, policy: Path) -> None:
+    (policy / "policy.py").write_text("raise ValueError('not today')")
+    result = cluster.evaluate(policy, env="toy/line", cases=[0])
+    assert result.mean_return is None
+    assert "not today" in (result[0].failure or "")
+    with pytest.raises(evp.ConfigError, match=r"no policy\.py"):
+        cluster.evaluate(policy.parent, env="toy/line")
+    with pytest.raises(evp.ConfigError, match="names"):
+        cluster.evaluate(policy, env="toy/none")
+
+
+def test_a_function_plays_a_run_from_inside_its_jail(cluster: evp.Cluster, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.txt"
+    outside.write_text("hidden")
+    before = os.getpid()
+
+    def agent(workspace: evp.Workspace) -> dict[str, object]:
+        refused = ""
+        try:
+            workspace.submit([0] * 99)
+        except Exception as error:
+            refused = str(error)
+        workspace.write(POLICY.replace("{gain}", "0.3"))
+        summary = workspace.submit([0, 1])
+        return {
+            "sees_outside": outside.exists(),
+            "same_process": os.getpid() == before,
+            "mean": summary["mean_return"],
+            "refused": refused,
+            "left": workspace.remaining_budget,
+            "task": workspace.task[:20],
+        }
+
+    run = cluster.run(
+        env="toy/line", agent=agent, budget=4, validation=2, heldout=2, runs=tmp_path / "runs", exp_id="one"
+    )
+    assert run.status == "completed"
+    assert run.summary.entry == "agent"
+    value = run.value
+    assert not value["sees_outside"]
+    assert not value["same_process"]
+    assert value["left"] == 2
+    assert "budget" in value["refused"]
+    assert run.submits[0].mean_return == value["mean"]
+    (again,) = evp.load_runs(tmp_path / "runs")
+    assert again.score == run.score
+
+
+def test_a_function_that_fails_or_returns_no_json_says_so(cluster: evp.Cluster, tmp_path: Path) -> None:
+    def agent(workspace: evp.Workspace) -> object:
+        workspace.submit([0])
+        return object()
+
+    run = cluster.run(
+        env="toy/line", agent=agent, budget=4, validation=1, heldout=1, runs=tmp_path / "runs", exp_id="two"
+    )
+    assert run.value is None
+    assert run.summary.closed_reason == "agent_failed"
+    assert "is not JSON" in (run.folder / "logs" / "agent.jsonl").read_text()
+
+
+def test_ctrl_c_cancels_the_run_and_leaves_nothing(tmp_path: Path) -> None:
+    program = """
+import time
+import evopolicy as evp
+
+def agent(workspace):
+    workspace.submit([0])
+    time.sleep(600)
+
+evp.run(env="toy/line", agent=agent, budget=4, validation=1, heldout=1, exp_id="stopped")
+"""
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path / "state"), "TMPDIR": str(tmp_path)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if "submit_000 ok" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=120)
+    assert told.strip().endswith("KeyboardInterrupt")
+    record = json.loads((tmp_path / "runs/agent/toy_line/stopped/run.json").read_text())
+    assert record["outcome"]["status"] == "cancelled"
+    assert not list(tmp_path.glob("evopolicy-function-*"))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_page_does_what_it_says(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert len(blocks) == 4
+    (tmp_path / "page.py").write_text("\n".join(blocks))
+    told = run_here([sys.executable, "page.py"], tmp_path)
+    assert "my_function gym/continuouscar completed" in told
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path) -> None:
+    notebook = json.loads(NOTEBOOK.read_text())
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 4)
+    told = run_here([sys.executable, "-c", CELLS, str(NOTEBOOK)], tmp_path)
+    assert told.count("<svg") == 2
+    assert "((60, 3), " in told
+    assert (tmp_path / "runs/climb/toy_line/notebook/run.json").is_file()
+
+
+def run_here(command: list[str], folder: Path) -> str:
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | {"XDG_STATE_HOME": str(folder / "state")},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=580,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    return done.stdout
