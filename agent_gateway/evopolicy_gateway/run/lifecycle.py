@@ -213,6 +213,7 @@ class RunLifecycle:
         serving = asyncio.create_task(self._keep_gateway())
         following = asyncio.create_task(self._follow())
         keeping: asyncio.Task[AgentEnded] | None = None
+        spent = asyncio.create_task(self._spent.wait())
         try:
             up: list[asyncio.Future[Any]] = [serving, self._ready]
             await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
@@ -222,10 +223,8 @@ class RunLifecycle:
                 return  # cancelled before it was served
             self._stopwatch.opened()
             keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
-            spent = asyncio.create_task(self._spent.wait())
             going: list[asyncio.Future[Any]] = [serving, keeping, spent]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
-            spent.cancel()
             if not serving.done() and not keeping.done():
                 await asyncio.wait(
                     [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
@@ -238,7 +237,7 @@ class RunLifecycle:
             await self._close(ended)
             await serving
         finally:
-            tasks = [task for task in (serving, following, keeping) if task is not None]
+            tasks = [task for task in (serving, following, keeping, spent) if task is not None]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)

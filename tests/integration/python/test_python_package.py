@@ -95,7 +95,7 @@ def test_a_failing_policy_is_a_result(cluster: evp.Cluster, policy: Path) -> Non
     assert "not today" in (result[0].failure or "")
     with pytest.raises(evp.ConfigError, match=r"no policy\.py"):
         cluster.evaluate(policy.parent, env="toy/line")
-    with pytest.raises(evp.ConfigError, match="names"):
+    with pytest.raises(evp.ConfigError, match="no environment or suite matches"):
         cluster.evaluate(policy, env="toy/none")
 
 

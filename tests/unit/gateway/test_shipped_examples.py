@@ -26,13 +26,15 @@ def test_a_wheel_has_the_examples_where_they_are_looked_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    ((source, target),) = wheel["force-include"].items()
-    assert (ROOT / source).is_dir()
     # Installed as the wheel says, with no checkout around it.
     package = tmp_path / "evopolicy_gateway"
-    (tmp_path / target).parent.mkdir(parents=True)
-    (tmp_path / target).symlink_to(ROOT / source)
+    for source, target in wheel["force-include"].items():
+        assert (ROOT / source).exists(), source
+        (tmp_path / target).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / target).symlink_to(ROOT / source)
     monkeypatch.setattr(shipped, "__file__", str(package / "shipped.py"))
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    assert shipped.found("examples/policies", elsewhere) == package / "examples/policies"
+    for source in wheel["force-include"]:
+        assert shipped.found(source, elsewhere) == package / source
+    assert shipped.found("docs/none.md", elsewhere) == elsewhere / "docs/none.md"
