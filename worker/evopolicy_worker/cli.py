@@ -10,6 +10,7 @@ import secrets
 import signal
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -20,7 +21,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.console import table, terminal
-from evopolicy_common.errors import ConfigError, MachineError, SlotDiedError, WorkerError
+from evopolicy_common.errors import ConfigError, MachineError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
@@ -30,11 +31,11 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_worker import environments
 from evopolicy_worker.fingerprint import fingerprint
-from evopolicy_worker.sandbox import available_tiers, why_not
+from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slots.cores import Cores
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.supervisor import Options, Supervisor
+from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App(add_completion=True)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -84,7 +85,9 @@ def work(
     need_tier: Annotated[
         list[str] | None,
         typer.Option(
-            "--need-tier", hidden=True, help="Sandbox tier without which the worker does not start."
+            "--need-tier",
+            hidden=True,
+            help="Sandbox tier without which the worker does not start; it offers no other.",
         ),
     ] = None,
     grace: Annotated[
@@ -117,22 +120,29 @@ def work(
         check_scratch()
         found = credentials.find("worker", tuple(connect or ()), credentials_file)
         worker_name = name or default_name(found)
-        tiers = available_tiers(unsandboxed=unsandboxed)
+        needed = cast("tuple[Tier, ...]", tuple(need_tier or ()))
+        if len(needed) == 1 and needed[0] in SANDBOXED:
+            # The first slot tries it.
+            tiers: tuple[Tier, ...] = (*needed, "none") if unsandboxed else needed
+        else:
+            tiers = available_tiers(unsandboxed=unsandboxed, wanted=needed or SANDBOXED)
         if not tiers:
             raise MachineError(
                 "no sandbox works here: `evopolicy-worker doctor` tells why and what to do; --unsandboxed plays runs that"
                 " ask for --tier none"
             )
-        for tier in need_tier or ():
+        for tier in needed:
             if tier not in tiers:
-                raise ConfigError(
-                    f"sandbox tier {tier} does not work here: {why_not(cast(Tier, tier))};"
-                    f" `evopolicy-worker doctor` checks this machine. {_other_tier(tiers)}"
-                )
+                raise _refused(tier, why_not(tier), unsandboxed=unsandboxed)
         with scratch_folder("worker") as scratch:
-            asyncio.run(
-                _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
-            )
+            try:
+                asyncio.run(
+                    _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
+                )
+            except SandboxError as error:
+                if not needed:
+                    raise
+                raise _refused(tiers[0], str(error), unsandboxed=unsandboxed) from error
 
 
 @app.command("doctor")
@@ -158,6 +168,13 @@ def doctor(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )
     raise typer.Exit(0 if best else 1)
+
+
+def _refused(tier: Tier, why: str | None, *, unsandboxed: bool) -> ConfigError:
+    return ConfigError(
+        f"sandbox tier {tier} does not work here: {why}; `evopolicy-worker doctor` checks this machine."
+        f" {_other_tier(available_tiers(unsandboxed=unsandboxed))}"
+    )
 
 
 def _other_tier(tiers: tuple[Tier, ...]) -> str:
@@ -192,13 +209,12 @@ def foreign(env_ids: list[str]) -> tuple[catalogue.Entry, ...]:
     return tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
 
 
-async def describe_all(env_ids: list[str], tier: Tier, scratch: Path) -> tuple[EnvironmentDescription, ...]:
-    """Descriptions of environments, made in a slot of that tier: this process must stay free of simulators.
+async def describe_all(env_ids: list[str], slot: Slot) -> tuple[EnvironmentDescription, ...]:
+    """Descriptions of environments, made in this slot, which stays started: this process must stay free of simulators.
 
     A slot whose processes are killed meanwhile is started again; the WorkerError of the last try, when all fail.
     """
     for tries_left in reversed(range(DESCRIBE_TRIES)):
-        slot = Slot(None, tier, scratch / "describing", definitions=foreign(env_ids))
         try:
             await slot.start()
             return await slot.describe(env_ids)
@@ -208,8 +224,6 @@ async def describe_all(env_ids: list[str], tier: Tier, scratch: Path) -> tuple[E
                 raise
             log.warning("environments are not described yet; trying again", why=str(error))
             await asyncio.sleep(DESCRIBE_PAUSE_S)
-        finally:
-            await slot.close()
     raise AssertionError("unreachable")
 
 
@@ -224,28 +238,48 @@ async def _run(
     grace_s: float,
 ) -> None:
     cores = Cores()
-    descriptions = await describe_all(env_ids, tiers[0], scratch)
-    options = Options(
-        name=name,
-        slots=slots or cores.count,
-        tiers=tiers,
-        environments=descriptions,
-        fingerprint=fingerprint(),
-        host=socket.gethostname(),
-        boot_id=host.boot_id(),
-        machine_id=host.machine_id(),
-        scratch=scratch,
-        grace_s=grace_s,
-    )
-    if not options.boot_id:
-        log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
-    taken = [cores.take() for _ in range(options.slots)]
+    taken = [cores.take() for _ in range(slots or cores.count)]
     packages, definitions = ("numpy", *allowed_packages), foreign(env_ids)
 
-    def make_slot(index: int, tier: Tier) -> Slot:
+    def new_slot(index: int, tier: Tier) -> Slot:
         return Slot(taken[index], tier, scratch / f"slot-{index}", packages, definitions=definitions)
 
-    log.info("waiting for the coordinator", endpoints=found.endpoints)
+    first = new_slot(0, tiers[0])
+    kept = [first]
+
+    def make_slot(index: int, tier: Tier) -> Slot:
+        return kept.pop() if kept and (index, tier) == (0, tiers[0]) else new_slot(index, tier)
+
+    try:
+        descriptions = await describe_all(env_ids, first)
+        if len(env_ids) > MAX_PREPARED:
+            await first.close()
+        options = Options(
+            name=name,
+            slots=len(taken),
+            tiers=tiers,
+            environments=descriptions,
+            fingerprint=fingerprint(),
+            host=socket.gethostname(),
+            boot_id=host.boot_id(),
+            machine_id=host.machine_id(),
+            scratch=scratch,
+            grace_s=grace_s,
+        )
+        if not options.boot_id:
+            log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
+        log.info("waiting for the coordinator", endpoints=found.endpoints)
+        with contextlib.suppress(asyncio.CancelledError):
+            await _serve(found, options, make_slot)
+    finally:
+        for slot in kept:
+            await slot.close()
+        cores.close()
+
+
+async def _serve(
+    found: credentials.Credentials, options: Options, make_slot: Callable[[int, Tier], Slot]
+) -> None:
     loop = asyncio.get_running_loop()
     main = asyncio.current_task()
     assert main is not None
@@ -261,14 +295,10 @@ async def _run(
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop)
-    try:
-        with contextlib.suppress(asyncio.CancelledError):
-            async with transport.connect(found, timeout_s=None) as link:
-                supervisor = Supervisor(link, options, make_slot)
-                await supervisor.run()
-                log.info("stopped", jobs_done=supervisor.jobs_done)
-    finally:
-        cores.close()
+    async with transport.connect(found, timeout_s=None) as link:
+        supervisor = Supervisor(link, options, make_slot)
+        await supervisor.run()
+        log.info("stopped", jobs_done=supervisor.jobs_done)
 
 
 def main() -> None:

@@ -22,7 +22,6 @@ from evopolicy_gateway.cli.option_groups import spread
 from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
 from evopolicy_gateway.http import listener
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator import trials
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run.layout import folder_of
 from evopolicy_gateway.run.plan import Plan
@@ -170,6 +169,9 @@ def try_policy(
 
     Brings up a local cluster unless --connect or --credentials name one. Exit code 1 when the policy failed.
     """
+    # With numpy, which a command that plays runs does without.
+    from evopolicy_gateway.operator import trials
+
     with fail_on_our_errors():
         trial = trials.Trial(
             env=options.one_environment(env),
@@ -204,6 +206,8 @@ def play_random(
     as_json: options.Json = False,
 ) -> None:
     """Plays uniform random actions on a split: the reference that scores are held against."""
+    from evopolicy_gateway.operator import trials
+
     with fail_on_our_errors():
         chosen = None if cases is None else options.cases_of(cases)
         where = _trial_cluster(connect, credentials_file, slots, options.state_of(state, fresh=fresh), data)

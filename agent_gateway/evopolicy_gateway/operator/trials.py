@@ -147,7 +147,7 @@ async def play_random(
             ]
             results.append(_result(env_id, episodes, where))
 
-    async with connected(where, env_ids, ()) as (operations, _, failed):
+    async with connected(where, env_ids, {"none"}) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
     if as_json or len(results) == 1:
         _print(results, as_json, console)

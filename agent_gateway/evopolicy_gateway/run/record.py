@@ -48,8 +48,8 @@ from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.layout import RunFolder, Staged, saved
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.submits.formatting import submit_id
 from evopolicy_gateway.submits.journal import Accepted, AnyEntry, Journal, Rejected, Requested
+from evopolicy_gateway.submits.names import submit_id
 
 
 async def write(

@@ -50,6 +50,7 @@ from evopolicy_gateway.submits.journal import (
     SetAside,
     Settled,
 )
+from evopolicy_gateway.submits.names import episode_name
 from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -493,7 +494,7 @@ class SubmitPipeline:
     def _put(self, tree: SubmitTree, key: str, first: int, fetched: list[_Fetched]) -> None:
         """Writes episodes' folders, one after another."""
         for each in fetched:
-            name = formatting.episode_name(first + each.episode.index, self.run.episode_budget)
+            name = episode_name(first + each.episode.index, self.run.episode_budget)
             tree.put_episode(name, self._files_of(key, each))
 
     def _files_of(self, key: str, fetched: _Fetched) -> dict[str, bytes]:
@@ -520,9 +521,7 @@ class SubmitPipeline:
         if done.status != "ok":
             errors = formatting.verdict_line(done.status, done.failure, done.completed_at)
             for late in [i for i in scores if i >= done.n_kept]:
-                tree.drop_episode(
-                    formatting.episode_name(done.first_global_episode + late, self.run.episode_budget)
-                )
+                tree.drop_episode(episode_name(done.first_global_episode + late, self.run.episode_budget))
         summary = formatting.summary_bytes(
             self.run.env.env, index, done, list(scores.values()), self.run.observations
         )

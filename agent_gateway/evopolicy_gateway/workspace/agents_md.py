@@ -7,7 +7,7 @@ from string import Template
 import msgspec
 
 from evopolicy_common.messages.gateway import RunOpened
-from evopolicy_gateway.submits.formatting import episode_name, submit_id
+from evopolicy_gateway.submits.names import episode_name, submit_id
 
 
 class Urls(msgspec.Struct, frozen=True, kw_only=True):

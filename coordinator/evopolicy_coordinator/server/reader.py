@@ -42,7 +42,6 @@ from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, Read
 from evopolicy_coordinator.core.events import AuditEvent
 from evopolicy_coordinator.core.records import RunRow
 from evopolicy_coordinator.pki import identity
-from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.server.reason_texts import words
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.store import Reader
@@ -149,6 +148,9 @@ class ServiceReader:
             answer(None)
 
     def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+        # With numpy, which a coordinator that audits nothing does without.
+        from evopolicy_coordinator.server import auditing
+
         try:
             tell(auditing.carry_out(effect, self._reader, self._blobs))
         except Exception:

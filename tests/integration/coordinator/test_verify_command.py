@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,18 +43,33 @@ ENVIRONMENTS = ("toy/line", "gym/acrobot", "gymnasium/MiniGrid-FourRooms-v0")
 
 
 class Played:
-    """A state folder, and the runs that were made with it."""
+    """A state folder, the runs that were made with it, and a cluster that has it, on which most of them are verified."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.state = root / "st"
         (root / "agent.py").write_text(AGENT)
-        self.play(*(word for env in ENVIRONMENTS for word in ("--env", env)))
+        self.play(
+            "local", *(word for env in ENVIRONMENTS for word in ("--env", env)), "--state", str(self.state)
+        )
+        self.copy = root / "copy"
+        shutil.copytree(self.state, self.copy)
+        self.operator = str(self.state / "credentials" / "operator.json")
+        self._cluster = contextlib.ExitStack()
+        worker = [word for env in ENVIRONMENTS for word in ("--env", env)]
+        worker += ["--slots", "2", "--credentials", str(self.state / "credentials" / "worker.json")]
+        for room, options in {"coordinator": ["--state", str(self.state)], "worker": worker}.items():
+            command = [sys.executable, "-m", f"evopolicy_{room}.cli", *options]
+            process = self._cluster.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+            self._cluster.callback(process.terminate)
+
+    def close(self) -> None:
+        self._cluster.close()
 
     def play(self, *options: str) -> None:
-        command = [sys.executable, "-m", "evopolicy_gateway.cli", "local", "--budget", "3"]
+        command = [sys.executable, "-m", "evopolicy_gateway.cli", *options, "--budget", "3"]
         command += ["--agent", f"command:{sys.executable} {self.root / 'agent.py'}", "--validation", "1"]
-        command += ["--heldout", "2", "--state", str(self.state), *options]
+        command += ["--heldout", "2"]
         done = subprocess.run(
             command, cwd=self.root, capture_output=True, text=True, timeout=150, check=False
         )
@@ -63,15 +79,20 @@ class Played:
         found = self.root.glob(f"runs/*/{env.replace('/', '_')}/*/run.json")
         return next(path.parent for path in found if path.parent.name != OWN)
 
-    def verify(self, run: Path, *options: str, state: bool = True) -> subprocess.CompletedProcess[str]:
-        where = ["--local", *(["--state", str(self.state)] if state else [])]
+    def verify(
+        self, run: Path, *options: str, where: tuple[str, ...] | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        """On the cluster, or on one of its own that `where` describes."""
+        where = ("--credentials", self.operator) if where is None else where
         command = [sys.executable, "-c", VERIFY, str(run), "--json", *where, *options]
         return subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    return Played(tmp_path_factory.mktemp("verify"))
+def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+    found = Played(tmp_path_factory.mktemp("verify"))
+    yield found
+    found.close()
 
 
 def tampered(run: Path, target: Path, step: int, **changes: Any) -> Path:
@@ -87,7 +108,9 @@ def tampered(run: Path, target: Path, step: int, **changes: Any) -> Path:
 
 @pytest.mark.parametrize("env", ENVIRONMENTS)
 def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: str) -> None:
-    done = played.verify(played.run(env))
+    # The first one on a cluster of its own, with the state of the cluster that played it.
+    own = ("--local", "--state", str(played.copy)) if env == ENVIRONMENTS[0] else None
+    done = played.verify(played.run(env), where=own)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)
     assert report["identical"]
@@ -100,13 +123,14 @@ def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: 
 
 @pytest.mark.timeout(600)
 def test_a_run_with_hidden_cases_of_its_own_is_verified_where_they_are_known(played: Played) -> None:
-    played.play("--env", "toy/line", "--hidden-cases", "per-run", "--exp-id", OWN)
+    on = ("--credentials", played.operator)
+    played.play("run", "--env", "toy/line", "--hidden-cases", "per-run", "--exp-id", OWN, *on)
     (run,) = [path.parent for path in played.root.glob("runs/*/toy_line/own*/run.json")]
     done = played.verify(run)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)
     assert (report["identical"], report["episodes"], report["not_checked"]) == (True, 8, [])
-    done = played.verify(run, state=False)
+    done = played.verify(run, where=("--local",))
     assert done.returncode != 0
     assert "hidden cases of its own" in done.stdout + done.stderr
 
@@ -117,21 +141,6 @@ def test_a_sample_draws_as_many_episodes_as_asked_and_the_same_ones_for_the_same
         done = played.verify(run, "--sample", "3", "--seed", "7", "--no-policy")
         assert done.returncode == 0, done.stdout + done.stderr
         assert json.loads(done.stdout)["episodes"] == 3
-
-
-def test_a_run_is_verified_on_the_workers_that_are_connected(played: Played) -> None:
-    credentials = played.state / "credentials"
-    worker = ["--env", "gym/acrobot", "--slots", "1", "--credentials", str(credentials / "worker.json")]
-    with contextlib.ExitStack() as stack:
-        for room, options in {"coordinator": ["--state", str(played.state)], "worker": worker}.items():
-            command = [sys.executable, "-m", f"evopolicy_{room}.cli", *options]
-            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL))
-            stack.callback(process.terminate)
-        command = [sys.executable, "-c", VERIFY, str(played.run("gym/acrobot")), "--json", "--no-policy"]
-        command += ["--credentials", str(credentials / "operator.json")]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert json.loads(done.stdout)["episodes"] == 8
 
 
 def test_a_tampered_reward_is_found(played: Played, tmp_path: Path) -> None:
@@ -160,7 +169,7 @@ def test_without_the_coordinators_records_a_tampered_action_shows_in_what_comes_
 
 
 def test_a_cluster_with_other_cases_says_so_and_stops(played: Played) -> None:
-    done = played.verify(played.run("toy/line"), state=False)
+    done = played.verify(played.run("toy/line"), where=("--local",))
     assert done.returncode == 2
     assert "train cases of toy/line are not the run's" in done.stderr
 

@@ -57,25 +57,6 @@ def kernels(state: Path) -> tuple[KernelRow, ...]:
         store.close()
 
 
-def test_what_a_user_plays_shares_cases_compares_and_is_verified(tmp_path: Path) -> None:
-    first, _ = played(tmp_path, "a")
-    second, _ = played(tmp_path, "b")
-    assert first == second
-    # The first run's worker has ended, and nobody waits for it.
-    assert len(kernels(tmp_path / "xdg" / "evopolicy" / "local")) == 1
-    run = run_dir(tmp_path, exp_id="a")
-    code, out, err = done(tmp_path, "verify", str(run), "--local")
-    assert code == 0, err
-    assert "identical" in out
-    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
-    assert code == 0, err
-    fresh, _ = played(tmp_path, "c", "--fresh")
-    assert fresh["heldout"] != first["heldout"]
-    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
-    assert code == 3
-    assert "--fresh" in err
-
-
 STEAL = """
 import os
 submit([0])
@@ -91,10 +72,20 @@ submit([1])
 """
 
 
-def test_a_run_without_a_jail_has_its_own_cases_and_later_runs_get_new_ones(tmp_path: Path) -> None:
+def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Path) -> None:
     state = tmp_path / "xdg" / "evopolicy" / "local"
     before, note = played(tmp_path, "a")
     assert "note: " not in note
+    assert before == played(tmp_path, "b")[0]
+    # The first run's worker has ended, and nobody waits for it.
+    assert len(kernels(state)) == 1
+    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
+    assert code == 0, err
+    fresh, _ = played(tmp_path, "c", "--fresh")
+    assert fresh["heldout"] != before["heldout"]
+    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
+    assert code == 3
+    assert "--fresh" in err
     steals = agent(tmp_path, f"STATE = {str(state)!r}\n" + STEAL)
     words = [
         "local",
@@ -117,7 +108,7 @@ def test_a_run_without_a_jail_has_its_own_cases_and_later_runs_get_new_ones(tmp_
     versions = record_in(thief).versions
     stolen = json.loads((thief / "workspace" / "system" / "stolen.json").read_text())
     assert set(stolen) == {"secret-unjailed"}  # it reads what there is: the secret of its own run
-    after, note = played(tmp_path, "b")
+    after, note = played(tmp_path, "d")
     assert "the cases are new from here on" in note
     for split in SPLITS:
         hashes = {before[split], versions.cases_hash(split), after[split]}
@@ -126,8 +117,9 @@ def test_a_run_without_a_jail_has_its_own_cases_and_later_runs_get_new_ones(tmp_
         known = {known_hash(bytes.fromhex(text), split, after) for split in SPLITS}
         assert not known & {*before.values(), *after.values()}
     # The first run's cases are gone from the secret, not from the state.
-    code, _, err = done(tmp_path, "verify", str(run_dir(tmp_path, exp_id="a")), "--local")
+    code, out, err = done(tmp_path, "verify", str(run_dir(tmp_path, exp_id="a")), "--local")
     assert code == 0, err
+    assert "identical" in out
 
 
 def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
@@ -147,8 +139,9 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
         assert "--state" in err
         assert not (tmp_path / "xdg" / "evopolicy" / "local" / WORKERS_ENDED).exists()
         words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
-        code, _, err = done(tmp_path, *words)
+        code, out, err = done(tmp_path, *words)
         assert code == 0, err
+        assert "the next call has others under the same ids" in out
         running.kill()
     # What was killed keeps nobody from the state, and no later run waits for its agent.
     played(tmp_path, "after")

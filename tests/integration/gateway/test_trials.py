@@ -88,14 +88,6 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
     assert len(set(found[0].values())) == 4
 
 
-def test_a_cluster_that_is_thrown_away_says_that_its_cases_are_too(tmp_path: Path) -> None:
-    for more, told in ((("--fresh",), True), ((), False)):
-        with command(tmp_path, "random", "--env", "toy/line", "--cases", "0", *more) as running:
-            code, out, err = running.finish()
-        assert code == 0, err
-        assert ("the next call has others under the same ids" in out) == told
-
-
 def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:
     where = ["--env", "toy", "--cases", "0-3", "--json", "--credentials", str(operator_file)]
     with command(tmp_path, "random", *where) as running:

@@ -75,6 +75,8 @@ def test_without_bubblewrap_what_needs_no_sandbox_is_played(tmp_path: Path, poli
             code, out, err = running.finish()
         assert code == 0, err
         assert "mean return" in out
+        # The cluster's state is kept.
+        assert "the next call has others" not in out
 
 
 @pytest.fixture

@@ -78,9 +78,8 @@ def play(
     assert json.loads((folder / "run.json").read_text())["outcome"]["budget_used"] == SUBMITS * EPISODES
 
 
-@pytest.mark.parametrize("env", [TOY, REAL])
-def test_a_run_over_several_hosts_is_that_of_one_machine(cluster: Sites, env: str) -> None:
-    play(cluster, "quiet", env)
+def test_a_run_over_several_hosts_is_that_of_one_machine(cluster: Sites) -> None:
+    play(cluster, "quiet", REAL)
 
 
 def test_both_workers_are_given_work_and_see_nothing_of_the_coordinators_disk(cluster: Sites) -> None:

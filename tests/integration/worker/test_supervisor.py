@@ -498,7 +498,7 @@ def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
     ("broken", "part"),
     [
         ("evopolicy_common.wire.transport.Link.ask_blocking", "the heartbeat"),
-        ("evopolicy_worker.outbox.Outbox._batch", "handing in"),
+        ("evopolicy_worker.outbox.Outbox._batch", "reporting"),
     ],
 )
 def test_a_worker_of_which_a_part_cannot_go_on_ends_with_the_reason(

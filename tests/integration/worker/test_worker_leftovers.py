@@ -14,6 +14,7 @@ import pytest
 from own_processes import alive
 
 from evopolicy_common.errors import WorkerError
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_gateway.run import processes
 from evopolicy_worker import cli
 from evopolicy_worker.slots.slot import Slot
@@ -24,12 +25,19 @@ from pathlib import Path
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_worker import cli
 from evopolicy_worker.sandbox import available_tiers
+from evopolicy_worker.slots.slot import Slot
 
 print("begun", flush=True)
 tiers = available_tiers()
 print("tiers", flush=True)
+async def describe(scratch):
+    slot = Slot(None, tiers[0], scratch / "slot")
+    try:
+        await cli.describe_all(["gym/acrobot", "gym/bipedal"], slot)
+    finally:
+        await slot.close()
 with scratch_folder("worker") as scratch:
-    asyncio.run(cli.describe_all(["gym/acrobot", "gym/bipedal"], tiers[0], scratch))
+    asyncio.run(describe(scratch))
     print("described", flush=True)
 """
 """What a worker does before it waits for its coordinator."""
@@ -42,6 +50,14 @@ def start(temporary: Path) -> subprocess.Popen[bytes]:
         stderr=subprocess.DEVNULL,
         env={**os.environ, "TMPDIR": str(temporary)},
     )
+
+
+async def described(env_ids: list[str], scratch: Path) -> tuple[EnvironmentDescription, ...]:
+    slot = Slot(None, "bwrap", scratch / "slot")
+    try:
+        return await cli.describe_all(env_ids, slot)
+    finally:
+        await slot.close()
 
 
 def semaphores() -> set[str]:
@@ -94,7 +110,7 @@ def test_a_describing_process_that_is_killed_is_started_again(
         return await describe(self, env_ids)
 
     monkeypatch.setattr(Slot, "describe", killed)
-    work = cli.describe_all(["toy/line", "gym/acrobot"], "bwrap", tmp_path)
+    work = described(["toy/line", "gym/acrobot"], tmp_path)
     if kills == cli.DESCRIBE_TRIES:
         with pytest.raises(WorkerError, match="ended with status"):
             asyncio.run(work)
@@ -106,4 +122,4 @@ def test_a_describing_process_that_is_killed_is_started_again(
 
 def test_what_cannot_be_described_is_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(WorkerError, match="no/such"):
-        asyncio.run(cli.describe_all(["no/such"], "bwrap", tmp_path))
+        asyncio.run(described(["no/such"], tmp_path))

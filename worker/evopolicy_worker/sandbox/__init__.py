@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import subprocess
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 
@@ -16,15 +17,21 @@ from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import START_TIMEOUT_S
 from evopolicy_worker.slots import slot_messages as messages
 
+SANDBOXED: tuple[Tier, ...] = ("bwrap", "landlock")
+"""Tiers that lock policies in, the strongest first."""
+
 
 def available_tiers(
-    allowed_packages: tuple[str, ...] = ("numpy",), *, unsandboxed: bool = False
+    allowed_packages: tuple[str, ...] = ("numpy",),
+    *,
+    unsandboxed: bool = False,
+    wanted: Collection[str] = SANDBOXED,
 ) -> tuple[Tier, ...]:
     """Tiers that this machine offers, the strongest first; `none` only when its operator says so.
 
-    Nothing falls back from one tier to another: a job names its tier.
+    `wanted`: sandboxed tiers that are tried, each of which takes about a second. Nothing falls back from one tier to another: a job names its tier.
     """
-    found: list[Tier] = [tier for tier in ("bwrap", "landlock") if why_not(tier, allowed_packages) is None]
+    found = [tier for tier in SANDBOXED if tier in wanted and why_not(tier, allowed_packages) is None]
     return (*found, "none") if unsandboxed else tuple(found)
 
 

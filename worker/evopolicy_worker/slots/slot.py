@@ -120,8 +120,10 @@ class Slot:
             raise _error(answer)
 
     async def prepare(self, env_ids: Sequence[str]) -> None:
-        """Start the processes and make these environments, which the jobs to come find ready. Raises as `start`."""
-        await self.start()
+        """Start the processes, unless they are, and make these environments, which the jobs to come find ready. Raises as
+        `start`."""
+        if self._process is None:
+            await self.start()
         if env_ids:
             await self.describe(env_ids)
 

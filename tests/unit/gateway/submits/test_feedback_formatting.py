@@ -23,12 +23,11 @@ from evopolicy_gateway.submits.episode_files import episode_files
 from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,
     EpisodeScore,
-    episode_name,
     failure_line,
-    submit_id,
     summary_bytes,
     verdict_line,
 )
+from evopolicy_gateway.submits.names import episode_name, submit_id
 
 
 def trajectory_files(packed: bytes, storage: ObsStorage | None) -> dict[str, bytes]:

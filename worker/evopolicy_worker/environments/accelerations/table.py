@@ -11,10 +11,6 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import structlog
-
-log = structlog.get_logger(__name__)
-
 PROVED: Mapping[str, tuple[str, ...]] = {
     "gymnasium": ("1.4.0",),
     "highway-env": ("1.12.1",),
@@ -54,7 +50,7 @@ class Acceleration:
             return True
         if self.name not in _told:
             _told.add(self.name)
-            log.warning("acceleration is off: not exact on this machine", acceleration=self.name)
+            _warn("not exact on this machine", acceleration=self.name)
         return False
 
     def apply(self, env: Any) -> None:
@@ -101,13 +97,20 @@ def usable(acceleration: Acceleration) -> bool:
     unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
     if unproved and acceleration.name not in _told:
         _told.add(acceleration.name)
-        log.warning(
-            "acceleration is off: not proved with the installed version",
+        _warn(
+            "not proved with the installed version",
             acceleration=acceleration.name,
             installed=unproved,
             proved={name: PROVED[name] for name in unproved},
         )
     return not unproved
+
+
+def _warn(why: str, **about: Any) -> None:
+    # Every slot's process imports this module, and the logger is a fifth of what it would import.
+    import structlog
+
+    structlog.get_logger(__name__).warning(f"acceleration is off: {why}", **about)
 
 
 def _version(distribution: str) -> str:
