@@ -6,6 +6,7 @@ import json
 
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_common.messages.gateway import RunOpened
+from evopolicy_gateway.submits.episode_files import episode_share
 
 
 def task_markdown(run: RunOpened) -> str:
@@ -116,6 +117,10 @@ def _limits(run: RunOpened) -> str:
         ("one action, beyond 16 bytes for each of its numbers", _size(limits.action_bytes)),
         ("what larger actions come to in one episode", _size(limits.episode_action_bytes)),
         ("kept of stdout and of stderr", f"{_size(limits.output_bytes)} each"),
+        (
+            "files of one episode; beyond it video, observations, rows are left out, in this order",
+            _size(episode_share(limits, run.episode_budget)),
+        ),
     ]
     if limits.submit_wall_s is not None:
         rows.append(("wall time of a whole submit", f"{limits.submit_wall_s:g} s"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 from evopolicy_common.messages.environment import ObsStorage
+from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_common.records import rendered, trajectory
 from evopolicy_common.records.summary import SCHEMA_VERSION, utc_text
@@ -14,10 +15,41 @@ FEEDBACK_ERROR = "feedback_error"
 """Category of the line in `error.txt` that tells of a fault of ours: the policy did not fail."""
 
 
+LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "trajectory.jsonl")
+"""What an episode does without, in this order, until its files fit into its share."""
+
+
+def episode_share(limits: ResourceLimits, episode_budget: int) -> int:
+    """What the files of one episode may take, bytes."""
+    return limits.feedback_bytes // max(1, episode_budget)
+
+
+def within_share(files: dict[str, bytes], share: int) -> dict[str, bytes]:
+    """The files that fit into `share` bytes; `left_out.txt` names the others."""
+    size = sum(map(len, files.values()))
+    told: list[str] = []
+    kept = dict(files)
+    for name in LEFT_OUT_FIRST:
+        if size > share and name in kept:
+            told.append(f"{name}: {len(kept[name]):,} bytes\n")
+            size -= len(kept.pop(name))
+    if told:
+        kept["left_out.txt"] = (
+            f"Left out, as an episode's files may take {share:,} bytes in this run:\n{''.join(told)}".encode()
+        )
+    return kept
+
+
 def episode_files(
-    episode: EpisodeFeedback, packed: bytes, video: bytes | None, storage: ObsStorage, *, at: float
+    episode: EpisodeFeedback,
+    packed: bytes,
+    video: bytes | None,
+    storage: ObsStorage,
+    *,
+    at: float,
+    share: int,
 ) -> dict[str, bytes]:
-    """What `episodes/ep_XXX/` holds.
+    """What `episodes/ep_XXX/` holds, in at most `share` bytes beside what the policy printed.
 
     `packed` is a rendered episode or, from workers of earlier versions, a trajectory; `at` the Unix time written into
     `error.txt`. ProtocolError when it is neither, or not of the length and return that were declared.
@@ -28,7 +60,7 @@ def episode_files(
         files = rendered.files_of(trajectory.decode(packed), storage)
     if video is not None:
         files["video.mp4"] = video
-    return files | _told_files(episode, at)
+    return within_share(files, share) | _told_files(episode, at)
 
 
 def set_aside_files(episode: EpisodeFeedback, why: str, *, at: float) -> dict[str, bytes]:

@@ -35,7 +35,7 @@ from evopolicy_common.wire.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.http.submit_request import Bounds, parse
 from evopolicy_gateway.run.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
 from evopolicy_gateway.submits import formatting, snapshots
-from evopolicy_gateway.submits.episode_files import episode_files, set_aside_files
+from evopolicy_gateway.submits.episode_files import episode_files, episode_share, set_aside_files
 from evopolicy_gateway.submits.feedback import SubmitTree
 from evopolicy_gateway.submits.formatting import EpisodeScore
 from evopolicy_gateway.submits.journal import (
@@ -502,10 +502,16 @@ class SubmitPipeline:
         episode, at = fetched.episode, self._clock()
         why = fetched.why
         if not why:
-            storage = self.run.env.obs_storage
             try:
                 with self._journal.at_work.on(key, episode.index):
-                    return episode_files(episode, fetched.trajectory, fetched.video, storage, at=at)
+                    return episode_files(
+                        episode,
+                        fetched.trajectory,
+                        fetched.video,
+                        self.run.env.obs_storage,
+                        at=at,
+                        share=episode_share(self.run.limits, self.run.episode_budget),
+                    )
             except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
                 log.error(
                     "an episode's files cannot be made", submit=key, index=episode.index, exc_info=error

@@ -7,6 +7,7 @@ from string import Template
 import msgspec
 
 from evopolicy_common.messages.gateway import RunOpened
+from evopolicy_gateway.submits.episode_files import episode_share
 from evopolicy_gateway.submits.names import episode_name, submit_id
 
 
@@ -189,6 +190,7 @@ head -n 2 feedback/$first_submit/episodes/$first_episode/trajectory.jsonl
 | `episodes/ep_*/stdout.txt`, `stderr.txt` | what the policy printed |
 | `episodes/ep_*/error.txt` | step, category and traceback where the policy failed |
 | `episodes/ep_*/video.mp4` | a frame a step, where this run records videos |
+| `episodes/ep_*/left_out.txt` | what is missing because the episode's files would take more than $share bytes: first the video, then the observations, then the rows |
 
 Episodes are numbered through the run. While a submit runs, its finished episodes are in `$first_submit.partial/` and so on.
 
@@ -265,6 +267,7 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
         observations=_OBSERVATIONS[run.observations],
         imports=", ".join(f"`{name}`" for name in run.allowed_imports) or "no package",
         threads=run.limits.processes,
+        share=f"{episode_share(run.limits, run.episode_budget):,}",
         first_submit=submit_id(0, run.episode_budget),
         first_episode=episode_name(0, run.episode_budget),
         task_url=urls.task,

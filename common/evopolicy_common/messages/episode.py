@@ -67,6 +67,9 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     made of as many values as there are 16 bytes in that."""
     episode_action_bytes: Int = 4 << 20
     """What the actions of an episode may take together beyond what the action space needs, bytes."""
+    feedback_bytes: Int = 16 << 30
+    """What the files of all the run's episodes may take together, bytes. Each episode has an equal share, whatever others take:
+    what is written must not depend on which was done first. Beyond it its video is left out, then its observations, then its rows."""
     submit_wall_s: Number | None = None
     """Wall time of a whole submit, seconds; None (the default) for no limit."""
 

@@ -23,8 +23,8 @@ from evopolicy_common.messages.worker import Message, WorkerReply, WorkerRequest
 WIRE_VERSION = 1
 """Raised when a change is not understood by older peers; the first message of a session carries it."""
 
-CHUNK_BYTES = 48 * 1024
-"""Payload of one blob chunk: fits one Zenoh batch of 65,535 bytes with its envelope."""
+CHUNK_BYTES = 256 * 1024
+"""Payload of one blob chunk: as large as a page of results, so that no chunk holds up its lane longer than one."""
 
 INLINE_BYTES = 24 * 1024
 """A blob up to this size travels inside the message that names it."""

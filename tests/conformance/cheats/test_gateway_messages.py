@@ -62,6 +62,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "output_bytes": "int",
         "action_bytes": "int",
         "episode_action_bytes": "int",
+        "feedback_bytes": "int",
         "submit_wall_s": "float | none",
     },
     "RunState": {

@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.messages.environment import ObservationForm, ObsStorage
-from evopolicy_common.messages.episode import BlobRef, PolicyFailure
+from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits
 from evopolicy_common.messages.gateway import EpisodeFeedback, SubmitDone
 from evopolicy_common.records.json_text import json_bytes
 from evopolicy_common.records.rendered import decode, files_of
 from evopolicy_common.records.summary import decode_summary
 from evopolicy_common.records.trajectory import Recorder
-from evopolicy_gateway.submits.episode_files import episode_files
+from evopolicy_gateway.submits.episode_files import LEFT_OUT_FIRST, episode_files, episode_share, within_share
 from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,
     EpisodeScore,
@@ -266,7 +266,7 @@ def test_streams_are_cut_and_videos_kept() -> None:
         stdout=b"x" * (MAX_TEXT_BYTES + 5),
         stderr=b"",
     )
-    files = episode_files(episode, packed([np.zeros(1)]), b"mp4", "inline", at=0.0)
+    files = episode_files(episode, packed([np.zeros(1)]), b"mp4", "inline", at=0.0, share=1 << 20)
     assert len(files["stdout.txt"]) == MAX_TEXT_BYTES
     assert files["video.mp4"] == b"mp4"
     assert sorted(files) == ["stderr.txt", "stdout.txt", "trajectory.jsonl", "video.mp4"]
@@ -274,3 +274,20 @@ def test_streams_are_cut_and_videos_kept() -> None:
 
 def test_an_episode_without_a_step_has_an_empty_trajectory() -> None:
     assert trajectory_files(packed([]), "npy") == {"trajectory.jsonl": b""}
+
+
+@pytest.mark.parametrize(
+    ("share", "left_out"), [(600, 0), (599, 1), (301, 1), (300, 1), (299, 2), (100, 2), (99, 3), (0, 3)]
+)
+def test_what_does_not_fit_an_episodes_share_is_left_out_in_order(share: int, left_out: int) -> None:
+    files = {"trajectory.jsonl": b"r" * 100, "observations.npz": b"o" * 200, "video.mp4": b"v" * 300}
+    kept = within_share(files, share)
+    assert set(files) - set(kept) == set(LEFT_OUT_FIRST[:left_out])
+    told = kept.get("left_out.txt", b"").decode()
+    assert [name for name in LEFT_OUT_FIRST if name in told] == list(LEFT_OUT_FIRST[:left_out])
+    assert (f"{share:,} bytes" in told) == bool(left_out)
+
+
+def test_every_episode_of_a_run_has_the_same_share_of_its_feedback() -> None:
+    assert episode_share(ResourceLimits(feedback_bytes=1000), 3) == 333
+    assert 128 * episode_share(ResourceLimits(), 128) == 16 << 30
