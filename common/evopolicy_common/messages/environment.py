@@ -73,7 +73,8 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Name to exact version of the distributions that decide this environment's numbers."""
 
     def digest(self) -> str:
-        """SHA-256 of the definition, 64 hex digits: of all that is told here but what plays it, in which versions.
+        """SHA-256 of the definition, 64 hex digits: of all that is told here but what plays it, in which versions,
+        and where its observations are kept.
 
         A field at its default does not count, so that fields that are added later change no digest.
         """
@@ -90,4 +91,4 @@ def _default(field: msgspec.structs.FieldInfo) -> object:
     return field.default if factory is msgspec.NODEFAULT else factory()
 
 
-_NOT_DEFINED = frozenset({"env_version", "adapter", "packages"})
+_NOT_DEFINED = frozenset({"env_version", "obs_storage", "adapter", "packages"})
