@@ -154,8 +154,12 @@ class Page:
 
     def open(self, path: Path) -> None:
         """Opens a file and waits for its load event."""
+        self.visit(path.resolve().as_uri())
+
+    def visit(self, url: str) -> None:
+        """Opens an address and waits for its load event."""
         self._loaded = False
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         deadline = time.monotonic() + self.timeout_s
         while not self._loaded:
             self._next(deadline)
@@ -166,6 +170,21 @@ class Page:
         if "exceptionDetails" in result:
             raise RuntimeError(str(result["exceptionDetails"]["exception"].get("description")))
         return result["result"].get("value")
+
+    def until(self, script: str) -> None:
+        """Waits until a JavaScript expression is true; TimeoutError with the page's text when it does not become so."""
+        deadline = time.monotonic() + self.timeout_s
+        while not self.run(script):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{script} is not true of: {self.run('document.body.innerText')}")
+            time.sleep(0.1)
+
+    def violations(self) -> list[str]:
+        """What axe-core finds wrong with the page's accessibility: rule, and the elements."""
+        axe = (Path(__file__).parent / "vendor" / "axe.min.js").read_text()
+        self.run(f"(() => {{ {axe}; }})(), true")
+        found = self.run("axe.run().then((result) => result.violations)")
+        return [f"{one['id']}: {[node['html'] for node in one['nodes']]}" for one in found]
 
     def look(self, *, width: int = 1280, height: int = 800, dark: bool = False, phone: bool = False) -> None:
         """Sets the window's size in CSS pixels and the preferred colour scheme."""

@@ -78,6 +78,15 @@ Audit = Annotated[
     ),
 ]
 
+Web = Annotated[
+    bool,
+    typer.Option(
+        "--web",
+        help="Show the runs in a browser while the command runs, live; its address is printed. See `evopolicy web`.",
+        rich_help_panel=RUN,
+    ),
+]
+
 HiddenIsolation = Literal["related", "strict", "off"]
 Isolation = Annotated[
     HiddenIsolation | None,

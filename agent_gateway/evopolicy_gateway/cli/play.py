@@ -57,6 +57,7 @@ def run(
     fresh: options.Fresh = False,
     data: options.DataFolder = None,
     hidden_isolation: options.Isolation = None,
+    web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
     """Plays one run: opens it at the coordinator, starts gateway and agent, follows them to run.json."""
@@ -82,7 +83,7 @@ def run(
                 data=data,
                 hidden_isolation=hidden_isolation,
             )
-        _play(plans, where, 1, as_json)
+        _play(plans, where, 1, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
@@ -107,6 +108,7 @@ def local(
     data: options.DataFolder = None,
     audit: options.Audit = 0.0,
     hidden_isolation: options.Isolation = None,
+    web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
     """Plays runs on this machine alone: coordinator, worker and gateways come up, play, and go again."""
@@ -120,7 +122,7 @@ def local(
             audit=audit,
             hidden_isolation=hidden_isolation,
         )
-        _play(plans, where, parallel, as_json)
+        _play(plans, where, parallel, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy demo")
@@ -286,7 +288,9 @@ def _plans(
     return plans
 
 
-def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
+def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
+    if web:
+        where = msgspec.structs.replace(where, web=plans[0].runs)
     console = terminal(stderr=as_json)
     played = run_to_end(plain_runs.play(plans, where, parallel, console))
     if as_json:

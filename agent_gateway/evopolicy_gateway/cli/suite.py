@@ -80,6 +80,7 @@ def suite(
     data: options.DataFolder = None,
     audit: options.Audit = 0.0,
     hidden_isolation: options.Isolation = None,
+    web: options.Web = False,
     as_json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
     """Plays a sweep: agents × environments × repeats. Stopped in any way, the same command goes on where it was."""
@@ -110,6 +111,8 @@ def suite(
                 audit=audit,
                 hidden_isolation=hidden_isolation,
             )
+        if web:
+            where = msgspec.structs.replace(where, web=root)
         where.check_cases(run.settings for run in expanded)
         order = Order(
             suite=wanted,

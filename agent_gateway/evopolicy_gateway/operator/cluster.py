@@ -18,6 +18,7 @@ from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.operator.live_view import live_view
 from evopolicy_gateway.operator.operations import Operations, find_credentials
 
 
@@ -37,6 +38,8 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """Of a local one: share of the episodes that a second worker plays again."""
     hidden_isolation: str | None = None
     """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
+    web: Path | None = None
+    """Folder of runs that a live view shows meanwhile; None for no view."""
 
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
         """ConfigError where a local one has not the case files that a run plays."""
@@ -83,6 +86,8 @@ async def reached(where: Cluster) -> AsyncIterator[Reached]:
             file, opened = local.operator_file, local.opened
         operator, gateway = find_credentials(where.connect, file)
         link = await stack.enter_async_context(transport.connect(operator))
+        if where.web is not None:
+            await stack.enter_async_context(live_view(where.web, where.connect, file))
         yield Reached(Operations(link, opened), gateway, local)
 
 

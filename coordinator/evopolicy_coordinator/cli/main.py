@@ -98,6 +98,13 @@ def serve(
             " of the machines until they are played.",
         ),
     ] = CoreSettings().hidden_wait_s,
+    metrics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Serve /metrics in Prometheus' text format and /healthz here. They need no token and tell nothing of single runs.",
+        ),
+    ] = None,
     ready_file: Annotated[
         Path | None,
         typer.Option(help="Once it serves, write where it can be reached to this file, as JSON."),
@@ -133,6 +140,7 @@ def serve(
             core=CoreSettings(
                 audit_share=audit, hidden_isolation=hidden_isolation, hidden_wait_s=hidden_wait
             ),
+            metrics=metrics,
         )
         try:
             asyncio.run(_run(options, ready_file))

@@ -50,6 +50,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     unjailed: bool = False
     """Agents of its runs may read the state folder: they play cases of their own; see `splits.secret_of`."""
     core: CoreSettings = CoreSettings()
+    metrics: str | None = None
+    """HOST:PORT of `/metrics` and `/healthz`; None for none."""
 
 
 async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:
@@ -88,7 +90,18 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         )
         reader = ServiceReader(state.database, blobs, uploads)
         service = Service(state.identity.cluster, store, reader, parser, options.core)
+        serving = contextlib.AsyncExitStack()
         try:
+            if options.metrics is not None:
+                # Here, not above: without the option nobody waits for its imports.
+                from evopolicy_coordinator.server.metrics import Meter
+                from evopolicy_coordinator.server.metrics_server import metrics_server
+
+                service.meter = Meter(state.root, service.status)
+                port = await serving.enter_async_context(
+                    metrics_server(options.metrics, service.meter, lambda: service.serves)
+                )
+                log.info("metrics are served", address=options.metrics, port=port)
             await service.start()
             listener = remote_listener(
                 state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
@@ -97,6 +110,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
                 await _serve(state, options, listen, reachable(remote), service, stop, on_ready, note)
         finally:
             await service.stop()
+            await serving.aclose()
         log.info("stopped; everything is on disk", state=str(state.root))
 
 

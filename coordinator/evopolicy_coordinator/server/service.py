@@ -23,6 +23,7 @@ import hmac
 import time
 from collections.abc import Callable, Coroutine
 from importlib import metadata
+from typing import TYPE_CHECKING
 
 import msgspec
 import structlog
@@ -60,6 +61,9 @@ from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.server.watchdog import LoopWatchdog
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
+
+if TYPE_CHECKING:
+    from evopolicy_coordinator.server.metrics import Meter
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -113,6 +117,8 @@ class Service:
         self._watchdog: LoopWatchdog | None = None
         self._sweeper: asyncio.TimerHandle | None = None
         self.n_events = 0
+        self.meter: Meter | None = None
+        """Is shown the effects of every step, where there is one."""
 
     async def start(self) -> None:
         """Loads the core from the store. StorageError when that cannot be read or counted up; PartFailedError when it can be
@@ -344,6 +350,15 @@ class Service:
         run = parsed.asker if parsed.room == "gw" else None
         self._reader.get(run, message, answer_to(query, parsed.asker))
 
+    @property
+    def serves(self) -> bool:
+        """Whether a core is loaded."""
+        return self._core is not None and not self._stopping
+
+    def status(self) -> operator.StatusReply | None:
+        """What operators are told now; None while no core is loaded."""
+        return None if self._core is None else self._status(self._core)
+
     def _status(self, core: Core) -> operator.StatusReply:
         part = core.status(self.now(), words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
@@ -395,6 +410,8 @@ class Service:
             # A bug. What the core holds may be half changed, what is on disk is not.
             self._core_failed(error)
             return
+        if self.meter is not None:
+            self.meter.observe(effects)
         outbox.put(effects)
 
     def _core_failed(self, error: Exception) -> None:
@@ -447,6 +464,8 @@ class Service:
         # A clock that was set back while no coordinator ran must not make anything end before it began.
         self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self._core, effects = Core.load(self._settings, snapshot, self.now())
+        if self.meter is not None:
+            self.meter.loaded(self._core)
         self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
         self._outbox.put(effects)
         self._storage_error = ""

@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl, urlencode
 import msgspec
 import structlog
 import uvicorn
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 from starlette.applications import Starlette
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -26,7 +27,9 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.operator import StatusReply
 from evopolicy_common.wire.credentials import Credentials
+from evopolicy_coordinator.server.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web import acting, views
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.cluster import Cluster
@@ -75,7 +78,12 @@ class Site:
         self._looked_at = float("-inf")
         self._looking = asyncio.Lock()
         self._took_s = 0.0
+        self._registry = CollectorRegistry()
+        ProcessCollector(registry=self._registry)
+        browsers = Gauge("evopolicy_web_browsers", "Browsers that follow a page.", registry=self._registry)
+        browsers.set_function(lambda: self.feeds.watchers)
         if credentials is not None:
+            self._registry.register(StatusCollector(self._known_status))
             self.cluster = Cluster(credentials, lambda: self.feeds.watchers > 0, self._moved.set)
 
     @contextlib.asynccontextmanager
@@ -122,6 +130,9 @@ class Site:
                 # Of one moment's files: the next look finds others.
                 log.exception("a page could not be updated")
             await asyncio.sleep(0.5)
+
+    def _known_status(self) -> StatusReply | None:
+        return self.cluster.status if self.cluster is not None and self.cluster.is_known else None
 
     # ---- views by page ----
 
@@ -321,6 +332,12 @@ class Site:
         """For service managers: the process serves. It tells nothing else, as it needs no token."""
         return PlainTextResponse("ok\n")
 
+    async def metrics(self, request: Request) -> Response:
+        """What the coordinator told last, and this process's own figures, in Prometheus' text format."""
+        if self.cluster is not None:
+            self.cluster.look()
+        return Response(await asyncio.to_thread(generate_latest, self._registry), media_type=CONTENT_TYPE)
+
     # ---- acting ----
 
     async def act(self, request: Request) -> Response:
@@ -397,6 +414,7 @@ class Site:
             Route("/login", self.login, methods=["GET", "POST"]),
             Route("/static/{name}", self.static),
             Route("/healthz", self.health),
+            Route("/metrics", self.metrics),
             Route("/act/{kind}/{name}/{verb}", self.act, methods=["GET", "POST"]),
             Route("/log", self.action_log),
         ]
