@@ -153,6 +153,9 @@ async def _suite(order: Order) -> int:
             for one in decided:
                 if one.kind == "keep":
                     _keep(order, index, one)
+                elif one.run.name not in index.runs:
+                    # So that whoever looks at the sweep sees what waits, too.
+                    index.runs[one.run.name] = suite_index.waiting(one.run)
             suite_index.save(order.root, index)
             names = [run.name for run in order.runs]
             view = view_of(names, order.suite.parallel.machine, console, as_json=order.as_json)
@@ -163,6 +166,7 @@ async def _suite(order: Order) -> int:
                 sweep = ClaimedSweep(order.suite, order.root, index, operations, gateway, view)
                 await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
     entries = [index.runs[name] for name in names if name in index.runs]
+    entries = [entry for entry in entries if entry.state != "pending"]
     if not order.as_json:
         console.print(results_table(entries))
         if (told := suite_index.told(index)) is not None:

@@ -34,7 +34,7 @@ def _kind(entry: Entry | None) -> str:
 
 def _why(run: Plan, entry: Entry | None) -> str:
     """In a line."""
-    if entry is None:
+    if entry is None or entry.state == "pending":
         return f"{run.name}: it was not begun"
     said = {
         "agent_failed": f"its agent stopped: {entry.closed_reason}",

@@ -127,6 +127,18 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     )
 
 
+def waiting(suite_run: SuiteRun) -> Entry:
+    """What the index tells of a run that has not begun."""
+    settings = suite_run.settings
+    return Entry(
+        name=suite_run.name,
+        agent=suite_run.agent,
+        env=settings.env,
+        repeat=settings.repeat,
+        digest=suite_run.digest,
+    )
+
+
 def used(index: Index) -> tuple[int, float]:
     """Tokens and dollars of all runs, with their earlier attempts."""
     told = [one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None]

@@ -13,7 +13,7 @@ from evopolicy_common.messages.operator import RunStatus, WorkerStatus
 from .agents import permits
 from .isolation import conflicts
 from .leasing import pins
-from .model import AUDIT, Lane, Lease, Run, Worker
+from .model import AUDIT, JobGroup, Lane, Lease, Run, Worker
 from .reasons import Reason
 from .runs import audits, finished
 from .runs.waits import waits_for
@@ -42,8 +42,17 @@ class CoreStatus(NamedTuple):
 
 def status(state: State, now: float, words: Words) -> CoreStatus:
     """The core's part of a `StatusReply`; `words` puts a reason into words."""
-    workers = tuple(_worker(state, worker, now) for worker in state.workers.values())
-    runs = tuple(_run(state, run, words) for run in state.runs.values())
+    # By profile and by run once: thousands of workers have few profiles, and hundreds of runs share the groups.
+    refused = {
+        profile: pins.refused_runs(state, profile)
+        for profile in {worker.profile: None for worker in state.workers.values()}
+    }
+    groups: dict[str, list[JobGroup]] = {}
+    for group in state.groups.values():
+        if group.kind != "audit":
+            groups.setdefault(group.run, []).append(group)
+    workers = tuple(_worker(state, worker, now, refused[worker.profile]) for worker in state.workers.values())
+    runs = tuple(_run(state, run, groups.get(run.id, []), words) for run in state.runs.values())
     states: dict[str, int] = {}
     for row in [row for run in state.runs.values() for row in run.audits.values()]:
         states[row.state] = states.get(row.state, 0) + 1
@@ -60,7 +69,7 @@ def status(state: State, now: float, words: Words) -> CoreStatus:
     )
 
 
-def _worker(state: State, worker: Worker, now: float) -> WorkerStatus:
+def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -> WorkerStatus:
     profile = worker.profile
     live = [lease for lease in worker.leases.values() if lease.live]
     return WorkerStatus(
@@ -76,7 +85,7 @@ def _worker(state: State, worker: Worker, now: float) -> WorkerStatus:
         held=len(live),
         running=sum(lease.running for lease in live),
         last_seen_s=max(0.0, now - worker.last_seen),
-        refused=pins.refused_runs(state, worker),
+        refused=refused,
         boot_id=worker.kernel.boot_id,
         hidden_bar=conflicts.conflict_of_worker(state, worker),
         playing=_playing(live),
@@ -93,8 +102,7 @@ def _playing(live: list[Lease]) -> dict[str, int]:
     return found
 
 
-def _run(state: State, run: Run, words: Words) -> RunStatus:
-    groups = [group for group in state.groups.values() if group.run == run.id and group.kind != "audit"]
+def _run(state: State, run: Run, groups: list[JobGroup], words: Words) -> RunStatus:
     waiting = [reason for group in groups if (reason := waits_for(state, group)) is not None]
     progress, waits = finished.progress(state, run)
     return RunStatus(

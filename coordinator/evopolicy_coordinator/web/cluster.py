@@ -23,7 +23,7 @@ from evopolicy_common.wire.operator_client import OperatorClient
 
 _LEAST_PAUSE_S = 1.0
 _IDLE_S = 30.0
-_SHARE = 100.0
+_SHARE = 60.0
 _RETRY_S = 2.0
 _SAMPLE_S = 60.0
 _SAMPLES = 24 * 60

@@ -28,7 +28,7 @@ from evopolicy_coordinator.web.run_folders import Reader, RunFacts, Runs, Submit
 
 PAGE_ROWS = 50
 """Rows of a table on one page."""
-MAX_CELLS = 400
+MAX_CELLS = 300
 """Runs that the matrix shows; the rest is in the table."""
 MAX_SUBMITS = 200
 """Submits that a run's page lists, the newest."""

@@ -23,15 +23,15 @@ from evopolicy_coordinator.web.access import kept_tokens
 SUITE = """
 name = "watched"
 environments = ["toy/line"]
-repeats = 2
 [defaults]
+repeats = 2
 budget = 3
 validation = 1
 heldout = 1
 [parallel]
 machine = 1
 [[agents]]
-name = "<b>careful</b>"
+name = "<b>careful"
 agent = "command:{python} {agent}"
 [agents.jail]
 read = ["{folder}"]
@@ -121,8 +121,9 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
             assert page.run("document.cookie") == "", "scripts see no cookie"
             with command(tmp_path, *plays) as sweep:
                 # The page has been open since before the sweep began: its rows come by themselves.
+                wait_until(workspaces, lambda: sweep.text)
                 page.until(f"{TEXT}.includes('watched') && {TEXT}.includes('training')")
-                assert "<b>careful</b>" in page.run(TEXT)
+                assert "<b>careful" in page.run(TEXT)
                 page.until("document.querySelectorAll('#run-rows tr').length === 2")
                 page.until("document.querySelector('#run-rows tr td:nth-child(6)').textContent === '1'")
                 assert page.violations() == []
@@ -138,9 +139,9 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                 assert page.violations() == []
                 assert page.problems == []
                 os.kill(worker.pid, signal.SIGKILL)
-                page.until("!document.querySelector('#facts').innerText.startsWith('1 of 1')")
+                page.until("!document.querySelector('#facts b').textContent.startsWith('1 of 1')")
                 with process(log, *works):
-                    page.until("document.querySelector('#facts').innerText.startsWith('1 of ')")
+                    page.until("document.querySelector('#facts b').textContent.startsWith('1 of ')")
 
                     # The coordinator restarts, and the page says so meanwhile.
                     coordinator.kill()
@@ -161,14 +162,18 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                         # The first run is scored while the second one's agent is alive: its scores are hidden until that ends.
                         page.visit(f"http://127.0.0.1:{web}/")
                         (first / "go").touch()
+                        wait_until(
+                            lambda: len(list((runs / "watched").rglob("submit_000/summary.json"))) == 2,
+                            lambda: sweep.text,
+                        )
+                        wait_until(lambda: list((runs / "watched").rglob("run.json")), lambda: sweep.text)
                         page.until(
                             "[...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
                         )
-                        assert len(workspaces()) == 2
                         for folder in workspaces():
                             (folder / "go").touch()
                         assert sweep.wait() == 0, sweep.err
-                        page.until("document.querySelector('#facts').innerText.startsWith('2 of 2')")
+                        page.until("document.querySelector('#facts b').textContent.startsWith('2 of 2')")
                         page.until(
                             "![...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
                         )

@@ -71,9 +71,8 @@ def pin_waiting(state: State, worker: Worker, step: Step) -> None:
 # ---- in words ----
 
 
-def refused_runs(state: State, worker: Worker) -> dict[str, str]:
-    """Runs of its environments that a worker gets no work of, and why."""
-    profile = worker.profile
+def refused_runs(state: State, profile: Profile) -> dict[str, str]:
+    """Runs of their environments that the workers of a profile get no work of, and why."""
     refused = {
         run.id: _mismatch(run, profile)
         for run in state.runs.values()

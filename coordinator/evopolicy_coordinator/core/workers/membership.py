@@ -53,7 +53,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
         session=event.session,
         lease_ttl_s=state.settings.lease_ttl_s,
         heartbeat_s=state.settings.heartbeat_s,
-        refused=pins.refused_runs(state, worker),
+        refused=pins.refused_runs(state, worker.profile),
         hidden_bar="" if message.boot_id or not state.isolates else conflicts.NO_BOOT_ID,
     )
     step.reply(event.request, reply)
