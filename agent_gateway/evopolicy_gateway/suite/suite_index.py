@@ -127,15 +127,11 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     )
 
 
-def waiting(suite_run: SuiteRun) -> Entry:
+def waiting(plan: Plan) -> Entry:
     """What the index tells of a run that has not begun."""
-    settings = suite_run.settings
+    settings = plan.settings
     return Entry(
-        name=suite_run.name,
-        agent=suite_run.agent,
-        env=settings.env,
-        repeat=settings.repeat,
-        digest=suite_run.digest,
+        name=plan.name, agent=plan.entry, env=settings.env, repeat=settings.repeat, digest=plan.digest
     )
 
 
