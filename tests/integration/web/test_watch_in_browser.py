@@ -163,10 +163,18 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                         page.visit(f"http://127.0.0.1:{web}/")
                         (first / "go").touch()
                         wait_until(
-                            lambda: len(list((runs / "watched").rglob("submit_000/summary.json"))) == 2,
+                            lambda: (
+                                sum(
+                                    (each / "feedback/submit_000/summary.json").exists()
+                                    for each in workspaces()
+                                )
+                                == 2
+                            ),
                             lambda: sweep.text,
                         )
-                        wait_until(lambda: list((runs / "watched").rglob("run.json")), lambda: sweep.text)
+                        wait_until(
+                            lambda: list((runs / "watched").glob("*/*/*/run.json")), lambda: sweep.text
+                        )
                         page.until(
                             "[...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
                         )
