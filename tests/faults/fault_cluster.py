@@ -168,7 +168,7 @@ class FaultCluster:
         ready = json.loads(self._ready.read_text())
         self.files: dict[str, str] = ready["credentials"]
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
-        worker += ["--env", "toy/*", "--slots", "2"]
+        worker += ["--env", "toy/*", "--slots", "2", "--need-tier", "bwrap"]
         worker += ["--grace", "1", "--credentials", self.files["worker"]]
         self.link: WeakLink | None = None
         if self.cable is None:

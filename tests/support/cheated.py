@@ -104,7 +104,7 @@ class Cheated:
         self.credentials: dict[str, str] = json.loads(ready.read_text())["credentials"]
         self._worker = self._start(
             *("evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
-            *("--credentials", self.credentials["worker"]),
+            *("--need-tier", "bwrap", "--credentials", self.credentials["worker"]),
         )
         self.listener = Listener()
 

@@ -131,7 +131,8 @@ def toy_cluster(root: Path, *arguments: str) -> Iterator[Path]:
     environments."""
     coordinator = Coordinator(root / "s", *arguments)
     credentials = coordinator.ready["credentials"]
-    options = ["--env", "toy", "--slots", "2", "--grace", "0", "--credentials", credentials["worker"]]
+    options = ["--env", "toy", "--slots", "2", "--grace", "0", "--need-tier", "bwrap"]
+    options += ["--credentials", credentials["worker"]]
     with coordinator.log.open("ab") as log:
         worker = subprocess.Popen(
             [sys.executable, "-m", "evopolicy_worker.cli", *options],

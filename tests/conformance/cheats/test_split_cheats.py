@@ -18,7 +18,7 @@ from coordinator_harness import OperatorClient
 
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest
-from evopolicy_common.records import trajectory
+from evopolicy_common.records import rendered
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.wire import credentials
@@ -77,7 +77,7 @@ class Probed:
 
 
 def _words(data: bytes) -> Iterator[int]:
-    for row in trajectory.decode(data).rows():
+    for row in rendered.decode(data).rows():
         action: Any = row.action
         yield round((float(action[0]) + 1) * 2**23)
 

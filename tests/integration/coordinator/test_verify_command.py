@@ -57,7 +57,14 @@ class Played:
         self.operator = str(self.state / "credentials" / "operator.json")
         self._cluster = contextlib.ExitStack()
         worker = [word for env in ENVIRONMENTS for word in ("--env", env)]
-        worker += ["--slots", "2", "--credentials", str(self.state / "credentials" / "worker.json")]
+        worker += [
+            "--slots",
+            "2",
+            "--need-tier",
+            "bwrap",
+            "--credentials",
+            str(self.state / "credentials" / "worker.json"),
+        ]
         for room, options in {"coordinator": ["--state", str(self.state)], "worker": worker}.items():
             command = [sys.executable, "-m", f"evopolicy_{room}.cli", *options]
             process = self._cluster.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL))

@@ -37,7 +37,7 @@ submit([2, 3])
 
 @contextmanager
 def worker(coordinator: Coordinator, root: Path) -> Iterator[subprocess.Popen[bytes]]:
-    options = ["--env", "toy", "--slots", "1", "--grace", "0"]
+    options = ["--env", "toy", "--slots", "1", "--grace", "0", "--need-tier", "bwrap"]
     with coordinator.log.open("ab") as log:
         process = subprocess.Popen(
             [

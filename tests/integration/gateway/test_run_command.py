@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
 from commands import agent, command, record_in, run_arguments, run_dir, run_on
 from waiting import wait_until
 
@@ -211,20 +210,18 @@ def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(
     assert (run_dir(tmp_path) / "run.json").read_bytes() != before
 
 
-@pytest.mark.parametrize("more", [["--overwrite"], ["--resume"], []])
-def test_a_run_that_is_played_is_nobody_elses_to_replace(
-    operator_file: Path, tmp_path: Path, more: list[str]
-) -> None:
+def test_a_run_that_is_played_is_nobody_elses_to_replace(operator_file: Path, tmp_path: Path) -> None:
     code = "submit([0])\nopen('here', 'w')\nwhile not os.path.exists('go'): time.sleep(0.05)\nsubmit([1])\n"
     arguments = run_arguments(operator_file, agent(tmp_path, code))
     with command(tmp_path, *arguments) as first:
         wait_until(lambda: [*tmp_path.glob("runs/*/toy_line/t/workspace/here")], lambda: first.text)
-        with command(tmp_path, *arguments, *more) as second:
-            exit_code, _, err = second.finish()
-        assert exit_code == 2, err
-        if more:
-            assert f"process {first.process.pid}" in err
-            assert len(err.splitlines()) == 1
+        for more in (["--overwrite"], ["--resume"], []):
+            with command(tmp_path, *arguments, *more) as second:
+                exit_code, _, err = second.finish()
+            assert exit_code == 2, err
+            if more:
+                assert f"process {first.process.pid}" in err
+                assert len(err.splitlines()) == 1
         workspace = run_dir(tmp_path) / "workspace"
         (workspace / "go").touch()
         assert first.wait() == 0, first.text

@@ -116,18 +116,21 @@ def test_a_run_whose_workers_are_paused_says_so_and_so_does_status(paused: Path,
     assert record_in(run_dir(tmp_path)).outcome.status == "completed"
 
 
-@pytest.mark.parametrize("name", ["try", "random"])
-def test_a_trial_whose_workers_are_paused_says_so(
-    paused: Path, tmp_path: Path, policy: str, name: str
-) -> None:
-    arguments = ["try", policy, "--cases", "0"] if name == "try" else ["random", "--split", "train"]
+def test_a_trial_whose_workers_are_paused_says_so(paused: Path, tmp_path: Path, policy: str) -> None:
     more = ("--env", "toy/line", "--json", "--credentials", str(paused))
-    with command(tmp_path, *arguments, *more) as running:
-        wait_until(lambda: WORKER_IS_PAUSED in running.err, lambda: running.text)
+    with (
+        command(tmp_path, "try", policy, "--cases", "0", *more) as tries,
+        command(tmp_path, "random", "--split", "train", *more) as plays,
+    ):
+        wait_until(
+            lambda: WORKER_IS_PAUSED in tries.err and WORKER_IS_PAUSED in plays.err,
+            lambda: tries.text + plays.text,
+        )
         resume(paused, tmp_path)
-        code, out, err = running.finish()
-    assert code == 0, err
-    assert json.loads(out)
+        for running in (tries, plays):
+            code, out, err = running.finish()
+            assert code == 0, err
+            assert json.loads(out)
 
 
 @pytest.mark.parametrize("name", ["status", "run", "try"])

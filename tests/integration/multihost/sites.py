@@ -140,7 +140,16 @@ class Sites:
 
     def start_worker(self, name: str, credentials_at: Path, slots: int = 1) -> subprocess.Popen[bytes]:
         program = [str(_FAULTS / "fixed_worker.py"), "--env", TOY, "--env", REAL, "--slots", str(slots)]
-        program += ["--grace", "1", "--name", name, "--credentials", str(credentials_at)]
+        program += [
+            "--need-tier",
+            "bwrap",
+            "--grace",
+            "1",
+            "--name",
+            name,
+            "--credentials",
+            str(credentials_at),
+        ]
         return self.start(name, program, "worker")
 
     def restart_router(self, away_s: float) -> None:
