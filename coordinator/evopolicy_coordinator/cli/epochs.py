@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import re
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli import fail, fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import journal
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_coordinator import splits
-from evopolicy_coordinator.pki.identity import public_key
+from evopolicy_coordinator.pki.identity import HEAD, public_key, sign
+from evopolicy_coordinator.publish.contents import Countersignature, document, head_digest
 from evopolicy_coordinator.storage.state_folder import StateFolder
 from evopolicy_coordinator.storage.store import Reader
 
@@ -89,6 +93,35 @@ def identity(state: State = None, as_json: AsJson = False) -> None:
         say_json({"identity": key})
     else:
         say(key)
+
+
+def countersign(
+    head: Annotated[
+        str,
+        typer.Argument(
+            metavar="HEAD",
+            help="Head of another coordinator's journal: 64 hexadecimal digits.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, for `evopolicy check --head`.")],
+    state: State = None,
+) -> None:
+    """Signs that this coordinator saw the head of another one's journal now, so that it cannot be begun anew unnoticed.
+
+    It says nothing of what is in that journal. Keep the file too: whoever asked for it may lose it.
+    """
+    root = state or default_state_dir()
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", head):
+        fail(f"{head!r} is no head: 64 hexadecimal digits, as `evopolicy-coordinator epoch list` prints them")
+    with fail_on_our_errors():
+        if not root.is_dir():
+            raise ConfigError(f"--state {root}: there is no such state folder")
+        at = round(time.time(), 3)
+        key, signature = sign(root, head_digest(head.lower(), at), HEAD)
+        signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)
+        write_atomically(out, document(signed))
+    say(f"{out}: signed by {key}")
 
 
 def _current(root: Path) -> str:

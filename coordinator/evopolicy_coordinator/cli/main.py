@@ -28,6 +28,9 @@ app.add_typer(certs_cli.app, name="certs")
 app.add_typer(epochs_cli.app, name="epoch")
 app.command(epilog="Example: evopolicy-coordinator identity --state /var/lib/evopolicy")(epochs_cli.identity)
 app.command(
+    epilog="Example: evopolicy-coordinator countersign HEAD --out head.json --state /var/lib/evopolicy"
+)(epochs_cli.countersign)
+app.command(
     "router-config",
     epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"
     " --installed-at /etc/evopolicy/router",

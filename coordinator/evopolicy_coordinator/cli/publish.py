@@ -14,12 +14,13 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
-from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.local_cluster import local_cluster
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_common.wire import credentials, transport
@@ -27,7 +28,7 @@ from evopolicy_coordinator.publish import replay as replays
 from evopolicy_coordinator.publish import rules
 from evopolicy_coordinator.publish.archive import Archive
 from evopolicy_coordinator.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
-from evopolicy_coordinator.publish.contents import Listed
+from evopolicy_coordinator.publish.contents import Countersignature, Listed
 from evopolicy_coordinator.publish.rules import KINDS, Checked
 
 FAILED, NOT_REPLAYED = 1, 3
@@ -111,6 +112,15 @@ def check(
             show_default=False,
         ),
     ] = None,
+    head: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="HEAD",
+            help="A head of the journal that was noted elsewhere: 64 hexadecimal digits, or the file that"
+            " `evopolicy-coordinator countersign` wrote; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Of the draw; default: another one each time.", show_default=False)
     ] = None,
@@ -132,11 +142,12 @@ def check(
             share = replays.share_of(replay)
         except ValueError:
             fail(f"--replay {replay!r}: say a share such as 5%, or all")
+    noted = [_noted(each) for each in head or ()]
     drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
     with fail_on_our_errors():
         try:
             with Archive(file) as archive:
-                checked = rules.check(archive, identity or "")
+                checked = rules.check(archive, identity or "", noted)
                 if share is None:
                     checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
                 elif not checked.failed:
@@ -163,6 +174,18 @@ def check(
         each.kind == "replay" and each.state == "open" for each in checked.findings
     )
     raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
+
+
+def _noted(text: str) -> str | Countersignature:
+    """A head as it was noted. Ends the command for what is none."""
+    if re.fullmatch(r"[0-9a-fA-F]{64}", text):
+        return text.lower()
+    try:
+        with Path(text).open("rb") as file:
+            return msgspec.json.decode(file.read(4096), type=Countersignature)
+    except (OSError, *DECODE_ERRORS) as error:
+        why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+        fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {why}")
 
 
 async def _replay(archive: Archive, checked: Checked, share: float, seed: int, slots: int) -> None:

@@ -15,7 +15,8 @@ from evopolicy_coordinator.splits import load_or_create_secret
 
 SIGNING_KEY = "signing-key"
 """File of the state folder: 32 random bytes, mode 0600."""
-_DOMAIN = b"evopolicy manifest 1\0"
+MANIFEST, HEAD = b"evopolicy manifest 1\0", b"evopolicy head 1\0"
+"""What is signed: a signature of one kind is none of another."""
 
 
 def public_key(state: Path) -> str:
@@ -23,17 +24,17 @@ def public_key(state: Path) -> str:
     return _public(_private(state))
 
 
-def sign(state: Path, digest: str) -> tuple[str, str]:
-    """The public key (64 hex digits) and the signature (128) of a manifest's SHA-256 (hex)."""
+def sign(state: Path, digest: str, kind: bytes = MANIFEST) -> tuple[str, str]:
+    """The public key (64 hex digits) and the signature (128) of a SHA-256 (hex)."""
     key = _private(state)
-    return _public(key), key.sign(_DOMAIN + bytes.fromhex(digest)).hex()
+    return _public(key), key.sign(kind + bytes.fromhex(digest)).hex()
 
 
-def signed_by(key: str, signature: str, digest: str) -> bool:
-    """Whether the owner of the public `key` signed the manifest's `digest`; False for anything malformed."""
+def signed_by(key: str, signature: str, digest: str, kind: bytes = MANIFEST) -> bool:
+    """Whether the owner of the public `key` signed the `digest`; False for anything malformed."""
     try:
         public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
-        public.verify(bytes.fromhex(signature), _DOMAIN + bytes.fromhex(digest))
+        public.verify(bytes.fromhex(signature), kind + bytes.fromhex(digest))
     except (InvalidSignature, ValueError):
         return False
     return True

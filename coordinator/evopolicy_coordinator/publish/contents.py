@@ -74,6 +74,22 @@ class Signature(msgspec.Struct, frozen=True, kw_only=True):
     signature: Word
 
 
+class Countersignature(msgspec.Struct, frozen=True, kw_only=True):
+    """Another coordinator's word that it saw a journal's head, in a file of its own beside the results."""
+
+    head: Word
+    at: Number
+    """By its clock, Unix seconds."""
+    key: Word
+    signature: Word
+    """Of `head_digest`."""
+
+
+def head_digest(head: str, at: float) -> str:
+    """What a countersignature is of."""
+    return digest(f"{head} {at!r}".encode())
+
+
 class Episode(msgspec.Struct, frozen=True, kw_only=True):
     """What one episode came to."""
 

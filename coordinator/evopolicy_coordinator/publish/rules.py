@@ -21,10 +21,18 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import bundles, journal
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.summary import utc_text
 from evopolicy_common.records.trajectory import Trajectory
-from evopolicy_coordinator.pki.identity import signed_by
+from evopolicy_coordinator.pki.identity import HEAD, signed_by
 from evopolicy_coordinator.publish import contents
-from evopolicy_coordinator.publish.contents import Group, Listed, Manifest, Removed, Signature
+from evopolicy_coordinator.publish.contents import (
+    Countersignature,
+    Group,
+    Listed,
+    Manifest,
+    Removed,
+    Signature,
+)
 from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
 from evopolicy_coordinator.verify.compare import same
 
@@ -118,14 +126,18 @@ class _Fault(NamedTuple):
     text: str
 
 
-def check(files: Files, identity: str = "") -> Checked:
-    """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any."""
+def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
+    """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any.
+
+    `heads`: of the journal, as they were noted elsewhere: hexadecimal digits, or another coordinator's countersignature.
+    """
     checked = Checked()
     manifest = _manifest(files, identity, checked)
     if manifest is None:
         return checked
     damaged = _digests(files, manifest, checked)
     entries = _journal(files, manifest, checked)
+    _order(entries, heads, checked)
     _removed(files, checked)
     folders = sorted({"/".join(name.split("/")[:2]) for name in files.names if name.startswith("runs/")})
     if len(folders) > contents.MAX_RUNS:
@@ -245,12 +257,41 @@ def _journal(files: Files, manifest: Manifest, checked: Checked) -> _Journal:
         checked.add("journal", "failed", fault)
     else:
         checked.add("journal", "ok", f"{len(lines)} entries, head {head}")
-    text = (
-        "the journal is its owner's, who could have deleted it and begun another: compare its head with one that was noted"
-        " elsewhere in time"
-    )
-    checked.add("order", "open", text)
     return _Journal(entries, heads)
+
+
+def _order(history: _Journal, noted: Sequence[str | Countersignature], checked: Checked) -> None:
+    """Whether the journal had the heads that were noted elsewhere."""
+    if not noted:
+        text = (
+            "the journal is its owner's, who could have deleted it and begun another: compare its head with one that was noted"
+            " elsewhere in time (--head)"
+        )
+        checked.add("order", "open", text)
+    for each in noted:
+        head, by = each, "that you gave"
+        if isinstance(each, Countersignature):
+            head, by = each.head, f"countersigned by {each.key} at {utc_text(each.at)} by its clock"
+            if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), HEAD):
+                checked.add("order", "failed", f"not a countersignature by {each.key}")
+                continue
+            if each.key == checked.signer:
+                checked.add(
+                    "order", "open", "countersigned with the signer's own key, which shows nothing more"
+                )
+                continue
+        try:
+            number = history.heads.index(str(head))
+        except ValueError:
+            text = f"the journal never had the head {head}, {by}: it was changed, or begun anew"
+            checked.add("order", "failed", text)
+            continue
+        later = sum(isinstance(entry, Opened) for entry in history.entries[number + 1 :])
+        checked.add(
+            "order",
+            "ok",
+            f"the journal had entry {number} with the head {by}; {later} runs were opened after it",
+        )
 
 
 def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
