@@ -26,7 +26,6 @@ from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Result
-from evopolicy_common.records.trajectory import Trajectory, decode
 
 FORMAT = "evopolicy results"
 VERSION = 1
@@ -187,14 +186,6 @@ def unpack_recordings(data: bytes) -> list[bytes | None]:
         return _recordings.decode(data)
     except DECODE_ERRORS as error:
         raise ProtocolError(f"not a group's recordings: {error}") from error
-
-
-def recording(data: bytes) -> Trajectory:
-    """A published recording; ProtocolError for what is none, or holds more than actions and rewards."""
-    found = decode(data, MAX_EPISODE_BYTES)
-    if found.record != "actions":
-        raise ProtocolError("it holds more than actions and rewards")
-    return found
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True):

@@ -30,7 +30,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_coordinator.publish import contents
 from evopolicy_coordinator.publish.contents import Group
-from evopolicy_coordinator.publish.rules import Checked, Files, PublishedRun
+from evopolicy_coordinator.publish.rules import Checked, Files, PublishedRun, recording_of
 from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_coordinator.verify import compare
 
@@ -214,7 +214,7 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> tuple[int, 
         if data is None:
             continue
         try:
-            actions = compare.recorded_actions(contents.recording(data))
+            actions = compare.recorded_actions(recording_of(data))
         except ProtocolError:
             continue
         await ask.upload(digest_of(actions), actions)
@@ -244,7 +244,7 @@ async def _play(ask: OperatorClient, files: Files, part: _Chosen) -> tuple[int, 
             seen.add(index)
             episode = group.episodes[index]
             again = decode(await ask.fetch(outcome.trajectory))
-            fault = compare.first_difference(contents.recording(data), again)
+            fault = compare.first_difference(recording_of(data), again)
             if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
                 fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
             if fault is not None:

@@ -22,7 +22,7 @@ from evopolicy_common.records import bundles, journal
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import utc_text
-from evopolicy_common.records.trajectory import Trajectory
+from evopolicy_common.records.trajectory import Trajectory, decode
 from evopolicy_coordinator.pki.identity import HEAD, signed_by
 from evopolicy_coordinator.publish import contents
 from evopolicy_coordinator.publish.contents import (
@@ -636,7 +636,7 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
     """Where a recording contradicts what is told of its episode; None when it does not."""
     try:
-        recording = contents.recording(data)
+        recording = recording_of(data)
     except ProtocolError as error:
         return str(error)
     total = return_of(recording)
@@ -645,6 +645,14 @@ def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
     if recording.n != episode.length:
         return f"it has {recording.n} steps, told are {episode.length}"
     return None
+
+
+def recording_of(data: bytes) -> Trajectory:
+    """A published recording; ProtocolError for what is none, or holds more than actions and rewards."""
+    found = decode(data, contents.MAX_EPISODE_BYTES)
+    if found.record != "actions":
+        raise ProtocolError("it holds more than actions and rewards")
+    return found
 
 
 def return_of(recording: Trajectory) -> float:
