@@ -164,6 +164,8 @@ def place(built: Built) -> Iterator[Place]:
 def test_the_installation_finds_its_own_files_and_not_the_repository(place: Place) -> None:
     where = "import evopolicy_common, evopolicy_gateway as g; print(g.__file__, evopolicy_common.__file__)"
     assert str(ROOT) not in place.run([str(place.bin / "python"), "-c", where])
+    public = "import evopolicy as evp; print(evp.__file__, evp.evaluate.__doc__)"
+    assert str(place.root) in place.run([str(place.bin / "python"), "-c", public])
     assert place.run(["evopolicy", "--version"]).startswith("evopolicy ")
     listed = place.run(["evopolicy", "files"]).splitlines()
     assert {"constraints.txt", "deploy/README.md", "examples/agents/qwen.toml"} <= set(listed)
