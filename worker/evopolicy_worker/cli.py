@@ -10,7 +10,7 @@ import secrets
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -29,6 +29,7 @@ from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
+from evopolicy_common.wire.ready import read_ready
 from evopolicy_worker import environments
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
@@ -82,6 +83,14 @@ def work(
             help="Also play runs that ask for tier none, whose policies are not locked in: they can do all that you can.",
         ),
     ] = False,
+    ready_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--ready-file",
+            hidden=True,
+            help="What a coordinator that is starting will write: its credentials are read from there.",
+        ),
+    ] = None,
     need_tier: Annotated[
         list[str] | None,
         typer.Option(
@@ -118,8 +127,16 @@ def work(
         # Until the worker can drain, SIGTERM ends it as an exception does: what it has begun is cleared away.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
-        found = credentials.find("worker", tuple(connect or ()), credentials_file)
-        worker_name = name or default_name(found)
+        # Wrong credentials are told at once; those of a coordinator that is starting are waited for once all is prepared.
+        found = None if ready_file else credentials.find("worker", tuple(connect or ()), credentials_file)
+
+        async def joined() -> credentials.Credentials:
+            if found is not None:
+                return found
+            assert ready_file is not None
+            ready = await read_ready(ready_file, asyncio.get_running_loop().create_future())
+            return credentials.find("worker", (), Path(ready.credentials["worker"]))
+
         needed = cast("tuple[Tier, ...]", tuple(need_tier or ()))
         if len(needed) == 1 and needed[0] in SANDBOXED:
             # The first slot tries it.
@@ -137,7 +154,7 @@ def work(
         with scratch_folder("worker") as scratch:
             try:
                 asyncio.run(
-                    _run(found, worker_name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
+                    _run(joined, name, wanted, slots, tiers, scratch, tuple(allow_package or ()), grace)
                 )
             except SandboxError as error:
                 if not needed:
@@ -228,8 +245,8 @@ async def describe_all(env_ids: list[str], slot: Slot) -> tuple[EnvironmentDescr
 
 
 async def _run(
-    found: credentials.Credentials,
-    name: str,
+    joined: Callable[[], Awaitable[credentials.Credentials]],
+    name: str | None,
     env_ids: list[str],
     slots: int | None,
     tiers: tuple[Tier, ...],
@@ -254,8 +271,9 @@ async def _run(
         descriptions = await describe_all(env_ids, first)
         if len(env_ids) > MAX_PREPARED:
             await first.close()
+        found = await joined()
         options = Options(
-            name=name,
+            name=name or default_name(found),
             slots=len(taken),
             tiers=tiers,
             environments=descriptions,

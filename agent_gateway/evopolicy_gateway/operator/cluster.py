@@ -14,7 +14,7 @@ from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.operator import RunSettings
-from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster
+from evopolicy_common.processes.local_cluster import LocalCluster, Workers, local_cluster
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
@@ -61,12 +61,12 @@ class Reached(NamedTuple):
     gateway: Credentials
     """The gateways'."""
     local: LocalCluster | None
-    """One that was brought up here; it has no workers yet."""
+    """One that was brought up here."""
 
 
 @contextlib.asynccontextmanager
-async def reached(where: Cluster) -> AsyncIterator[Reached]:
-    """A link to the cluster, which is brought up where it is a local one."""
+async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterator[Reached]:
+    """A link to the cluster, which is brought up where it is a local one, with these workers."""
     async with contextlib.AsyncExitStack() as stack:
         local: LocalCluster | None = None
         file, opened = where.file, None
@@ -79,6 +79,7 @@ async def reached(where: Cluster) -> AsyncIterator[Reached]:
                     audit=where.audit,
                     hidden_isolation=where.hidden_isolation,
                     unjailed=where.unjailed,
+                    workers=workers,
                 )
             )
             if local.note:
@@ -100,7 +101,6 @@ async def connected(
     `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
     """
     end_on_sigterm()
-    async with reached(where) as (operations, gateway, local):
-        if local is not None and where.local_slots is not None:
-            await local.start_workers(env_ids, slots=where.local_slots, tiers=tiers)
+    workers = None if where.local_slots is None else Workers(env_ids, where.local_slots, tiers)
+    async with reached(where, workers) as (operations, gateway, local):
         yield operations, gateway, None if local is None else local.failed

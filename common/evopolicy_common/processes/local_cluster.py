@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Collection, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from evopolicy_common import catalogue
 from evopolicy_common.cli import USAGE_ERROR
@@ -39,6 +40,14 @@ _SOON_S = 60.0
 
 WORKERS_ENDED = "workers-ended"
 """File in a kept state folder: every worker of its last command has ended, so the next coordinator expects none of them."""
+
+
+class Workers(NamedTuple):
+    """What a local cluster's workers offer: see `LocalCluster.start_workers`."""
+
+    env_ids: Sequence[str]
+    slots: int
+    tiers: Collection[Tier] = ()
 
 
 class LocalCluster:
@@ -70,17 +79,25 @@ class LocalCluster:
 
         `tiers`: sandbox tiers that will be asked for. Where one does not work here the cluster fails with the remedy.
         """
-        # Who starts this cluster is the one who chooses the tiers of what it plays.
-        program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed"]
-        program += ["--credentials", self._worker_file]
-        for env_id in env_ids:
-            program += ["--env", catalogue.source_of(env_id)]
-        for tier in sorted(tiers):
-            program += ["--need-tier", tier]
-        second = max(1, slots // 2) if self._audited else 0
-        for name, n in (("worker", max(1, slots - second)), ("worker-2", second)):
-            if n:
-                await self._processes.keep_up(name, [*program, "--slots", str(n)])
+        wanted = Workers(env_ids, slots, tiers)
+        await _start_workers(
+            self._processes, wanted, ("--credentials", self._worker_file), audited=self._audited
+        )
+
+
+async def _start_workers(
+    processes: _Processes, wanted: Workers, credentials: Sequence[str], *, audited: bool
+) -> None:
+    # Who starts this cluster is the one who chooses the tiers of what it plays.
+    program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed", *credentials]
+    for env_id in wanted.env_ids:
+        program += ["--env", catalogue.source_of(env_id)]
+    for tier in sorted(wanted.tiers):
+        program += ["--need-tier", tier]
+    second = max(1, wanted.slots // 2) if audited else 0
+    for name, n in (("worker", max(1, wanted.slots - second)), ("worker-2", second)):
+        if n:
+            await processes.keep_up(name, [*program, "--slots", str(n)])
 
 
 @contextlib.asynccontextmanager
@@ -92,12 +109,13 @@ async def local_cluster(
     audit: float = 0.0,
     hidden_isolation: str | None = None,
     unjailed: bool = False,
+    workers: Workers | None = None,
 ) -> AsyncIterator[LocalCluster]:
     """A coordinator inside the `async with`; it and its workers are taken down at its end. Enter it on the main thread.
 
     `kind` names its logs and its folder. `state` None: a folder that is thrown away. `audit`: share of the episodes that
     a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
-    read the folder; see the coordinator's `--unjailed-agents`. ConfigError when the coordinator does not come up (the folder
+    read the folder; see the coordinator's `--unjailed-agents`. `workers`: those that are started at once, beside the coordinator. ConfigError when the coordinator does not come up (the folder
     may be in use).
     """
     with contextlib.ExitStack() as folders:
@@ -128,6 +146,11 @@ async def local_cluster(
         served = False
         try:
             await processes.keep_up("coordinator", coordinator)
+            if workers is not None:
+                # Beside the coordinator: they import simulators, and try sandboxes, while it starts.
+                await _start_workers(
+                    processes, workers, ("--ready-file", str(ready_file)), audited=bool(audit)
+                )
             try:
                 with notify_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
                     async with asyncio.timeout(START_TIMEOUT_S):

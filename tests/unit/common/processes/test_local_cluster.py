@@ -170,3 +170,26 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
     assert started["test-coordinator"][4:] == ["--data", str(tmp_path / "d"), "--audit", "0.5"]
     assert started["test-worker"][-6:] == ["--env", "toy/line", "--env", "toy/maze", "--slots", "3"]
     assert started["test-worker-2"][-2:] == ["--slots", "2"]
+
+
+def test_workers_are_started_beside_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    programs(monkeypatch, SERVES)
+    started: dict[str, list[str]] = {}
+    start = ChildProcess.start
+
+    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
+        started[log.stem] = list(program[3:])
+        return await start(program, log, **more)
+
+    monkeypatch.setattr(ChildProcess, "start", noted)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    workers = local_cluster.Workers(["toy/line"], 2, {"bwrap"})
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path, workers=workers):
+            pass
+
+    asyncio.run(main())
+    ready = started["test-coordinator"][started["test-coordinator"].index("--ready-file") + 1]
+    assert started["test-worker"][started["test-worker"].index("--ready-file") + 1] == ready
+    assert started["test-worker"][-6:] == ["--env", "toy/line", "--need-tier", "bwrap", "--slots", "2"]
