@@ -48,6 +48,7 @@ from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.layout import RunFolder, Staged, saved
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.run.transitions import Transitions, count_transitions
 from evopolicy_gateway.submits.journal import Accepted, AnyEntry, Journal, Rejected, Requested
 from evopolicy_gateway.submits.names import submit_id
 
@@ -98,6 +99,7 @@ def run_record(
     recorded: tuple[Replay, ...] = (),
     code: Mapping[int, CodeMetrics] | None = None,
     artifacts: Artifacts | None = None,
+    transitions: Transitions | None = None,
 ) -> RunRecord:
     """The record of a finished run; pure. `staged` None: it ended before its workspace was made. `code`: by submit."""
     settings = finished.settings
@@ -145,7 +147,7 @@ def run_record(
             permit_s=round(times.permit_s, 3),
             finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
         ),
-        outcome=_outcome(finished, code or {}),
+        outcome=_outcome(finished, code or {}, transitions),
         rejected_submits=tuple(
             RejectedSubmit(
                 status=cast(RejectedStatus, one.status),
@@ -184,7 +186,9 @@ def _agent(plan: Plan, told: dict[str, Any]) -> Agent:
     )
 
 
-def _outcome(finished: RunFinished, code: Mapping[int, CodeMetrics]) -> Outcome:
+def _outcome(
+    finished: RunFinished, code: Mapping[int, CodeMetrics], transitions: Transitions | None
+) -> Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
     error = finished.error
@@ -201,6 +205,7 @@ def _outcome(finished: RunFinished, code: Mapping[int, CodeMetrics]) -> Outcome:
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,
         "nondeterministic_results": finished.nondeterministic_results,
+        **({} if transitions is None else {"transitions": msgspec.to_builtins(transitions)}),
     }
     return Outcome(
         status=finished.status,
@@ -369,7 +374,10 @@ def _write_record(
         # The agent's log is there also where nothing was said.
         folder.agent_log.touch()
     write_atomically(folder.env_log, _env_log(finished))
-    done = run_record(plan, finished, staged, rejected, times, recorded, code, folder.artifacts())
+    transitions = count_transitions(folder.feedback)
+    done = run_record(
+        plan, finished, staged, rejected, times, recorded, code, folder.artifacts(), transitions
+    )
     write_atomically(folder.run_json, encode_run_record(done))
     remove_tree(folder.state)
     return done

@@ -153,6 +153,7 @@ def test_a_run_without_a_session_is_begun_again_and_the_old_one_kept_aside(tmp_p
         assert "begun again as a new attempt (its agent keeps no session" in second.text
     record = decode_run_record((root / "own/toy_line/t-0/run.json").read_bytes())
     assert record.attempt == 2
+    assert record.outcome.auxiliary["transitions"]["steps"] > 0
     aside = root / ".attempts/own/toy_line/t-0.1/workspace/feedback/submit_000/summary.json"
     assert aside.exists()
 

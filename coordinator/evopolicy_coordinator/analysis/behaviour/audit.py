@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from statistics import fmean
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -32,6 +32,8 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     """Accepted submits that are not ok."""
     invalid_rate: float | None
     """Invalid-transition rate: accepted submits that are not ok, of all accepted; None without any."""
+    repaired_rate: float | None
+    """Invalid-action rate: steps of train episodes whose action was repaired, of all; None where the run does not tell."""
     budget: int
     budget_used: int
     """Episodes."""
@@ -105,6 +107,7 @@ def _signals(run: Run) -> AuditSignals:
         rejected=_told(run, len(run.record.rejected_submits)),
         not_ok=not_ok,
         invalid_rate=not_ok / accepted if accepted else None,
+        repaired_rate=_repaired_rate(run.record.outcome.auxiliary.get("transitions")),
         budget=run.budget,
         budget_used=run.submits[-1].consumed if run.submits else 0,
         episodes_per_submit=fmean(submit.n_episodes for submit in run.submits) if run.submits else None,
@@ -127,6 +130,14 @@ def _signals(run: Run) -> AuditSignals:
         simulation=run.record.experiment_dimensions.simulation,
         simulator_flags=None if run.simulation_allowed else len(run.simulator_flags),
     )
+
+
+def _repaired_rate(transitions: Any) -> float | None:
+    told = transitions if isinstance(transitions, dict) else {}
+    steps, invalid = told.get("steps"), told.get("action_invalid")
+    if not isinstance(steps, int) or not isinstance(invalid, int) or not 0 <= invalid <= steps or not steps:
+        return None
+    return invalid / steps
 
 
 def _told(run: Run, value: _Value) -> _Value | None:

@@ -16,8 +16,10 @@ from evopolicy_coordinator.analysis.scoring.normalised import Scale
 from evopolicy_coordinator.analysis.scoring.scores import family_of, ordered_environments
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate, of_runs
 
-SUCCESS_ABOVE = {"minigrid": 0.0}
-"""Family to the return above which an episode has reached its goal: MiniGrid pays 1 − 0.9 · steps/limit at the goal, else 0."""
+SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}
+"""Family or environment to the return above which an episode has reached its goal. MiniGrid pays 1 − 0.9 · steps/limit at the goal, else 0.
+Acrobot costs 1 a step, the one that reaches the goal aside, up to 500 steps. MountainCarContinuous pays 100 at the goal,
+and costs at most 0.1 a step, up to 999 steps."""
 
 
 class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,7 +93,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _success(env: str, runs: Sequence[Run]) -> float | None:
-    above = SUCCESS_ABOVE.get(family_of(env))
+    above = SUCCESS_ABOVE.get(env, SUCCESS_ABOVE.get(family_of(env)))
     if above is None or any(not run.record.outcome.heldout_returns for run in runs):
         return None
     return fmean(fmean(value > above for value in run.record.outcome.heldout_returns) for run in runs)

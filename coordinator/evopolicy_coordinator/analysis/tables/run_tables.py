@@ -286,7 +286,8 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
     return Table(
         name="audit",
         title="Audit signals",
-        caption="One row a run. Invalid rate: accepted submits that are not ok, of all accepted. Score drops: score-bearing submits "
+        caption="One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired actions: share of the train "
+        "steps whose action was outside the action space; a dash for runs of earlier versions. Score drops: score-bearing submits "
         "whose validation mean is below the one before. Growth: AST nodes of the selected policy over those of the first. "
         "Wall time by phase, in seconds; phases may overlap.",
         columns=(
@@ -295,7 +296,15 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             RUN,
             Column("accepted", "Accepted", "integer"),
             Column("rejected", "Rejected", "integer"),
-            Column("invalid_rate", "Invalid rate", "percent"),
+            Column("invalid_rate", "Invalid submits", "percent"),
+            Column(
+                "repaired_rate",
+                "Repaired actions",
+                "number",
+                digits=4,
+                below=True,
+                note="Share of the train steps whose action was outside the action space.",
+            ),
             Column("budget_used", "Budget used", "integer"),
             Column("episodes_per_submit", "Episodes / submit", "number", digits=1),
             Column("failed_episodes", "Failed episodes", "integer"),

@@ -31,6 +31,7 @@ from evopolicy_gateway.run.layout import Staged
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.run.transitions import Transitions
 from evopolicy_gateway.submits.journal import Rejected
 
 
@@ -69,7 +70,9 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
         Rejected(status="conflict", message="busy", at=106.0, after_submits=1),
     ]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
-    record = run_record(plan(tmp_path), finished(), STAGED, rejected, times)
+    counted = Transitions(steps=10, action_invalid=3)
+    record = run_record(plan(tmp_path), finished(), STAGED, rejected, times, transitions=counted)
+    assert record.outcome.auxiliary["transitions"] == {"steps": 10, "action_invalid": 3}
     assert decode_run_record(encode_run_record(record)) == record
     assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0
     assert record.outcome.heldout_std_return == 1.0

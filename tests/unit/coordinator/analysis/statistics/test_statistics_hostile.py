@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from pathlib import Path
@@ -251,7 +252,8 @@ def test_report_of_single_runs_says_that_it_compares_checkpoints(tmp_path: Path)
     assert "profiles_core16" in {plot.name for plot in figures_of(found)}
     general = table_named(tables, "generalisation_core16")
     success = {row["env"]: row.get("success") for row in general.rows if row["entry"] == "Kestrel"}
-    assert success["Acrobot"] is None
+    assert success["Acrobot"] == 1.0
+    assert success["Ant"] is None
     assert 0.0 <= success["FourRooms"] <= 1.0
 
 
@@ -284,6 +286,53 @@ def test_mixed_splits_that_were_allowed_are_not_paired(tmp_path: Path) -> None:
     found = study([tmp_path / "runs"], allow_mixed=True)
     (pair,) = [one for one in found.suites[0].statistics.pairs if one.second == "B"]
     assert pair.reason == NO_COMMON_CASES
+
+
+@pytest.mark.parametrize(
+    ("env", "returns", "share"),
+    [
+        ("gym/acrobot", [-500.0, -499.0, -80.0, -500.0], 0.5),
+        ("gym/continuouscar", [-99.9, 0.0, 0.1, 93.0], 0.5),
+        ("gymnasium/MiniGrid-FourRooms-v0", [0.0, 0.1, 0.9, 1.0], 0.75),
+        ("gym/racing", [900.0, 950.0, 10.0, 1.0], None),
+    ],
+)
+def test_success_is_told_where_the_return_tells_it(
+    tmp_path: Path, env: str, returns: list[float], share: float | None
+) -> None:
+    write_run(
+        tmp_path / "runs",
+        [Version(policy(gain=1.0), (1.0,), 1.0)],
+        env=env,
+        heldout=returns,
+        random_mean=None,
+    )
+    (one,) = study([tmp_path / "runs"]).suites[0].statistics.generalisation
+    assert one.success == share
+
+
+@pytest.mark.parametrize(
+    ("told", "rate"),
+    [
+        ({"steps": 1000, "action_invalid": 5}, 0.005),
+        ({"steps": 0, "action_invalid": 0}, None),
+        ({"steps": 3, "action_invalid": 4}, None),
+        ({"steps": "many", "action_invalid": 4}, None),
+        ([1], None),
+        (None, None),
+    ],
+)
+def test_rate_of_repaired_actions_is_told_where_it_was_recorded(
+    tmp_path: Path, told: object, rate: float | None
+) -> None:
+    folder = write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)])
+    record = json.loads((folder / "run.json").read_bytes())
+    if told is not None:
+        record["outcome"]["auxiliary"]["transitions"] = told
+    (folder / "run.json").write_text(json.dumps(record))
+    found = study([tmp_path / "runs"])
+    assert found.audit[0].repaired_rate == rate
+    assert [row.get("repaired_rate") for row in table_named(tables_of(found), "audit").rows] == [rate]
 
 
 def test_selection_optimism_is_validation_minus_heldout(tmp_path: Path) -> None:

@@ -1,0 +1,58 @@
+"""Counts the steps of a run's train episodes, and those whose action was repaired, from the feedback that was written."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.processes.left_files import left_files
+
+MAX_READ_BYTES = 8 << 30
+"""Feedback beyond this is not counted: an agent without a jail may leave files of any size that take no room."""
+_CHUNK_BYTES = 1 << 22
+_INVALID = b'"action_invalid":true'
+"""As `json_text.rows_text` writes it. Quotes within a text are escaped there, so no text can hold these bytes."""
+
+
+class Transitions(msgspec.Struct, frozen=True, kw_only=True):
+    """Of all train episodes that were recorded."""
+
+    steps: int
+    action_invalid: int
+    """Steps whose action was outside the action space, and was repaired."""
+
+
+def count_transitions(feedback: Path) -> Transitions | None:
+    """None where the feedback is too large to be read, or cannot be read."""
+    try:
+        if not stat.S_ISDIR(os.lstat(feedback).st_mode):
+            return None
+        files = [
+            (path, size)
+            for path, size in left_files(feedback)
+            if path.name == "trajectory.jsonl" and path.parent.parent.name == "episodes"
+        ]
+        if sum(size for _, size in files) > MAX_READ_BYTES:
+            return None
+        counts = [_count(path) for path, _ in files]
+    except OSError:
+        return None
+    return Transitions(
+        steps=sum(steps for steps, _ in counts), action_invalid=sum(invalid for _, invalid in counts)
+    )
+
+
+def _count(path: Path) -> tuple[int, int]:
+    steps = invalid = 0
+    # The file may have become a link or a pipe since it was found.
+    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        rest = b""
+        while chunk := file.read(_CHUNK_BYTES):
+            lines = (rest + chunk).split(b"\n")
+            rest = lines.pop()
+            steps += len(lines)
+            invalid += sum(_INVALID in line for line in lines)
+    return steps, invalid
