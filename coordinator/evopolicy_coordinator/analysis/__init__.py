@@ -8,6 +8,7 @@ From a notebook:
     core16 = found.suites[0]
     for row in core16.board.standings:          # typed records
         print(row.entry, row.score, row.wins)
+    core16.statistics.pairs                     # how sure they are; see `statistics`
     rows(found.evolutions)                      # a list of dicts: pandas.DataFrame(rows(...)) takes it
 
 `study` refuses runs that are no fair comparison (MixedRunsError) unless `allow_mixed=True`. `write_report` writes the

@@ -1,7 +1,6 @@
 """How sure the scores are: intervals, tests, tie groups, aggregates, and what a suite can resolve.
 
     from evopolicy_coordinator.analysis import study
-    from evopolicy_coordinator.analysis.statistics.distributions import t_quantile
 
     core16 = study(["runs"]).suites[0].statistics
     for pair in core16.pairs:                    # typed records

@@ -288,6 +288,28 @@ def test_mixed_splits_that_were_allowed_are_not_paired(tmp_path: Path) -> None:
     assert pair.reason == NO_COMMON_CASES
 
 
+def test_random_reference_with_returns_is_compared_by_case_in_a_family_of_its_own(tmp_path: Path) -> None:
+    versions = [Version(policy(gain=1.0), (-200.0,), -180.0)]
+    for name, shift in (("A", 40.0), ("B", 20.0)):
+        folder = write_run(tmp_path / "runs", versions, entry=name, heldout=rising(32, shift))
+        record = json.loads((folder / "run.json").read_bytes())
+        returns = list(rising(32))
+        record["outcome"]["random_reference"] = {
+            "mean_return": sum(returns) / 32, "std_return": 1.0, "returns": returns, "seeded_by": "case",
+        }  # fmt: skip
+        (folder / "run.json").write_text(json.dumps(record))
+    found = study([tmp_path / "runs"]).suites[0].statistics
+    assert [(one.first, one.second, one.verdict) for one in found.pairs] == [
+        ("A", "B", "first"), ("A", "Random policy", "first"), ("B", "Random policy", "first"),
+    ]  # fmt: skip
+    agents, *reference = found.pairs
+    assert agents.p_holm == agents.p  # the only test of its family
+    assert all(one.p is not None and one.p_holm == pytest.approx(2 * one.p) for one in reference)
+    assert {(row.entry, row.ties, row.rank_low, row.rank_high) for row in found.standings.rows} == {
+        ("A", "a", 1, 1), ("B", "b", 2, 2), ("Random policy", "c", 3, 3),
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("env", "returns", "share"),
     [
