@@ -62,7 +62,7 @@ class Said(msgspec.Struct, frozen=True, kw_only=True):
     at: int
     """Its place in the log, bytes."""
     kind: str
-    """`prompt`, `message`, `tool`, `result`, `output`, `stderr`, `note`."""
+    """`prompt`, `message`, `tool`, `result`, `output`, `stderr`, `ended`."""
     title: str
     text: str
 
@@ -402,9 +402,9 @@ def _entries(value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     elif isinstance(value.get("turn"), int) and "text" in value:
         yield "message", "", str(value["text"])
     elif kind == "result":
-        yield "note", "Turn ended", str(value.get("subtype", ""))
+        yield "ended", "Turn ended", str(value.get("subtype", ""))
     elif kind in ("log_full", "error"):
-        yield "note", str(kind), str(value.get("text") or value.get("message") or "")
+        yield "ended", str(kind), str(value.get("text") or value.get("message") or "")
 
 
 def _block(block: dict[str, Any]) -> Iterator[tuple[str, str, str]]:

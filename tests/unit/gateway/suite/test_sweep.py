@@ -606,3 +606,23 @@ def test_a_commands_own_runs_go_on_where_they_are_resumed_and_end_with_it(
         direct.play(parallel=2)
     assert direct.kinds == ["play", "go_on"]
     assert direct.ended == ["toy/line", "toy/maze"]
+
+
+def test_a_paused_sweep_begins_nothing_and_goes_on_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
+    stage.root.mkdir(parents=True, exist_ok=True)
+    paused = stage.root / "paused"
+    paused.touch()
+
+    async def resume() -> None:
+        await until(lambda: any("paused: no further run begins" in line for line in stage.said))
+        assert stage.begun == []
+        paused.unlink()
+
+    stage.beside = resume
+    index = stage.play()
+    assert sorted(stage.begun) == sorted(index.runs)
+    assert len(index.runs) == 2
+    assert sum("paused" in line for line in stage.said) == 1
