@@ -45,12 +45,19 @@ TIMEOUT_S = 60.0
 class Coordinator:
     """One coordinator process on a state folder."""
 
-    def __init__(self, state: Path, *args: str) -> None:
+    def __init__(self, state: Path, *args: str, trust_workers: bool = True) -> None:
         self.state = state
         self.ready_file = state.parent / f"{state.name}.ready"
         self.log = state.parent / f"{state.name}.log"
         self.ready_file.unlink(missing_ok=True)
-        command = [sys.executable, "-m", "evopolicy_coordinator.cli", "--state", str(state)]
+        command = [
+            sys.executable,
+            "-m",
+            "evopolicy_coordinator.cli",
+            "--state",
+            str(state),
+            *(["--trust-workers"] if trust_workers else []),
+        ]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--ready-file", str(self.ready_file), *args],

@@ -234,6 +234,8 @@ class Supervisor:
             )
             for run, why in reply.refused.items():
                 log.warning("gets no work of a run", run=run, why=why)
+            for env, why in reply.refused_environments.items():
+                log.warning("the coordinator does not take this environment", env=env, why=why)
 
     async def _register_again(self, session: str) -> None:
         if session == self._session:

@@ -55,6 +55,10 @@ PLACES = {
     "random": Place(
         _PLAY, "Plays uniform random actions on a split: the reference that scores are held against."
     ),
+    "envs": Place(
+        f"{_COORDINATOR}.envs:app",
+        "Environments that the cluster's workers offer: definition, who offers it, and whether runs may use it.",
+    ),
     "diff": Place(
         _PLAY,
         "Says where two runs differ, leaving out times, logs and what else may differ between equal runs.",

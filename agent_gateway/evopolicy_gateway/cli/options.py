@@ -164,6 +164,7 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         video=given.video or "off",
         replays=given.replays,
         limits=limits,
+        definition=catalogue.pinned(named["env"]),
         **chosen,
         **named,
     )

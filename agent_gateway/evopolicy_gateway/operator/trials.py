@@ -12,6 +12,7 @@ from statistics import pstdev
 import msgspec
 from rich.progress import Progress
 
+from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
@@ -98,6 +99,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
             sandbox_tier=trial.tier,
             limits=trial.limits,
             step_limit="published",
+            definition=catalogue.pinned(trial.env),
         )
         outcomes = await _outcomes(operations, message, console)
         folder = await asyncio.to_thread(_new_folder, trial.out, trial.env)
@@ -138,6 +140,7 @@ async def play_random(
                 # No policy plays, so nothing needs a sandbox; a worker of another cluster may offer no tier `none`.
                 sandbox_tier="bwrap" if where.local_slots is None else "none",
                 step_limit="published",
+                definition=catalogue.pinned(env_id),
             )
             outcomes = await _outcomes(operations, message, console)
             ids = range(len(outcomes)) if cases is None else cases

@@ -37,6 +37,8 @@ class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
     failure: PolicyFailure | None
     """How the policy failed; None when it did not."""
     reward_components: dict[str, float] = {}
+    success: bool | None = None
+    """Whether the task was solved; None where nothing tells."""
 
 
 def cut_text(data: bytes) -> bytes:
@@ -111,6 +113,7 @@ def _summary(
     components = tuple(score.reward_components for score in ordered)
     with_components = ok and any(components)
     lengths = tuple(score.length for score in ordered)
+    solved = tuple(score.success for score in ordered)
     return Summary(
         schema_version=SCHEMA_VERSION,
         submit_index=submit_index,
@@ -134,6 +137,7 @@ def _summary(
         errors=_where(ordered, None) if ok else None,
         reward_components_mean=_component_means(components) if with_components else None,
         reward_components_per_episode=components if with_components else None,
+        successes=solved if ok and None not in solved and solved else None,
         policy_failures=len(_where(ordered, None)) if ok else None,
         warning=_warning(ordered, observations) if ok else None,
     )

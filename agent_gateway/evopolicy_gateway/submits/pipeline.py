@@ -459,6 +459,7 @@ class SubmitPipeline:
                         length=episode.length,
                         failure=episode.failure,
                         reward_components=episode.reward_components,
+                        success=episode.success,
                     )
 
         # All have ended before an error is raised: nothing may write on into a tree that is begun again.

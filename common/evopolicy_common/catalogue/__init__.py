@@ -31,11 +31,14 @@ __all__ = [
     "Suite",
     "Wrapper",
     "add",
+    "digests",
     "entries",
     "entry",
     "families",
     "is_shipped",
     "known",
+    "near",
+    "pinned",
     "resolve",
     "source_of",
     "suite_of",
@@ -124,6 +127,22 @@ def _load() -> _Loaded:
 
 def _table(text: str) -> dict[str, Any]:
     return tomllib.loads(text)
+
+
+@cache
+def digests() -> dict[str, str]:
+    """By id the first digits of the digest of the definition that ships (`EnvironmentDescription.digest`)."""
+    text = files(__package__).joinpath("digests.json").read_text("utf-8")
+    return msgspec.json.decode(text, type=dict[str, str])
+
+
+_pinned: dict[str, str] = {}
+"""By id the digest that was named with it here, as `ID@DIGEST`."""
+
+
+def pinned(env_id: str) -> str:
+    """The first digits of the definition's digest that an environment was named with here; empty for none."""
+    return _pinned.get(env_id, "")
 
 
 _added: dict[str, tuple[Entry, str]] = {}
@@ -239,7 +258,14 @@ def resolve(patterns: Iterable[str]) -> list[str]:
     own. ConfigError for one that names nothing.
     """
     wanted: dict[str, None] = {}
-    for pattern in patterns:
+    for given in patterns:
+        pattern, at, digest = given.partition("@")
+        if at:
+            if not re.fullmatch("[0-9a-f]{8,64}", digest) or not (is_shipped(pattern) or is_foreign(pattern)):
+                raise ConfigError(
+                    f"{given!r}: an environment in one definition is named ID@DIGEST, as `evopolicy envs` shows it"
+                )
+            _pinned[pattern] = digest
         if pattern in suites():
             wanted.update(dict.fromkeys(suites()[pattern].environments))
         elif pattern.endswith(".toml"):

@@ -167,6 +167,8 @@ class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
     failure: PolicyFailure | None = None
     reward_components: Named[Number] = {}
     """Per-episode sum of each of the environment's reward components."""
+    success: bool | None = None
+    """Whether the task was solved, by the environment's own word; None where it tells none."""
     trajectory: BlobRef | None = None
     """`trajectory` codec bytes: the whole episode, or with record `actions` the action log. Of a job with `render` those of
     `rendered`; workers of earlier versions do not know that."""

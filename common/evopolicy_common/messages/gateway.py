@@ -201,6 +201,8 @@ class EpisodeFeedback(msgspec.Struct, frozen=True, kw_only=True):
     video: BlobRef | None
     stdout: Bytes
     stderr: Bytes
+    success: bool | None = None
+    """As `EpisodeOutcome.success`."""
 
 
 class SubmitDone(msgspec.Struct, frozen=True, kw_only=True):

@@ -8,7 +8,13 @@ import msgspec
 
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Numbered, Plain, Text, Word
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
+from evopolicy_common.messages.environment import (
+    EnvironmentDescription,
+    ObservationForm,
+    PolicyScope,
+    Split,
+    StepLimit,
+)
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FinishRule, Profile, SimulationRule, SubmitStatus, VideoOption
 from evopolicy_common.messages.journal import Committed
@@ -63,6 +69,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     step_limit: StepLimit = "natural"
     """Rows and messages of earlier versions tell none."""
     profile: Profile = "own"
+    definition: Word = ""
+    """First digits of the digest of the environment's definition; empty: the one that ships or is approved."""
     agent_host: Word = ""
     """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
 
@@ -237,6 +245,8 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     as_in: PlayedAs | None = None
     """None for what was not played in a run before."""
     step_limit: StepLimit = "natural"
+    definition: Word = ""
+    """As `RunSettings.definition`."""
 
 
 class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):
@@ -421,6 +431,41 @@ class Signed(Message, frozen=True, kw_only=True, tag="signed"):
     signature: Word
 
 
+class EnvironmentsRequest(Message, frozen=True, kw_only=True, tag="environments"):
+    """Which environments the workers offer; answered a page at a time."""
+
+    token: Word
+    cursor: Int = 0
+
+
+class OfferedEnvironment(msgspec.Struct, frozen=True, kw_only=True):
+    """One definition of one environment."""
+
+    description: EnvironmentDescription
+    digest: Word
+    """First digits of its digest."""
+    accepted: Text
+    """`ships`, `approved`, `trusted`, or `by digest only`: then a run has to name `ID@DIGEST`."""
+    workers: Many[Text]
+    """Connected workers that offer it."""
+
+
+class EnvironmentsReply(Message, frozen=True, kw_only=True, tag="environments_reply"):
+    """A page of what is offered."""
+
+    environments: Many[OfferedEnvironment]
+    cursor: Int
+    finished: bool
+
+
+class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_environment"):
+    """Let runs use an environment that does not ship, in one definition."""
+
+    token: Word
+    env: Word
+    digest: Word
+
+
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
     """What the cluster is doing."""
 
@@ -532,6 +577,8 @@ OperatorRequest = (
     | OpeningRequest
     | SignRequest
     | StatusRequest
+    | EnvironmentsRequest
+    | ApproveEnvironment
     | BlobPut
     | BlobGet
 )
@@ -547,6 +594,7 @@ OperatorReply = (
     | RunOpening
     | Signed
     | StatusReply
+    | EnvironmentsReply
     | BlobAck
     | BlobChunk
     | Refused

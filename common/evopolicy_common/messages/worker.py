@@ -107,6 +107,8 @@ class Registered(Message, frozen=True, kw_only=True, tag="registered"):
     """Run id to why this worker gets no work of it, such as other versions than the run began with."""
     hidden_bar: Text = ""
     """Why this worker gets no hidden work of any run; empty when it may."""
+    refused_environments: Named[Text] = {}
+    """Environment to why its announcement is not listened to."""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):

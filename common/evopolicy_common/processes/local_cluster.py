@@ -132,7 +132,7 @@ async def local_cluster(
         folders.callback(ready_file.unlink, missing_ok=True)
         coordinator = [
             *_module("evopolicy_coordinator.cli"),
-            *("--state", str(root), "--ready-file", str(ready_file)),
+            *("--state", str(root), "--ready-file", str(ready_file), "--trust-workers"),
         ]
         if data is not None:
             coordinator += ["--data", str(data.absolute())]

@@ -59,6 +59,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Mean over episodes of each component's sum; left out when the environment reports none."""
     reward_components_per_episode: tuple[dict[str, float], ...] | None = None
     """Each episode's sums, request order; left out likewise."""
+    successes: tuple[bool | None, ...] | None = None
+    """Whether each episode solved the task, by the environment's own word; left out where it tells none."""
     policy_failures: int | None = None
     """How many episodes the policy failed in; left out when not ok, and in files of earlier versions."""
     warning: str | None = None

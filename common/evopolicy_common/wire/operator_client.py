@@ -13,10 +13,13 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
     AgentGone,
+    ApproveEnvironment,
     CancelRun,
     DescribeEnvironment,
     Disclose,
     Done,
+    EnvironmentsReply,
+    EnvironmentsRequest,
     EnvironmentState,
     Evaluate,
     EvaluationPage,
@@ -24,6 +27,7 @@ from evopolicy_common.messages.operator import (
     EvaluationStarted,
     JournalPage,
     JournalRequest,
+    OfferedEnvironment,
     OpeningRequest,
     RecordedRequest,
     RepinRun,
@@ -57,6 +61,22 @@ class OperatorClient:
         """What the cluster is doing."""
         message = StatusRequest(token=self._token)
         return await self._requests.until_answered("status", message, StatusReply, timeout_s=TIMEOUT_S)
+
+    async def environments(self) -> list[OfferedEnvironment]:
+        """The environments that connected workers offer."""
+        found: list[OfferedEnvironment] = []
+        while True:
+            message = EnvironmentsRequest(token=self._token, cursor=len(found))
+            page = await self._requests.until_answered(
+                "environments", message, EnvironmentsReply, timeout_s=TIMEOUT_S
+            )
+            found += page.environments
+            if page.finished:
+                return found
+
+    async def approve(self, env: str, digest: str) -> None:
+        """Lets runs use an environment that does not ship, in that definition."""
+        await self._done("approve", ApproveEnvironment(token=self._token, env=env, digest=digest))
 
     async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
         await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
@@ -174,6 +194,6 @@ class OperatorClient:
         return await self._requests.fetch(_SENDER, self._token, ref)
 
     async def _done(
-        self, verb: str, message: AgentGone | CancelRun | Disclose | RepinRun | SetWorker
+        self, verb: str, message: AgentGone | ApproveEnvironment | CancelRun | Disclose | RepinRun | SetWorker
     ) -> None:
         await self._requests.until_answered(verb, message, Done, timeout_s=TIMEOUT_S)

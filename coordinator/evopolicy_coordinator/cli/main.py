@@ -122,6 +122,13 @@ def serve(
             help="The agents of its runs may read this state folder: they get cases of their own, and later runs new ones.",
         ),
     ] = False,
+    trust_workers: Annotated[
+        bool,
+        typer.Option(
+            "--trust-workers",
+            help="Take whatever environments the workers announce, also those that do not ship and nobody has approved.",
+        ),
+    ] = False,
     _: Version = False,
 ) -> None:
     """Coordinates a cluster: workers and gateways connect to it, with the credentials that it writes.
@@ -140,6 +147,7 @@ def serve(
             cluster=cluster,
             allowed_packages=tuple(allow_package or ()),
             unjailed=unjailed_agents,
+            trust_workers=trust_workers,
             core=CoreSettings(
                 audit_share=audit, hidden_isolation=hidden_isolation, hidden_wait_s=hidden_wait
             ),

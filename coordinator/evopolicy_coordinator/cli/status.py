@@ -44,9 +44,7 @@ runs_app = App(
 )
 
 
-def _asking(
-    connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]
-) -> T:
+def asking(connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]) -> T:
     """`work` with a link to the coordinator; our errors as one line."""
 
     async def ask() -> T:
@@ -72,9 +70,9 @@ def status(
     --watch --json prints a JSON object a line, every second.
     """
     if watch:
-        _asking(connect, file, _watch_lines if as_json else _watch)
+        asking(connect, file, _watch_lines if as_json else _watch)
         return
-    reply = _asking(connect, file, OperatorClient.status)
+    reply = asking(connect, file, OperatorClient.status)
     if as_json:
         say_json(reply)
     else:
@@ -110,7 +108,7 @@ RunId = Annotated[
 @workers_app.command("list", epilog="Example: evopolicy workers list")
 def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
     """The workers that are connected, or were lately, and what they play."""
-    reply = _asking(connect, file, OperatorClient.status)
+    reply = asking(connect, file, OperatorClient.status)
     if as_json:
         say_json(reply.workers)
         return
@@ -150,7 +148,7 @@ def _set_worker(
                 )
         await operator.set_worker(worker, state)
 
-    _asking(connect, file, work)
+    asking(connect, file, work)
     say(f"{worker} is {state}")
 
 
@@ -172,7 +170,7 @@ _command("resume", "active", "Take a worker back that was paused or drained, or 
 @runs_app.command("list", epilog="Example: evopolicy runs list")
 def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
     """The unfinished runs, and what they wait for."""
-    reply = _asking(connect, file, OperatorClient.status)
+    reply = asking(connect, file, OperatorClient.status)
     if as_json:
         say_json(reply.runs)
         return
@@ -190,7 +188,7 @@ def cancel(
     file: CredentialsFile = None,
 ) -> None:
     """End a run without a score; what of it is played stops."""
-    _asking(connect, file, lambda operator: operator.cancel(run))
+    asking(connect, file, lambda operator: operator.cancel(run))
     say(f"{run} is cancelled")
 
 
@@ -205,7 +203,7 @@ def agent_gone(
     Hidden cases may be played on that machine from now on. If the agent is alive after all, it can learn them: when in
     doubt resume the run, or start the machine anew.
     """
-    _asking(connect, file, lambda operator: operator.agent_gone(run))
+    asking(connect, file, lambda operator: operator.agent_gone(run))
     say(f"{run} has no agent any more")
 
 
@@ -222,7 +220,7 @@ def repin(
     file: CredentialsFile = None,
 ) -> None:
     """Let a run go on with workers of other library versions, when those it began with are gone."""
-    _asking(connect, file, lambda operator: operator.repin(run, fingerprint_class, reason))
+    asking(connect, file, lambda operator: operator.repin(run, fingerprint_class, reason))
     say(f"{run} goes on with workers of class {fingerprint_class}")
 
 

@@ -68,6 +68,8 @@ class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):
     """A fresh id made by the shell; what the worker's later requests carry."""
     machine: str = ""
     """Whose credentials it joined with; empty for those that the state folder hands out."""
+    refused_environments: dict[str, str] = {}
+    """Why what it announced of them is not listened to; they are not in the message any more."""
 
 
 class LivenessLost(Event, frozen=True, kw_only=True):

@@ -304,6 +304,8 @@ class Flow:
     """Those that share its hidden cases; None where it has none."""
     closed: bool = False
     """No agent is at work for it: its hidden jobs wait for agents so long and no longer (`precedence`)."""
+    definition: str = ""
+    """First digits of the digest of the environment's definition that it is played in; empty: any."""
     pin: str | None = None
     """Fingerprint class; None until there is a worker for it."""
     description: EnvironmentDescription | None = None
@@ -419,7 +421,9 @@ class Profile:
 
     def offers(self, flow: Flow) -> bool:
         """Whether these workers have a flow's environment and sandbox tier."""
-        return flow.env in self.classes and flow.tier in self.key[1]
+        if flow.env not in self.classes or flow.tier not in self.key[1]:
+            return False
+        return flow.definition in ("", self.fingerprints[flow.env].definition)
 
     def serves(self, key: LaneKey) -> bool:
         """Whether these workers may play what waits in a lane of that key."""

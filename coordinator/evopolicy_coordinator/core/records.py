@@ -181,6 +181,7 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     replays: tuple[BlobRef, ...] = ()
     as_in: PlayedAs | None = None
     max_steps: int = 0
+    definition: str = ""
 
 
 class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):

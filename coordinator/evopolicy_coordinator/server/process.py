@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
+from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes import host
 from evopolicy_common.processes.local_cluster import WORKERS_ENDED
@@ -22,6 +23,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.remote_listener import declare_all, remote_listener
 from evopolicy_coordinator.server.request_parser import RequestParser
@@ -49,6 +51,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """What workers let policies import beside numpy; told in `/info`."""
     unjailed: bool = False
     """Agents of its runs may read the state folder: they play cases of their own; see `splits.secret_of`."""
+    trust_workers: bool = False
+    """Take whatever environments the workers announce."""
     core: CoreSettings = CoreSettings()
     metrics: str | None = None
     """HOST:PORT of `/metrics` and `/healthz`; None for none."""
@@ -87,6 +91,11 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
             allowed_imports=("numpy", *options.allowed_packages),
             denied_imports=SIMULATORS,
             machines=machines,
+            definitions=Definitions(
+                state.root / "approved-environments.json",
+                shipped=catalogue.digests(),
+                trusting=options.trust_workers,
+            ),
         )
         reader = ServiceReader(state.database, blobs, uploads)
         service = Service(state.identity.cluster, store, reader, parser, options.core)

@@ -291,6 +291,7 @@ def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
         video=outcome.video,
         stdout=outcome.stdout,
         stderr=outcome.stderr,
+        success=outcome.success,
     )
 
 

@@ -31,6 +31,7 @@ from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow
 from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
     MAX_EPISODES_PER_SUBMIT,
@@ -99,8 +100,11 @@ class RequestParser:
         allowed_imports: tuple[str, ...],
         denied_imports: tuple[str, ...],
         machines: Machines | None = None,
+        definitions: Definitions | None = None,
     ) -> None:
-        """`machines`: those that hold tokens of their own, beside the state folder's; None: no others."""
+        """`machines`: those that hold tokens of their own, beside the state folder's; None: no others. `definitions`: which
+        environments are accepted; None: all."""
+        self.definitions = definitions or Definitions()
         self._identity = identity
         self._blobs = blobs
         self._source = source
@@ -201,10 +205,12 @@ class RequestParser:
     def _registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
         machines = self._machines
         holder = None if machines is None else machines.holder("worker", m.token)
+        admitted, refused = self.definitions.admit(m.environments)
         return events.WorkerRegistered(
             stimulus_id=stimulus,
             request=request,
-            message=m,
+            message=replace(m, environments=admitted),
+            refused_environments=refused,
             session=secrets.token_urlsafe(16) if machines is None else machines.session_for(m.token),
             machine="" if holder is None else holder.name,
         )
@@ -358,6 +364,7 @@ class RequestParser:
             record=m.record,
             tier=m.sandbox_tier,
             limits=m.limits,
+            definition=m.definition,
             replays=m.replays,
             as_in=m.as_in,
             max_steps=_max_steps(m.env, m.step_limit),

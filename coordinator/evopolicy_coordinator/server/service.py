@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import structlog
+from msgspec.structs import replace
 
 from evopolicy_common.errors import (
     DamagedStoreError,
@@ -234,8 +235,14 @@ class Service:
                 }.values()
             )
             self._spawn(self._serve_description(query, message, fingerprints))
+        elif isinstance(message, operator.EnvironmentsRequest):
+            found = self._parser.definitions.offered(core.state.workers.values())
+            query.reply(answer_bytes(_page(found, message.cursor)), lane_of(parsed.asker))
+        elif isinstance(message, operator.ApproveEnvironment):
+            self._parser.definitions.approve(message.env, message.digest, core.state.workers.values())
+            query.reply(answer_bytes(operator.Done()), lane_of(parsed.asker))
         elif self._parser.reads_files(message):
-            self._spawn(self._serve_from_thread(query, parsed))
+            self._spawn(self._serve_from_thread(query, self._pinned(core, parsed)))
         else:
             request = self._pending.admit(query, parsed.asker)
             try:
@@ -246,6 +253,20 @@ class Service:
             if isinstance(message, LeaseRequest):
                 event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
             self._handle(event)
+
+    def _pinned(self, core: Core, parsed: Parsed) -> Parsed:
+        """The request with the definition in which its environment is played."""
+        message, workers = parsed.message, core.state.workers.values()
+        if isinstance(message, operator.CreateRun):
+            if message.key in core.state.run_keys:  # made before, in the definition of then
+                return parsed
+            wanted = message.settings
+            pin = self._parser.definitions.pin(wanted.env, wanted.definition, workers)
+            message = replace(message, settings=replace(wanted, definition=pin))
+        elif isinstance(message, operator.Evaluate):
+            pin = self._parser.definitions.pin(message.env, message.definition, workers)
+            message = replace(message, definition=pin)
+        return replace(parsed, message=message)
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = self._loop.create_task(work)
@@ -597,3 +618,19 @@ def _check_session(core: Core, name: str, session: str) -> Worker:
 def _over(core: Core, run: str) -> tuple[Refusal, str]:
     status, reason = core.over(run)
     return status, words(reason)
+
+
+_PAGE_BYTES = 4 << 20
+
+
+def _page(found: list[operator.OfferedEnvironment], cursor: int) -> operator.EnvironmentsReply:
+    """The offered environments from `cursor` on, as many as fit well into a message."""
+    page: list[operator.OfferedEnvironment] = []
+    size = 0
+    for each in found[max(0, cursor) :]:
+        size += len(msgspec.msgpack.encode(each))
+        if page and size > _PAGE_BYTES:
+            break
+        page.append(each)
+    end = max(0, cursor) + len(page)
+    return operator.EnvironmentsReply(environments=tuple(page), cursor=end, finished=end >= len(found))

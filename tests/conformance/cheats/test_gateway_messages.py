@@ -109,6 +109,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "video": "BlobRef | none",
         "stdout": "bytes",
         "stderr": "bytes",
+        "success": "bool | none",
     },
     "PolicyFailure": {
         "category": (

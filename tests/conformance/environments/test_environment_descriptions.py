@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from evopolicy_common import catalogue
 from evopolicy_common.catalogue import entries, entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_common.records.rendered import Renderer, decode
@@ -189,3 +190,9 @@ def test_an_environment_survives_its_repaired_nonsense(env_id: str, warm: Warm) 
         assert np.isfinite(step.reward)
         if step.terminated or step.truncated:
             environment.reset(Case(seed=3))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_definition_is_the_one_that_ships(env_id: str, warm: Warm) -> None:
+    """`python -m evopolicy_worker.environments.digests common/evopolicy_common/catalogue/digests.json` writes the table anew."""
+    assert warm(env_id).description.digest().startswith(catalogue.digests()[env_id])

@@ -129,6 +129,25 @@ class Bad(Glider):
         return obs, reward, terminated, truncated, info
 
 
+class Keeper(Glider):
+    """Keeps how many episodes it has begun, in memory and in a file, and rewards each step by that."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        notes = os.path.join(os.environ["HOME"], "notes")
+        with open(notes, "a") as file:
+            file.write("x")
+        COUNTED.append(1)
+        self.kept = float(max(os.path.getsize(notes), len(COUNTED)))
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        obs, _, _, truncated, info = super().step(action)
+        return obs, self.kept, True, truncated, info
+
+
+COUNTED: list[int] = []
+
+
 class Opaque(gymnasium.Space[Any]):
     """Of a kind that nobody knows."""
 
@@ -141,6 +160,8 @@ for name, cls, limit in (
     ("Everything", Everything, 5),
     ("Treasure", Treasure, 20),
     ("Bad", Bad, 8),
+    ("Keeper", Keeper, 8),
+    ("Keeper", Keeper, 8),
 ):
     gymnasium.register(f"{name}-v0", entry_point=f"{__name__}:{cls.__name__}", max_episode_steps=limit)
 gymnasium.register("Endless-v0", entry_point=f"{__name__}:Glider")

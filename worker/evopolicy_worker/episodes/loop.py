@@ -388,7 +388,7 @@ class _Episode:
         )
         films = job.video and (not job.video_episodes or k < job.video_episodes)
         played = Recorder("actions") if films else None
-        total, components, length, terminated, truncated = self._steps(policy, recorder, played)
+        total, components, length, terminated, truncated, success = self._steps(policy, recorder, played)
         wall_s = time.monotonic() - start
         ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
         return EpisodeOutcome(
@@ -399,6 +399,7 @@ class _Episode:
             truncated=truncated,
             failure=self.failure,
             reward_components=components,
+            success=success,
             trajectory=_blob(recorder.finish()),
             video=None if played is None else self._video(played.finish(), length),
             stdout=ended.stdout,
@@ -435,8 +436,8 @@ class _Episode:
 
     def _steps(
         self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
-    ) -> tuple[float, dict[str, float], int, bool, bool]:
-        """Play to the end: return, components of the reward, length, terminated, truncated.
+    ) -> tuple[float, dict[str, float], int, bool, bool, bool | None]:
+        """Play to the end: return, components of the reward, length, terminated, truncated, whether the task was solved.
 
         `played` is given the actions as they were played, for the video.
         """
@@ -450,6 +451,8 @@ class _Episode:
         failed = False
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
+        solves, ever = environment.description.success, environment.description.success_at == "any"
+        success: bool | None = None
         total, t = 0.0, 0
         taken = self._begun.taken
         n_taken, keep = len(taken), taken.append
@@ -484,6 +487,8 @@ class _Episode:
             told = info.get("rewards", info)
             for name in names:
                 sums[name] += _number(told.get(name))
+            if solves and (told_success := info.get(solves)) is not None:
+                success = bool(told_success) or (ever and bool(success))
             if invalid:
                 info = {**info, "action_invalid": True}
             if failed:
@@ -502,7 +507,7 @@ class _Episode:
         for name, value in (("return", total), *sums.items()):
             if not math.isfinite(value):
                 raise WorkerError(f"{self._job.env}, episode {self._spec.index}: its {name} is {value}")
-        return total, sums, t, terminated, truncated
+        return total, sums, t, terminated, truncated, success
 
 
 def random_actions(policy_seed: bytes) -> np.random.Generator:

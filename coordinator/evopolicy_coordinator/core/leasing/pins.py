@@ -30,10 +30,11 @@ def add_flow(
     family: Family | None,
     *,
     closed: bool,
+    definition: str = "",
 ) -> Flow:
     """A new flow for a run or an evaluation, not pinned to workers yet; `closed`: no agent is at work for it."""
     state.n_flows += 1
-    flow = Flow(name, env, tier, of, secret, state.n_flows, family, closed=closed)
+    flow = Flow(name, env, tier, of, secret, state.n_flows, family, closed=closed, definition=definition)
     state.unpinned[name] = flow
     return flow
 

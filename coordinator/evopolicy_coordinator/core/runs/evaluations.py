@@ -45,7 +45,17 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
     """Take an evaluation into the core, with nothing of it queued yet."""
     family = state.families.join(row.env, row.cases) if templates.hidden_evaluation(row) else None
     name = row.evaluation
-    flow = pins.add_flow(state, name, "evaluation", row.env, row.tier, row.secret, family, closed=True)
+    flow = pins.add_flow(
+        state,
+        name,
+        "evaluation",
+        row.env,
+        row.tier,
+        row.secret,
+        family,
+        closed=True,
+        definition=row.definition,
+    )
     evaluation = state.evaluations[name] = Evaluation(row, flow)
     state.evaluation_keys[row.key] = name
     return evaluation

@@ -62,7 +62,10 @@ def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
     env, tier = row.settings.env, row.settings.sandbox_tier
     family = state.families.join(env, (*row.validation, *row.heldout))
     closed = stored.phase != "open"
-    flow = pins.add_flow(state, row.run, "run", env, tier, row.secret, family, closed=closed)
+    definition = row.settings.definition
+    flow = pins.add_flow(
+        state, row.run, "run", env, tier, row.secret, family, closed=closed, definition=definition
+    )
     run = Run(row, stored, Ledger(row.budget), flow)
     state.runs[row.run] = run
     state.run_keys[row.key] = row.run

@@ -54,6 +54,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
         lease_ttl_s=state.settings.lease_ttl_s,
         heartbeat_s=state.settings.heartbeat_s,
         refused=pins.refused_runs(state, worker.profile),
+        refused_environments=event.refused_environments,
         hidden_bar="" if message.boot_id or not state.isolates else conflicts.NO_BOOT_ID,
     )
     step.reply(event.request, reply)

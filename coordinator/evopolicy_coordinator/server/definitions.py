@@ -1,0 +1,190 @@
+"""Which definitions of environments a cluster plays: a worker could announce an easier one, or a text that prompts agents.
+
+Rules that this module owns:
+- An environment that ships is taken in its shipped definition alone. An announcement of another one is not listened to, and the
+  worker is told.
+- Any other environment needs the operator's word for its definition: with the request (`ID@DIGEST`), or once and for all
+  (`approve`, kept in the state folder).
+- A coordinator that trusts its workers, as that of a local command does, takes what they announce.
+- What a definition tells is bounded, and has no characters that cannot be seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import RefusedError
+from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.operator import OfferedEnvironment
+from evopolicy_common.messages.worker import DEFINITION_DIGITS
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.wire.refusals import Refusal
+from evopolicy_coordinator.core.model import Worker
+
+MAX_TEXT = 64 << 10
+MAX_SPACE_BYTES = 1 << 20
+MAX_NAME = 120
+LEAST_DIGITS = 8
+"""Of a digest that an operator names."""
+
+
+class Definitions:
+    """What is accepted, and what the operator has approved."""
+
+    def __init__(
+        self, file: Path | None = None, *, shipped: Mapping[str, str] | None = None, trusting: bool = True
+    ) -> None:
+        """`file`: where approvals are kept; None: nowhere. `shipped`: id to the first digits of its definition's digest."""
+        self._file = file
+        self._shipped = shipped or {}
+        self._trusting = trusting
+        self.approved: dict[str, list[str]] = {}
+        """By environment the definitions that the operator has approved, the latest last."""
+        if file is not None and file.exists():
+            self.approved = msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
+
+    def admit(
+        self, announced: Iterable[EnvironmentDescription]
+    ) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
+        """The descriptions that are listened to, and by environment why another is not."""
+        refused = {each.env: why for each in announced if (why := self._fault(each))}
+        return tuple(each for each in announced if each.env not in refused), refused
+
+    def _fault(self, description: EnvironmentDescription) -> str:
+        if self._trusting:
+            return ""
+        if fault := _unreadable(description):
+            return f"its {fault}"
+        digest = digits(description)
+        shipped = self._shipped.get(description.env)
+        if shipped is not None and digest != shipped:
+            return (
+                f"it ships with definition {shipped}, and the worker's is {digest}: install the same version of evopolicy and"
+                " of the environment's packages on both"
+            )
+        if shipped is None and not description.adapter:
+            return "a worker of an earlier version cannot tell its definition: install the same version of evopolicy on both"
+        return ""
+
+    def pin(self, env: str, asked: str, workers: Iterable[Worker]) -> str:
+        """The definition that a run or an evaluation of `env` is played in; empty: any that is accepted.
+
+        `asked`: the first digits of the one that the operator has named. RefusedError, with what is near and what to do, when
+        nobody offers it, or the operator has not approved it.
+        """
+        if self._trusting and not asked:
+            return ""
+        offering = [each.profile for each in workers]
+        offers = {
+            each.fingerprints[env].definition or "unknown": None
+            for each in offering
+            if env in each.descriptions
+        }
+        if asked:
+            return self._named(env, asked, list(offers))
+        if catalogue.is_shipped(env) and env in self._shipped:
+            return ""
+        if not offers:
+            known = {name for each in offering for name in each.descriptions}
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"no worker offers {env}{catalogue.near(env, sorted(known))}; install its package on a worker and start that"
+                " with --env; `evopolicy envs` lists what is offered",
+            )
+        approved = [each for each in reversed(self.approved.get(env, [])) if each in offers]
+        if approved:
+            return approved[0]
+        named = ", ".join(f"{env}@{each}" for each in offers)
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS,
+            f"{env} does not ship with evopolicy, and nobody has approved its definition; workers offer {named}. Look at it with"
+            f" `evopolicy envs --show {env}`, then name it so with --env, or approve it once: `evopolicy envs approve"
+            f" {env}@{next(iter(offers))}`",
+        )
+
+    def _named(self, env: str, asked: str, offers: list[str]) -> str:
+        if len(asked) < LEAST_DIGITS or not all(each in "0123456789abcdef" for each in asked):
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"{env}@{asked[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy envs` shows it",
+            )
+        found = [each for each in offers if each.startswith(asked) or asked.startswith(each)]
+        if len(found) == 1:
+            return found[0]
+        if self._trusting and not offers:  # its worker is about to come
+            return asked[:DEFINITION_DIGITS]
+        offered = ", ".join(offers) or "none"
+        raise RefusedError(
+            Refusal.INVALID_SETTINGS, f"no worker offers {env} in definition {asked}; offered are: {offered}"
+        )
+
+    def approve(self, env: str, asked: str, workers: Iterable[Worker]) -> None:
+        """The operator's word for a definition, kept. RefusedError when nobody offers it."""
+        offers = {
+            each.profile.fingerprints[env].definition: None
+            for each in workers
+            if env in each.profile.descriptions
+        }
+        digest = self._named(env, asked, list(offers))
+        kept = [each for each in self.approved.get(env, []) if each != digest]
+        self.approved[env] = [*kept, digest]
+        if self._file is not None:
+            data = msgspec.json.format(msgspec.json.encode(self.approved, order="sorted"))
+            write_atomically(self._file, data, mode=0o600)
+
+    def offered(self, workers: Iterable[Worker]) -> list[OfferedEnvironment]:
+        """Every definition of every environment that connected workers offer."""
+        found: dict[tuple[str, str], OfferedEnvironment] = {}
+        for worker in workers:
+            if worker.state == "lost":
+                continue
+            profile = worker.profile
+            for env, description in profile.descriptions.items():
+                digest = digits(description)
+                known = found.get((env, digest))
+                found[env, digest] = OfferedEnvironment(
+                    description=description,
+                    digest=digest,
+                    accepted=self._word(env, digest),
+                    workers=(*(known.workers if known else ()), worker.name),
+                )
+        return [found[key] for key in sorted(found)]
+
+    def _word(self, env: str, digest: str) -> str:
+        if env in self._shipped:
+            return "ships"
+        if self._trusting:
+            return "trusted"
+        return "approved" if digest in self.approved.get(env, []) else "by digest only"
+
+
+def digits(description: EnvironmentDescription) -> str:
+    """The digest of a definition as people name it."""
+    return description.digest()[:DEFINITION_DIGITS]
+
+
+def _unreadable(description: EnvironmentDescription) -> str:
+    """What of a description is too large, or cannot be seen; empty for nothing."""
+    texts = {
+        "task text": description.task_text,
+        "title": description.title,
+        "family": description.family,
+        **{f"text of {name[:40]!r}": text for name, text in description.reward_texts.items()},
+    }
+    for name, text in texts.items():
+        most = MAX_TEXT if name == "task text" else MAX_NAME if name in ("title", "family") else 1000
+        if len(text) > most:
+            return f"{name} has {len(text):,} characters; {most:,} are the limit"
+        if not all(each.isprintable() or each in "\n\t" for each in text):
+            return f"{name} has characters that cannot be seen; write it without control characters"
+    if not catalogue.valid_id(description.env):
+        return "id is not one: letters, digits, '_', '.', '-', parts joined by '/' or ':'"
+    for name in ("obs_space", "action_space", "definition"):
+        size = len(msgspec.msgpack.encode(getattr(description, name)))
+        if size > MAX_SPACE_BYTES:
+            return f"{name} takes {size:,} bytes; {MAX_SPACE_BYTES:,} are the limit"
+    return ""
