@@ -167,7 +167,13 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
 
     monkeypatch.chdir(tmp_path)
     asyncio.run(main())
-    assert started["test-coordinator"][4:] == ["--data", str(tmp_path / "d"), "--audit", "0.5"]
+    assert started["test-coordinator"][4:] == [
+        "--trust-workers",
+        "--data",
+        str(tmp_path / "d"),
+        "--audit",
+        "0.5",
+    ]
     assert started["test-worker"][-6:] == ["--env", "toy/line", "--env", "toy/maze", "--slots", "3"]
     assert started["test-worker-2"][-2:] == ["--slots", "2"]
 

@@ -123,7 +123,7 @@ def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
         (FILE.replace('name = "GPT"', 'name = "evolve"'), "agents of one name: evolve"),
         (FILE.replace('agent = "evolve"', 'agent = "nobody"'), "'evolve': --agent 'nobody'"),
         (FILE.replace('name = "s"', 'name = "s/t"'), "letters, digits"),
-        (FILE.replace('"toy/line", ', '"no/such", '), "no/such"),
+        (FILE.replace('"toy/line", ', '"gym/no-such", '), "gym/no-such"),
     ],
 )
 def test_a_wrong_file_is_refused_with_the_place(tmp_path: Path, text: str, message: str) -> None:
