@@ -44,6 +44,7 @@ async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> As
                     f" `evopolicy web {root}`"
                 ) from error
             say(f"view: {address.read_text()}", err=True)
+            address.unlink()  # it holds the token, and an agent without a jail reads this user's files
             yield
         finally:
             await child.end(_GRACE_S)

@@ -187,6 +187,7 @@ class Reader:
         """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and does not
         answer."""
         by_run = {status.run: status for status in cluster or ()}
+        by_name = {(status.entry, status.env, status.exp_id): status for status in by_run.values()}
         sweeps: list[Sweep] = []
         alive: set[str] = set()
         seen: set[str] = set()
@@ -211,8 +212,11 @@ class Reader:
             }
             for entry in entries.values():
                 if entry.name in listed:
-                    found.append(_without_folder(root, entry, by_run.get(entry.run)))
-                    seen.add(entry.run)
+                    # Another host of the sweep may have begun it, which tells its id to the coordinator alone.
+                    name = "" if index is None else f"{index.suite}-{entry.repeat}"
+                    status = by_run.get(entry.run) or by_name.get((entry.agent, entry.env, name))
+                    found.append(_without_folder(root, entry, status))
+                    seen.add(entry.run if status is None else status.run)
             name = root.name if index is None else index.suite
             paused = (root / PAUSED).exists()
             sweeps.append(
@@ -397,7 +401,7 @@ def _without_folder(root: Path, entry: SuiteEntry, status: RunStatus | None) -> 
     return RunFacts(
         key=key_of(f"{root}\n{entry.name}"),
         path=None,
-        run=entry.run,
+        run=entry.run if status is None else status.run,
         entry=entry.agent,
         env=entry.env,
         exp_id=entry.name,
@@ -407,10 +411,14 @@ def _without_folder(root: Path, entry: SuiteEntry, status: RunStatus | None) -> 
         budget=None if status is None else status.budget,
         used=entry.budget_used if status is None else status.budget - status.remaining_budget,
         n_submits=entry.n_submits if status is None else status.n_submits,
+        best=None if status is None else status.best_mean,
+        running=0 if status is None else status.running,
+        queued=0 if status is None else status.queued,
+        started_at=None if status is None else status.created_at or None,
         tokens=_n_tokens(entry.tokens) + _n_tokens(entry.earlier),
         cost=_cost(entry.tokens) + _cost(entry.earlier),
         error=entry.error or "",
-        host=entry.host,
+        host=entry.host or ("" if status is None else status.agent_host),
         waits_for="" if status is None else status.waits_for,
         wall_s=entry.wall_s,
         closed_reason=entry.closed_reason,
