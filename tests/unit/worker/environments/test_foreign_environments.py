@@ -229,3 +229,13 @@ def test_agents_that_ship_act_in_every_space(everything: Environment) -> None:
         everything.reset(Case(seed=0))
         assert everything.step(repaired).info["inside"]
     assert Features(json.loads(json.dumps(everything.description.obs_space))).size > 0
+
+
+def test_the_readmes_environment_is_played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    readme = (PACKAGE.parents[2] / "README.md").read_text(encoding="utf-8")
+    (source,) = [block for block in readme.split("```python\n")[1:] if block.startswith("# my_env.py\n")]
+    (tmp_path / "my_env.py").write_text(source.partition("```")[0], encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    told = describe("my_env:Glider-v0")
+    assert told.max_episode_steps == 50
+    assert "A point is steered to the origin." in told.task_text
