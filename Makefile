@@ -3,6 +3,7 @@
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
 # make docs   the documentation as a site in build/site
+# make check-envs  plays every environment of every family, and writes the table in docs/reference/environments.md
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
@@ -21,7 +22,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test check docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web faults sim clean
+.PHONY: help install paper-worker demo test check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -58,6 +59,12 @@ check: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check -q .
 	@$(BIN)/mypy
+
+# Resumed where it was stopped (build/check-envs.jsonl). A part, or longer episodes: make check-envs ARGS="--steps 1000 highway"
+check-envs: install
+	@mkdir -p build
+	@$(BIN)/evopolicy-worker check-env --results build/check-envs.jsonl $(if $(ARGS),$(ARGS),--steps 200 "gymnasium/*" "gym/*" toy); status=$$?; \
+	$(BIN)/python docs/_site/environments.py build/check-envs.jsonl docs/reference/environments.md && exit $$status
 
 docs: install
 	@test -x $(BIN)/mkdocs || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -30,7 +30,7 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.ready import read_ready
-from evopolicy_worker import environments
+from evopolicy_worker import check_env, environments
 from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
@@ -185,6 +185,9 @@ def doctor(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )
     raise typer.Exit(0 if best else 1)
+
+
+app.command("check-env")(check_env.command)
 
 
 def _refused(tier: Tier, why: str | None, *, unsandboxed: bool) -> ConfigError:

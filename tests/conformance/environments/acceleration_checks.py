@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from acceleration_drivers import Driver, competent_driver, random_driver
-from environment_checks import _digest
+from environment_checks import IDS, _digest
 from gymnasium.envs.box2d.car_racing import PLAYFIELD
 
 from evopolicy_common.catalogue import entries
@@ -48,7 +48,7 @@ class Comparison:
 def accelerated_ids() -> list[str]:
     """Suite ids of the environments that have accelerations, in catalogue order."""
     served = set(itertools.chain.from_iterable(one.gymnasium_ids for one in table.ACCELERATIONS))
-    return [entry.id for entry in entries().values() if entry.gymnasium_id in served]
+    return [env_id for env_id in IDS if entries()[env_id].gymnasium_id in served]
 
 
 def compare(

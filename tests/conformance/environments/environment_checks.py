@@ -1,7 +1,7 @@
 """What the conformance tests of environments share: playing an episode to a digest, reading spaces and task tables.
 
 Also a program, so that an episode can be played in another process: `python environment_checks.py play` or `render`
-prints one JSON object, id to digests, of all ids given or of all that are offered.
+prints one JSON object, id to digests, of all ids given or of Core16 and the toys.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from evopolicy_common.catalogue import suites
 from evopolicy_common.messages.environment import Case, SpaceSchema
-from evopolicy_worker.environments import Environment, make, offered
+from evopolicy_worker.environments import Environment, make
 
+IDS = [*suites()["core16"].environments, *suites()["toy"].environments]
+"""Those with a text and numbers of their own; `test_families.py` looks at the others."""
 SEED = 20_011
 STEPS = {"gym/racing": 25, "gymnasium/parking-v0": 30, "gymnasium/roundabout-v0": 11}
 """Steps played per episode where a step is slow; 80 elsewhere."""
@@ -127,7 +130,7 @@ def table(text: str, heading: str) -> list[list[str]]:
 def main(mode: str, ids: list[str]) -> None:
     digests = {}
     # Reversed, and all of them alive together: what came before must not matter.
-    environments = [make(env_id, render=mode == "render") for env_id in reversed(ids or offered())]
+    environments = [make(env_id, render=mode == "render") for env_id in reversed(ids or IDS)]
     for environment in environments:
         digests[environment.description.env] = play(environment, frames=mode == "render")
         if mode == "render":

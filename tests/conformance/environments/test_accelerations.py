@@ -10,6 +10,7 @@ import pygame
 import pytest
 from acceleration_checks import DifferenceError, DriverFactory, accelerated_ids, compare, compare_car_pictures
 from acceleration_drivers import competent_driver, random_driver
+from environment_checks import IDS as CORE_IDS
 
 from evopolicy_common.catalogue import entries
 from evopolicy_common.messages.environment import Case
@@ -23,7 +24,7 @@ STEPS = {"gym/racing": 60, "gymnasium/parking-v0": 50, "gymnasium/roundabout-v0"
 SINGLES = [
     (one.name, entry.id)
     for one in ACCELERATIONS
-    for entry in entries().values()
+    for entry in (entries()[env_id] for env_id in CORE_IDS)
     if one.serves(str(entry.gymnasium_id))
 ]
 

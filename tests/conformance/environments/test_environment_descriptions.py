@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from environment_checks import IDS
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import entries, entry
@@ -17,12 +18,11 @@ from evopolicy_common.records.rendered import Renderer, decode
 from evopolicy_worker.environments import Environment, offered
 from evopolicy_worker.environments.spaces import bounds
 
-IDS = offered()
 Warm = Callable[[str], Environment]
 
 
 def test_the_whole_catalogue_is_offered() -> None:
-    assert list(entries()) == IDS
+    assert list(entries()) == offered()
 
 
 @pytest.mark.parametrize("env_id", IDS)

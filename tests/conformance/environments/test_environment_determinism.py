@@ -12,14 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from environment_checks import SEED, STEPS, play
+from environment_checks import IDS, SEED, STEPS, play
 
 from evopolicy_common.catalogue import entry
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker.environments import Environment, make, offered, process_environment
+from evopolicy_worker.environments import Environment, make, process_environment
 from evopolicy_worker.environments.box2d import Box2DFamily
 
-IDS = offered()
 Warm = Callable[[str], Environment]
 
 

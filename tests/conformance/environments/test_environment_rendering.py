@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from environment_checks import FRAMES, play
+from environment_checks import FRAMES, IDS, play
 
 from evopolicy_common.errors import WorkerError
-from evopolicy_worker.environments import make, mujoco, offered, process_environment
+from evopolicy_worker.environments import make, mujoco, process_environment
 
-DRAWS_WITH_EGL = [env_id for env_id in offered() if env_id.endswith("5") or "Fetch" in env_id]
-DRAWABLE = [env_id for env_id in offered() if env_id not in DRAWS_WITH_EGL or ctypes.util.find_library("EGL")]
+DRAWS_WITH_EGL = [env_id for env_id in IDS if env_id.endswith("5") or "Fetch" in env_id]
+DRAWABLE = [env_id for env_id in IDS if env_id not in DRAWS_WITH_EGL or ctypes.util.find_library("EGL")]
 
 
 @pytest.fixture(scope="session")

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from environment_checks import IDS
 from slots import Slots, make_job, rows
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_worker.environments import Environment, offered
+from evopolicy_worker.environments import Environment
 
 SEED = 77
 COMPARED_STEPS = 60
@@ -56,7 +57,7 @@ def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
     found.close()
 
 
-@pytest.mark.parametrize("env_id", offered())
+@pytest.mark.parametrize("env_id", IDS)
 def test_a_slot_plays_what_the_environment_plays(
     slots: Slots, env_id: str, warm: Callable[[str], Environment]
 ) -> None:

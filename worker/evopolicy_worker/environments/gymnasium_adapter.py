@@ -122,7 +122,7 @@ class GymnasiumEnvironment(Environment):
         self.accelerations: tuple[str, ...] = ()
         """Names of those in use."""
         settings.apply(render=render)
-        with _quiet():
+        with quiet():
             family.load()
         self._rebuilds = family.rebuilds(entry)
         self._used = False
@@ -161,6 +161,16 @@ class GymnasiumEnvironment(Environment):
             adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),
             packages=family.packages(entry),
         )
+
+    @property
+    def rebuilds(self) -> bool:
+        """Whether each episode gets an environment made anew."""
+        return self._rebuilds
+
+    @property
+    def bare(self) -> gymnasium.Env[Any, Any]:
+        """What is played now, without the adapter."""
+        return self._env
 
     def reset(self, case: Case) -> Observation:
         # `reset(options=…)` may reconfigure an environment for good (highway-env does), so none is reused after it.
@@ -201,7 +211,7 @@ class GymnasiumEnvironment(Environment):
 
     def _build(self) -> None:
         entry = self._entry
-        with _quiet():
+        with quiet():
             env = self._family.make(entry, render=self._render)
         limits = [entry.max_episode_steps]
         while type(env).__name__ in _PLAIN_WRAPPERS:
@@ -234,7 +244,7 @@ def _definition(entry: Entry) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Nothing that a library has to say at import or make: deprecations, notices, greetings."""
     sink = io.StringIO()
     with warnings.catch_warnings(), contextlib.redirect_stdout(sink), contextlib.redirect_stderr(sink):

@@ -1,10 +1,11 @@
-"""highway-env: parking and roundabout."""
+"""highway-env: parking, roundabouts, motorways and crossings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.info import plain_info
 
@@ -23,6 +24,10 @@ class HighwayFamily(GymnasiumFamily):
             "on_road_reward": "1 on the road; the whole reward is 0 off it",
         },
     }
+
+    def rebuilds(self, entry: Entry) -> bool:
+        # These two have been seen to repeat; a scene is built in milliseconds.
+        return entry.gymnasium_id not in ("parking-v0", "roundabout-v0")
 
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The nested `rewards` (unweighted, some of them bools) become numbers."""

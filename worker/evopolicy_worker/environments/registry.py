@@ -19,7 +19,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_worker.environments import settings
 from evopolicy_worker.environments.base import Environment
 from evopolicy_worker.environments.foreign import ForeignFamily
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily, quiet
 
 _defined: dict[str, Entry] = {}
 
@@ -52,6 +52,15 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
     if accelerations is None:
         accelerations = settings.accelerations_on()
     return GymnasiumEnvironment(found, family, render=render, accelerations=accelerations)
+
+
+def load(env_id: str) -> None:
+    """Import what an environment is made with, where it is installed; processes forked afterwards have it already."""
+    found = _entry(env_id)
+    if found.adapter != "toy" and (family := _family(found)).installed():
+        settings.apply()
+        with quiet():
+            family.load()
 
 
 def describe(env_id: str) -> EnvironmentDescription:

@@ -1,9 +1,10 @@
-"""Gymnasium-Robotics: the Fetch tasks."""
+"""Gymnasium-Robotics: Fetch, Shadow Hand, Adroit, mazes, the kitchen."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.mujoco import MujocoFamily
 
 if TYPE_CHECKING:
@@ -11,11 +12,15 @@ if TYPE_CHECKING:
 
 
 class RoboticsFamily(MujocoFamily):
-    """A robot's arm, with goals."""
+    """Arms, hands and walkers, with goals."""
 
     distributions = ("gymnasium-robotics", "mujoco")
     modules = ("gymnasium", "mujoco", "gymnasium_robotics")
     components = {}
+
+    def rebuilds(self, entry: Entry) -> bool:
+        # Fetch and the Shadow Hand have been seen to repeat.
+        return not str(entry.gymnasium_id).startswith(("Fetch", "Hand"))
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture; the callback that moves the target's marker also runs the forward dynamics, so both are put back.

@@ -9,27 +9,35 @@ against the spaces.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from evopolicy_common.catalogue import Entry, is_shipped
+from evopolicy_common.catalogue import Entry, entries, is_shipped
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:
     import gymnasium
 
-_INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
-
 
 @cache
 def written(env_id: str) -> str | None:
     """The Markdown text that is written for an environment; None when none is."""
     name = env_id.replace("/", "_") + ".md"
-    return _read(name) if files(__package__).joinpath(name).is_file() else None
+    return template.read(name) if files(__package__).joinpath(name).is_file() else None
+
+
+def _shared(entry: Entry) -> str | None:
+    """The text written for it, or for the same environment of Gymnasium's under another id with the same limit."""
+    same = (
+        each.id
+        for each in entries().values()
+        if entry.gymnasium_id
+        and (each.gymnasium_id, each.max_episode_steps) == (entry.gymnasium_id, entry.max_episode_steps)
+    )
+    return next((text for env_id in (entry.id, *same) if (text := written(env_id))), None)
 
 
 def task_text(
@@ -44,10 +52,5 @@ def task_text(
     template."""
     if entry.task:
         return template.clean(entry.task)
-    found = written(entry.id) if is_shipped(entry.id) else None
+    found = _shared(entry) if is_shipped(entry.id) else None
     return found or template.text(entry, env, obs_space, action_space, components, limit)
-
-
-def _read(name: str) -> str:
-    text = files(__package__).joinpath(name).read_text(encoding="utf-8")
-    return _INCLUDE.sub(lambda match: _read(match[1]).rstrip("\n"), text)

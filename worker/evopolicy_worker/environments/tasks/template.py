@@ -8,9 +8,10 @@ import inspect
 import math
 import re
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from evopolicy_common.catalogue import Entry
+from evopolicy_common.catalogue import Entry, is_shipped
 from evopolicy_common.messages.environment import SpaceSchema
 
 if TYPE_CHECKING:
@@ -18,7 +19,36 @@ if TYPE_CHECKING:
 
 MAX_DOCUMENTATION = 12_000
 """Characters of an environment's documentation that are shown."""
+MAX_SECTION = 6_000
+"""Characters of one section of it, of an environment that ships."""
 _MAX_ROWS = 64
+_HEADING = re.compile(r"^\s*(#+)\s+(.+?)\s*$")
+_PLACES = {
+    "Observation": ("observation",),
+    "Action": ("action",),
+    "Reward": ("reward",),
+    "Start": ("starting state", "start"),
+    "End": ("terminat", "episode end", "truncat"),
+    "": ("description", "mission", "goal", "task", "map"),
+}
+"""Words in the headings of a documentation, by the section of ours that they belong to."""
+_REWARD = "What each step gave is in the feedback of submits."
+_SIGNS = re.compile(
+    "|".join(
+        (
+            r"←|:=|[ΔΣ√∫≤≥]|\w′|\w''|[\w)]\s?(²|³|\^)|\*\*2|\|\||_\{",
+            r"\b(cos|sin|tan|atan|exp|sqrt|log|norm)\b ?[(\w]|\\\w",
+            r"\d\.\d+ ?[·*×]|\d\.\d+ (?![msN]\b)[a-zA-Zθωφ][ᵢⱼ\d]?\b|\w \* \w|\w = -?[\d.(\w]",
+            r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²|weight.{0,40}\d",
+            r"Runge|Euler(?! angles)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s|frame_skip|\bdt\b|time ?step of|Hz",
+            r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
+            r"gymnasium\.make|kwarg|arXiv|arxiv|http|[Ss]eed|reward threshold|initialized as|must be specified|argument|`options`|_reward=|naming convention|[Ii]f `",
+        )
+    )
+)
+"""Signs that a sentence gives equations of motion, a reward's formula, or constants; or that it speaks of options."""
+_IN_CODE = re.compile(r"[\w)\]] [+*/×÷−<>-] [\w(]|\w[*/+]\w|\|.+ − .+\||=")
+_INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 
 
@@ -30,7 +60,12 @@ def text(
     components: Mapping[str, str],
     limit: int,
 ) -> str:
-    """Markdown with the sections of every task text."""
+    """Markdown with the sections of every task text.
+
+    Of an environment that ships its documentation is told in words: formulas and constants of its dynamics are left out.
+    """
+    if is_shipped(entry.id):
+        return _in_sections(entry, env, obs_space, action_space, components, limit)
     documentation = _documentation(env)
     parts = [
         f"# {entry.label}",
@@ -45,6 +80,126 @@ def text(
         " (`truncated`)." + _success(entry),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _in_sections(
+    entry: Entry,
+    env: gymnasium.Env[Any, Any],
+    obs_space: SpaceSchema,
+    action_space: SpaceSchema,
+    components: Mapping[str, str],
+    limit: int,
+) -> str:
+    """The documentation's sections sorted into ours, after what is written for the whole family."""
+    told = _sections(clean(inspect.getdoc(type(env.unwrapped)) or ""))
+    family = _sections(_family_text(entry.family))
+
+    def section(ours: str, *facts: str) -> str:
+        shown = [family[ours]] if ours in family else [in_words(told.get(ours, "")), *facts]
+        return "\n\n".join(part for part in shown if part)
+
+    rewards = _reward(components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space"))
+    end = (
+        f"An episode ends when the environment ends it (`terminated`), and is truncated after {limit} steps."
+        + _success(entry)
+    )
+    parts = [
+        f"# {entry.label}",
+        "Maximise the sum of the rewards of an episode.",
+        in_words(told.get("", "")),
+        "## Observation\n\n" + section("Observation", _space(obs_space)) + _maze(env),
+        "## Action\n\n" + section("Action") + "\n\n" + _space(action_space),
+        "## Reward\n\n" + section("Reward", *([rewards] if components else [_REWARD])),
+        "## Start\n\n" + section("Start", "The start of an episode is drawn from its seed."),
+        "## End\n\n" + "\n\n".join(part for part in (in_words(told.get("End", "")), end) if part),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _family_text(family: str) -> str:
+    """What is written for all environments of a family; empty for nothing."""
+    name = f"family_{family}.md"
+    return read(name) if files(__package__).joinpath(name).is_file() else ""
+
+
+def read(name: str) -> str:
+    """A file of this folder, with those that it includes."""
+    text = files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return _INCLUDE.sub(lambda match: read(match[1]).rstrip("\n"), text)
+
+
+def _maze(env: gymnasium.Env[Any, Any]) -> str:
+    """The map of an environment that has one, a letter a cell."""
+    rows = getattr(getattr(env.unwrapped, "maze", None), "maze_map", None)
+    if not rows:
+        return ""
+    drawn = ["".join("#" if cell == 1 else str(cell or ".") for cell in row) for row in rows]
+    told = (
+        "The maze, seen from above: `#` wall, `.` free, `r` a place to start, `g` a place for the goal, `c` for both;"
+        " where it has no letters, any free cell is for both. x grows to the right, y upwards, and the middle is the origin."
+    )
+    return "\n\n" + told + "\n\n```\n" + "\n".join(drawn) + "\n```"
+
+
+def _sections(documentation: str) -> dict[str, str]:
+    """A documentation's text by the section of ours that it belongs to, the description under ""; the rest, such as arguments and
+    versions, is left out."""
+    found: dict[str, list[str]] = {}
+    ours: str | None = ""
+    level = 9
+    fenced = False
+    for line in documentation.splitlines():
+        fenced ^= line.lstrip().startswith("```")
+        heading = None if fenced else _HEADING.match(line)
+        if heading is None:
+            if ours is not None:
+                found.setdefault(ours, []).append(line)
+        elif ours is not None or len(heading[1]) <= level:
+            ours, level = _place(heading[2]), len(heading[1])
+    return {name: "\n".join(lines).strip() for name, lines in found.items()}
+
+
+def _place(heading: str) -> str | None:
+    low = heading.lower()
+    return next((ours for ours, names in _PLACES.items() if any(name in low for name in names)), None)
+
+
+def in_words(documentation: str) -> str:
+    """A documentation without code, formulas, constants and links; sentences with one are left out whole, rows of tables too."""
+    text = re.sub(r"^\s*```.*?^\s*```", "", documentation, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r" ?\([^()$]*default[^()]*\)", "", text)
+    text = re.sub(r"\$\$?[^$]+\$\$?", "∫", text)
+    text = re.sub(r"!?\[([^\]\n]+)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"</?[a-z][^>\n]*>", "", text)
+    text = re.sub(r",? by default,?", "", text)
+    blocks = [_block_in_words(block) for block in re.split(r"\n\s*\n", text)]
+    found = "\n\n".join(block for block in blocks if block)
+    if len(found) > MAX_SECTION:
+        found = found[:MAX_SECTION].rpartition("\n")[0]
+    return found
+
+
+def _block_in_words(block: str) -> str:
+    lines = block.strip("\n").splitlines()
+    if any(line.lstrip().startswith("|") for line in lines):
+        rows = [line.strip() for line in lines if line.lstrip().startswith("|")]
+        widths = {row.count("|") for row in rows}
+        return "\n".join(row for row in rows if not _is_formula(row)) if len(widths) == 1 else ""
+    items = re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", "\n".join(lines))
+    kept = []
+    for item in items:
+        sentences = re.split(r"(?<=[.!?:;])\s+(?=[A-Z*`_\"(])", " ".join(item.split()))
+        kept.append(" ".join(each for each in sentences if not _is_formula(each)))
+    return "\n".join(
+        item for item in kept if re.search(r"[A-Za-z]{2}", item) and not re.fullmatch(r"[-*] \*.+\*:", item)
+    )
+
+
+def _is_formula(text: str) -> bool:
+    code = re.findall(r"`([^`\n]+)`", text)
+    return (
+        bool(_SIGNS.search(text)) or any(_IN_CODE.search(span) for span in code) or text.count("`") % 2 == 1
+    )
 
 
 def clean(given: str) -> str:

@@ -1,0 +1,143 @@
+"""A few environments of each family: they are played as they say, and their texts tell no equations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_environment_task_texts import flags
+from typer.testing import CliRunner
+
+from evopolicy_common import catalogue
+from evopolicy_worker import check_env, cli
+from evopolicy_worker.environments import Environment, conformance
+from evopolicy_worker.environments.tasks import template
+
+Warm = Callable[[str], Environment]
+SAMPLE = (
+    "gymnasium/CartPole-v1",
+    "gymnasium/Acrobot-v1",
+    "gymnasium/Taxi-v4",
+    "gymnasium/Blackjack-v1",
+    "gymnasium/LunarLander-v3",
+    "gymnasium/Hopper-v5",
+    "gymnasium/Walker2d-v4",
+    "gymnasium/MiniGrid-Dynamic-Obstacles-5x5-v0",
+    "gymnasium/BabyAI-GoToLocal-v0",
+    "gymnasium/BabyAI-BossLevel-v0",
+    "gymnasium/merge-v0",
+    "gymnasium/highway-fast-v0",
+    "gymnasium/FetchReach-v4",
+    "gymnasium/PointMaze_UMaze-v3",
+    "gymnasium/AdroitHandDoor-v1",
+)
+FAMILIES = {"classic_control", "toy_text", "box2d", "mujoco", "minigrid", "babyai", "highway", "robotics"}
+
+
+def test_every_family_has_a_suite_and_is_sampled() -> None:
+    suites = catalogue.suites()
+    assert suites.keys() >= FAMILIES | {"breadth", "core16", "toy"}
+    assert sum(len(suites[name].environments) for name in FAMILIES) > 390
+    for name in FAMILIES:
+        assert set(suites[name].environments) & set(SAMPLE), name
+        assert all(catalogue.entry(each).max_episode_steps for each in suites[name].environments)
+
+
+def test_the_breadth_suite_does_not_change_the_numbers_of_its_environments() -> None:
+    breadth = catalogue.suites()["breadth"]
+    assert {catalogue.entry(each).family for each in breadth.environments} >= FAMILIES - {"highway"}
+    assert "breadth" not in {catalogue.suite_of(each).name for each in breadth.environments}
+
+
+@pytest.mark.parametrize("env_id", SAMPLE)
+def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
+    played = conformance.play(env_id, 40)
+    assert played.verdict(None) == "ok"
+    assert played.limit == catalogue.entry(env_id).max_episode_steps
+
+
+@pytest.mark.parametrize("env_id", SAMPLE)
+def test_a_text_made_by_the_template_has_all_sections_and_no_equations(env_id: str, warm: Warm) -> None:
+    description = warm(env_id).description
+    text = description.task_text
+    assert re.findall(r"^## (.+)$", text, re.MULTILINE) == ["Observation", "Action", "Reward", "Start", "End"]
+    assert re.search(rf"runcated after\s+{description.max_episode_steps} steps", text)
+    assert flags(text) == []
+
+
+def test_documentation_is_told_in_words() -> None:
+    told = template.in_words(
+        "The pole stands on a cart. The velocity is `v = v + 0.1 * a` each step (default is `2`). Links: see [a page](x.md).\n\n"
+        "```python\nenv.step(0)\n```\n\n| Num | Meaning |\n|---|---|\n| 0 | position |\n| 1 | `a * sin(b)` |"
+    )
+    assert "The pole stands on a cart." in told
+    assert "see a page." in told
+    assert "| 0 | position |" in told
+    for gone in ("0.1", "default", "env.step", "sin"):
+        assert gone not in told
+
+
+def test_one_environment_under_two_ids_has_the_text_that_is_written_for_it(warm: Warm) -> None:
+    assert warm("gymnasium/Acrobot-v1").description.task_text == warm("gym/acrobot").description.task_text
+
+
+BROKEN = """
+import os
+import gymnasium
+import numpy as np
+
+class Broken(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, how):
+        self.how = how
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seed = seed
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        obs, info = np.zeros(1, np.float32), {}
+        if self.how == "outside":
+            obs += 2
+        elif self.how == "unseeded":
+            obs[0] = np.random.default_rng().random()
+        elif self.how == "dies":
+            os._exit(3)
+        elif self.how == "tells":
+            info["start"] = self.seed
+        elif self.how == "hash":
+            obs[0] = hash("a") % 97 / 97
+        return obs, 0.0, False, False, info
+
+for how in ("outside", "unseeded", "dies", "tells", "hash", "nothing"):
+    gymnasium.register(f"{how}-v0", Broken, kwargs={"how": how}, max_episode_steps=5)
+"""
+
+
+def test_check_env_names_what_is_not_kept_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_environments.py").write_text(BROKEN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    ways = ("outside", "unseeded", "dies", "tells", "hash", "nothing")
+    ids = [f"broken_environments:{how}-v0" for how in ways]
+    results = tmp_path / "results.jsonl"
+    done = CliRunner().invoke(cli.app, ["check-env", "--steps", "10", "--results", str(results), *ids])
+    assert done.exit_code == 1, done.output
+    verdicts = {name.partition(":")[2]: each.verdict for name, each in check_env.read(results).items()}
+    assert "outside its space" in verdicts["outside-v0"]
+    assert "another episode" in verdicts["unseeded-v0"]
+    assert "status" in verdicts["dies-v0"]
+    assert "names the seed" in verdicts["tells-v0"]
+    assert verdicts["hash-v0"] == "another process plays another episode"
+    assert verdicts["nothing-v0"] == "ok"
+    # What is in the file is not played again.
+    n = len(results.read_bytes().splitlines())
+    CliRunner().invoke(cli.app, ["check-env", "--results", str(results), *ids])
+    assert len(results.read_bytes().splitlines()) == n == len(ids)

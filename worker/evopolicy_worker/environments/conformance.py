@@ -1,0 +1,273 @@
+"""Whether environments keep what the interface promises: played, not believed.
+
+As a program, `python -m evopolicy_worker.environments.conformance STEPS ID…` prints a `Played` as JSON a line: it loads a family
+once and forks a process for each id, so that one that crashes or hangs takes no other with it. `evopolicy-worker check-env` runs two
+such programs of different hash seeds and compares them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import resource
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.records.rendered import Renderer, decode
+from evopolicy_worker.environments import registry, spaces
+from evopolicy_worker.environments.base import Environment
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
+
+SEEDS = (20_011_117, 20_011_229)
+"""Large, so that they are found where an observation or an info gives them away."""
+TIMEOUT_S = 300.0
+"""For one environment."""
+_TIMED_STEPS = 200
+_NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
+
+
+class Played(msgspec.Struct, kw_only=True):
+    """What came of playing one environment in one process."""
+
+    env: str
+    faults: list[str] = []
+    """What it does not keep, in words; empty: it keeps all that was looked at."""
+    steps: int = 0
+    """Played in the episode whose digests are compared."""
+    limit: int = 0
+    ended: str = ""
+    """How that episode ended: `terminated`, `truncated`, or `going on` where the steps were over before it."""
+    digest: str = ""
+    """Of all observations, rewards, ends and infos of it."""
+    fresh: bool = False
+    """Another environment, made anew, played the same."""
+    reused: bool = False
+    """The same environment played the same after another episode."""
+    rebuilt: bool = False
+    """It is made anew for each episode."""
+    microseconds: float = 0.0
+    """A step of the bare environment."""
+    step_bytes: int = 0
+    """A step in the feedback of a train episode."""
+    memory_mb: int = 0
+    """At most, of the process."""
+    seconds: float = 0.0
+    observation: str = ""
+    action: str = ""
+    success: list[str] = []
+    """Keys of its info that seem to tell success."""
+
+    def verdict(self, other: Played | None) -> str:
+        """`ok`, or what is wrong. `other`: what came of it in another process."""
+        wrong = list(self.faults)
+        if not wrong:
+            wrong += [] if self.fresh else ["a fresh one plays another episode"]
+            wrong += [] if self.reused else ["a reused one plays another episode"]
+            if other is not None and other.digest != self.digest:
+                wrong.append("another process plays another episode")
+        return "; ".join(wrong) or "ok"
+
+
+def play(env_id: str, steps: int) -> Played:
+    """Plays an environment in this process, at most so many steps an episode."""
+    began = time.monotonic()
+    played = Played(env=env_id)
+    try:
+        _play(played, steps)
+    except EvopolicyError as error:
+        played.faults.append(str(error))
+    except Exception as error:
+        played.faults.append(f"it raised {type(error).__name__}: {error}")
+    played.faults = [" ".join(each.split())[:300] for each in played.faults]
+    played.memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    played.seconds = round(time.monotonic() - began, 2)
+    return played
+
+
+def _play(played: Played, steps: int) -> None:
+    environment = registry.make(played.env)
+    told = environment.description
+    played.limit = told.max_episode_steps
+    played.observation, played.action = told.obs_space["type"], told.action_space["type"]
+    played.rebuilt = bool(getattr(environment, "rebuilds", False))
+    first = _episode(played, environment, SEEDS[0], steps, looked_at=True)
+    played.digest = first
+    _episode(played, environment, SEEDS[1], steps)
+    played.reused = _episode(played, environment, SEEDS[0], steps) == first
+    _nonsense(played, environment)
+    environment.close()
+    again = registry.make(played.env)
+    played.fresh = _episode(played, again, SEEDS[0], steps) == first
+    if isinstance(again, GymnasiumEnvironment):
+        played.microseconds = round(_bare_step(again, steps) * 1e6, 1)
+    again.close()
+
+
+def _episode(
+    played: Played, environment: Environment, seed: int, steps: int, *, looked_at: bool = False
+) -> str:
+    """The digest of an episode of keyed uniform random actions; with `looked_at` everything in it is checked too."""
+    told = environment.description
+    rng = np.random.default_rng(seed)
+    digest = hashlib.sha256()
+    recorder = Renderer("arrays", told.obs_storage)
+    obs = environment.reset(Case(seed=seed))
+    _update(digest, obs)
+    n, ended = 0, "going on"
+    success: dict[str, None] = {}
+    while n < steps and ended == "going on":
+        if looked_at:
+            _look(played, told.obs_space, obs, n)
+        action = environment.action_codec.sample(rng)
+        step = environment.step(action)
+        n += 1
+        ended = "terminated" if step.terminated else "truncated" if step.truncated else ended
+        _update(digest, tuple(step))
+        if looked_at:
+            recorder.append(obs, action, step.reward, step.terminated, step.truncated, step.info)
+            success |= dict.fromkeys(key for key in step.info if "success" in key)
+            if not np.isfinite(step.reward):
+                played.faults.append(f"step {n}: the reward is {step.reward}")
+            if seed in _numbers(step.info) or any("seed" in key for key in step.info):
+                played.faults.append(f"step {n}: info names the seed")
+            if ended == "truncated" and n > told.max_episode_steps:
+                played.faults.append(f"its limit of {told.max_episode_steps} steps is not kept")
+        obs = step.obs
+    if looked_at:
+        _look(played, told.obs_space, obs, n)
+        played.steps, played.ended, played.success = n, ended, list(success)
+        if n >= told.max_episode_steps and ended == "going on":
+            played.faults.append(f"its limit of {told.max_episode_steps} steps is not kept")
+        files = decode(recorder.finish()).files
+        played.step_bytes = round(sum(map(len, files.values())) / n)
+    return digest.hexdigest()[:16]
+
+
+def _look(played: Played, schema: Any, obs: Any, n: int) -> None:
+    if len(played.faults) < 3:
+        if fault := spaces.outside(obs, schema):
+            played.faults.append(f"step {n}: the observation is outside its space: {fault}")
+        if {float(each) for each in SEEDS} & _numbers(obs):
+            played.faults.append(f"step {n}: the observation names the seed")
+
+
+def _nonsense(played: Played, environment: Environment) -> None:
+    environment.reset(Case(seed=SEEDS[0]))
+    for raw in _NONSENSE:
+        action, invalid = environment.action_codec.repair(raw)
+        if not invalid:
+            continue
+        step = environment.step(action)
+        if step.terminated or step.truncated:
+            environment.reset(Case(seed=SEEDS[0]))
+
+
+def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
+    """Seconds a step of the environment alone, without the adapter; resets are not counted."""
+    rng = np.random.default_rng(0)
+    bare, n, spent = environment.bare, 0, 0.0
+    bare.reset(seed=0)
+    most = min(steps, _TIMED_STEPS)
+    while n < most:
+        action = environment.action_codec.sample(rng)
+        began = time.perf_counter()
+        _, _, terminated, truncated, _ = bare.step(action)
+        spent += time.perf_counter() - began
+        n += 1
+        if terminated or truncated or n % environment.description.max_episode_steps == 0:
+            bare.reset(seed=n)
+    return spent / n
+
+
+def _update(digest: Any, value: Any) -> None:
+    """Everything that tells one value from another, types and signs of zero included."""
+    if isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(value.tobytes())
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            digest.update(str(key).encode())
+            _update(digest, item)
+    elif isinstance(value, list | tuple):
+        digest.update(f"{len(value)}".encode())
+        for item in value:
+            _update(digest, item)
+    else:
+        digest.update(
+            f"{type(value).__name__}:{value.hex() if isinstance(value, float) else value!r}".encode()
+        )
+
+
+def _numbers(value: Any) -> set[float]:
+    """The numbers in a small value; of a large array none, where a seed would be one of thousands."""
+    if isinstance(value, np.ndarray):
+        return set(np.ravel(value).astype(float).tolist()) if value.size <= 4096 else set()
+    if isinstance(value, dict):
+        return set().union(*map(_numbers, value.values()))
+    if isinstance(value, list | tuple):
+        return set().union(*map(_numbers, value))
+    return {float(value)} if isinstance(value, int | float) and abs(value) < 2**53 else set()
+
+
+def play_all(env_ids: list[str], steps: int) -> Iterator[Played]:
+    """Each in a process forked for it."""
+    for env_id in env_ids:
+        registry.load(env_id)
+        yield _in_child(env_id, steps)
+
+
+def _in_child(env_id: str, steps: int) -> Played:
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os.close(reading)
+            with os.fdopen(writing, "wb") as out:
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, 1)
+                os.dup2(null, 2)
+                out.write(msgspec.json.encode(play(env_id, steps)))
+        finally:
+            os._exit(0)
+    os.close(writing)
+    data, deadline = b"", time.monotonic() + TIMEOUT_S
+    with os.fdopen(reading, "rb") as answer:
+        while select.select([answer], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            part = os.read(answer.fileno(), 1 << 16)
+            if not part:
+                break
+            data += part
+        else:
+            os.kill(pid, signal.SIGKILL)
+            data = b""
+    status = os.waitpid(pid, 0)[1]
+    if data:
+        return msgspec.json.decode(data, type=Played)
+    why = (
+        f"it was not done within {TIMEOUT_S:.0f} s"
+        if time.monotonic() >= deadline
+        else f"its process ended with status {status}"
+    )
+    return Played(env=env_id, faults=[why])
+
+
+def main() -> None:
+    """The program; the definitions of environments that do not ship come on standard input, as JSON."""
+    registry.define(msgspec.json.decode(sys.stdin.buffer.read() or b"[]", type=list[Entry]))
+    for played in play_all(sys.argv[2:], int(sys.argv[1])):
+        sys.stdout.buffer.write(msgspec.json.encode(played) + b"\n")
+        sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    main()
