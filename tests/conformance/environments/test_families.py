@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from evopolicy_common import catalogue
 from evopolicy_worker import check_env, cli
-from evopolicy_worker.environments import Environment, conformance
+from evopolicy_worker.environments import Environment, conformance, make
 from evopolicy_worker.environments.tasks import template
 
 Warm = Callable[[str], Environment]
@@ -34,6 +34,10 @@ SAMPLE = (
     "gymnasium/AdroitHandDoor-v1",
 )
 FAMILIES = {"classic_control", "toy_text", "box2d", "mujoco", "minigrid", "babyai", "highway", "robotics"}
+
+
+def test_every_environment_has_the_digest_of_its_definition() -> None:
+    assert catalogue.digests().keys() == catalogue.entries().keys()
 
 
 def test_every_family_has_a_suite_and_is_sampled() -> None:
@@ -81,6 +85,17 @@ def test_documentation_is_told_in_words() -> None:
 
 def test_one_environment_under_two_ids_has_the_text_that_is_written_for_it(warm: Warm) -> None:
     assert warm("gymnasium/Acrobot-v1").description.task_text == warm("gym/acrobot").description.task_text
+
+
+@pytest.mark.parametrize("env_id", ["gymnasium/AntMaze_UMaze-v3", "gymnasium/PointMaze_UMaze-v3"])
+def test_a_maze_leaves_no_file_that_another_process_could_meet(
+    env_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "ant_maze.xml").touch()
+    make(env_id).close()
+    assert [each.name for each in tmp_path.iterdir()] == ["ant_maze.xml"]
+    assert not (tmp_path / "ant_maze.xml").read_bytes()
 
 
 BROKEN = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
@@ -17,6 +18,17 @@ class RoboticsFamily(MujocoFamily):
     distributions = ("gymnasium-robotics", "mujoco")
     modules = ("gymnasium", "mujoco", "gymnasium_robotics")
     components = {}
+
+    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+        """As others. A maze's model is written to a file of a fixed name beside Python's temporary folders, and read again: with a
+        folder of its own no other process comes between."""
+        usual = tempfile.tempdir
+        with tempfile.TemporaryDirectory() as own:
+            tempfile.tempdir = own
+            try:
+                return super().make(entry, render=render)
+            finally:
+                tempfile.tempdir = usual
 
     def rebuilds(self, entry: Entry) -> bool:
         # Fetch and the Shadow Hand have been seen to repeat.
