@@ -35,7 +35,7 @@ def test_an_auditor_gets_the_recorded_actions_and_no_policy() -> None:
     leases = fleet.rig.poll(fleet.sessions["w2"], 4)
     (job,) = [lease.job for lease in leases if "train/audit" in lease.job.job_id]
     assert job.bundle is None
-    assert job.record == "full"
+    assert (job.record, job.render) == ("full", False)  # compared number by number, and no agent reads it
     assert job.episodes[0].replay is not None
     assert job.episodes[0].case.seed == 0
 
