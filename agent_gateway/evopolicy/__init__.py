@@ -1,4 +1,4 @@
-"""evopolicy for notebooks and scripts: play a policy, play whole runs, read finished runs.
+"""evopolicy for notebooks and scripts: evaluate a policy, play whole runs, read finished runs.
 
 ```python
 import evopolicy as evp
@@ -10,8 +10,8 @@ with evp.Cluster.local(slots=2) as cluster:
 frames = evp.load_runs("runs/").episodes()
 ```
 
-Each call has an async twin, which ends in `_async`. Names that begin with an underscore, and the packages `evopolicy_*`, are
-private. Errors are `EvopolicyError`s; wrong arguments are `ConfigError`s.
+Calls that play have an async twin with the suffix `_async`. Names that start with an underscore and the packages
+`evopolicy_*` are private. Errors derive from `EvopolicyError`; wrong arguments raise `ConfigError`.
 """
 
 from __future__ import annotations

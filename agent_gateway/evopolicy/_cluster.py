@@ -1,4 +1,4 @@
-"""Clusters, and what is played on them: policies on train cases, and whole runs."""
+"""Clusters, which play policies on train cases and whole runs."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ Limits = Mapping[str, float]
 
 
 class Cluster:
-    """A coordinator with workers: this machine's own for a while (`Cluster.local`), or one that runs (`Cluster.connect`).
+    """A coordinator with workers: temporary on this machine (`Cluster.local`) or already running (`Cluster.connect`).
 
-    A context manager, `with` or `async with`; in notebooks also `open()` and `close()`. Calls may be made from several threads or tasks at once.
+    A context manager for `with` and `async with`; notebooks can use `open()` and `close()`. Several threads or tasks
+    may call it at once. A cluster opens once: a second `open` raises ConfigError, and so does a call before it is open.
     """
 
     def __init__(self, where: operator.Cluster) -> None:
@@ -69,11 +70,12 @@ class Cluster:
         fresh: bool = False,
         data: str | os.PathLike[str] | None = None,
     ) -> Cluster:
-        """A cluster of this machine, inside the `with`.
+        """Describes a cluster on this machine, which runs inside the `with`; starts nothing before that.
 
-        `slots`: episodes at once, of each environment that is played. `state`: the folder of what it keeps; default: the one
-        of all local commands, so that the same ids are the same cases. `fresh`: a state that is thrown away. `data`: folder of
-        split files. Nothing is started before the `with`.
+        `slots`: episodes played at once for each environment, at least 1. `state`: folder of the cluster's stored
+        state, by default the folder that all local commands share, so that equal ids name equal cases. `fresh`: use a
+        temporary state, deleted at the end. `data`: folder of split files. Raises ConfigError for `slots` below 1, and
+        for `fresh` together with `state`.
         """
         if slots < 1:
             raise ConfigError(f"slots is {slots}: at least 1")
@@ -84,22 +86,23 @@ class Cluster:
 
     @classmethod
     def connect(cls, *endpoints: str, credentials: str | os.PathLike[str] | None = None) -> Cluster:
-        """A running cluster, such as `Cluster.connect("tls/host:7447", credentials="operator-me")`.
+        """Describes a running cluster, such as `Cluster.connect("tls/host:7447", credentials="operator-me")`.
 
-        `credentials`: the folder of `evopolicy-coordinator certs issue operator`. Without arguments: this machine's own.
+        `credentials`: the folder written by `evopolicy-coordinator certs issue operator`. Without arguments it is the
+        cluster of this machine.
         """
         return cls(
             operator.Cluster(connect=endpoints, file=None if credentials is None else Path(credentials))
         )
 
     def open(self) -> Self:
-        """Starts it, for notebooks; `close` ends it, as the end of the process does."""
+        """Starts or connects to the cluster, for notebooks. `close` ends it, and so does the end of the process."""
         call(self._open())
         atexit.register(self.close)
         return self
 
     def close(self) -> None:
-        """Ends what was started. A second close does nothing."""
+        """Ends the processes and connections of `open`. A second call does nothing."""
         atexit.unregister(self.close)
         call(self._close())
 
@@ -126,12 +129,14 @@ class Cluster:
         limits: Limits | None = None,
         progress: bool = True,
     ) -> Evaluation:
-        """Plays the policy in a folder on train cases, each policy in a sandbox; outside any run, without a budget.
+        """Plays the policy in a folder on train cases, in a sandbox, outside any run and without a budget.
 
-        `policy`: a folder with a `policy.py`. `env`: a suite id, such as `gym/acrobot`. `cases`: train ids; the same ids are the
-        same cases in each call on the same state. `limits`: the policy's, such as `{"act_wall_s": 5}`. `progress`: a bar on a
-        terminal, and in a notebook where ipywidgets is installed. ConfigError for wrong arguments, and for what this machine
-        lacks, with the remedy.
+        `policy`: a folder with a `policy.py`. `env`: an environment's id, such as `gym/acrobot`. `cases`: train ids;
+        equal ids name equal cases in every call on the same state. `tier`: sandbox tier, `bwrap`, `landlock` or `none`.
+        `limits`: of the policy, such as `{"act_wall_s": 5}`. `progress`: show a progress bar on a terminal, or in a
+        notebook with ipywidgets.
+
+        Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine.
         """
         return call(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
 
@@ -145,24 +150,24 @@ class Cluster:
         limits: Limits | None = None,
         progress: bool = True,
     ) -> Evaluation:
-        """As `evaluate`."""
+        """Async twin of `evaluate`."""
         return await awaited(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
 
     def run(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
-        """As `evopolicy.run`, on this cluster."""
+        """Plays one run on this cluster; arguments as for `evopolicy.run` without `slots`."""
         return call(self._run(env, agent, **options))
 
     async def run_async(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
-        """As `run`."""
+        """Async twin of `run`."""
         return await awaited(self._run(env, agent, **options))
 
-    # On the one loop.
+    # The methods below run on the package's event loop.
 
     async def _open(self) -> None:
         if self._held is not None:
             raise ConfigError("this cluster is open already, or was closed: make another")
         opened: asyncio.Future[operator.Reached] = loop().create_future()
-        # One task enters and leaves everything, whichever tasks or threads call.
+        # One task enters and exits all context managers, because callers may use different tasks or threads.
         self._held = asyncio.create_task(self._hold(opened))
         try:
             both: list[asyncio.Future[Any]] = [opened, self._held]
@@ -186,7 +191,7 @@ class Cluster:
             await asyncio.wait([self._held])
 
     async def _on(self, env: str, tier: Tier, work: Callable[[operator.Reached], Awaitable[T]]) -> T:
-        """What `work` gives; the local cluster's error when that fails first."""
+        """Returns the result of `work`; raises the local cluster's error when the cluster fails first."""
         reached = self._reached
         if reached is None:
             raise ConfigError("this cluster is not open: use it inside `with Cluster.local() as cluster:`")
@@ -319,7 +324,7 @@ def evaluate(
     limits: Limits | None = None,
     progress: bool = True,
 ) -> Evaluation:
-    """`Cluster.evaluate` on a local cluster of its own. For several calls, one `Cluster.local` saves starting it each time."""
+    """`Cluster.evaluate` on a temporary local cluster. For several calls, one `Cluster.local` saves repeated starts."""
     wanted = (policy, env, tuple(cases), slots, tier, limits or {}, progress)
     return call(_evaluated(*wanted))
 
@@ -334,7 +339,7 @@ async def evaluate_async(
     limits: Limits | None = None,
     progress: bool = True,
 ) -> Evaluation:
-    """As `evaluate`."""
+    """Async twin of `evaluate`."""
     return await awaited(_evaluated(policy, env, tuple(cases), slots, tier, limits or {}, progress))
 
 
@@ -347,15 +352,17 @@ def run(
     slots: int = 2,
     **options: Any,
 ) -> Run:
-    """Plays one whole run on a local cluster of its own, to its score.
+    """Plays one whole run, up to its score, on a temporary local cluster.
 
-    `agent`: a function of a `Workspace`, which runs in a process of its own in the agent's jail, or a text as `--agent` of
-    `evopolicy run` takes it. In the jail a function can import the standard library and numpy; its own module goes with it.
-    It returns what JSON can say, which `Run.value` reads back. `budget`: train episodes; default: the suite's. `runs`: the
-    folder of run directories. Further `options`: `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`,
-    `replays`, `tier`, `agent_wall_s`, `overwrite`, `progress`, as the options of `evopolicy run` of these names.
+    `agent`: a function of one `Workspace`, or a text as for `--agent` of `evopolicy run`. A function runs in its own
+    process in the agent's jail, where it can import the standard library and numpy; its own module is sent with it. It
+    returns a JSON-serialisable value, which `Run.value` reads back. `budget`: train episodes, by default the suite's.
+    `runs`: the folder of run directories. Further `options`, as the options of `evopolicy run` with these names:
+    `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`, `replays`, `tier`, `agent_wall_s`
+    (seconds), `overwrite`, `progress`.
 
-    ConfigError for wrong arguments, and for what this machine lacks, with the remedy. Ctrl-C cancels the run; its folder says so.
+    Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
+    cancels the run, and its folder records that.
     """
     return call(_ran(slots, env, agent, budget=budget, runs=runs, **options))
 
@@ -369,7 +376,7 @@ async def run_async(
     slots: int = 2,
     **options: Any,
 ) -> Run:
-    """As `run`."""
+    """Async twin of `run`."""
     return await awaited(_ran(slots, env, agent, budget=budget, runs=runs, **options))
 
 
@@ -414,10 +421,10 @@ def _name_of(function: AgentFunction) -> str:
 
 
 def _pickled(function: AgentFunction, file: Path) -> str:
-    """Writes the function for the jail; the agent that calls it there, as `--agent` takes it."""
+    """Writes the function to `file` for the jail. Returns the agent that calls it there, in the form of `--agent`."""
     import cloudpickle
 
-    # Importable here, and not in the jail: such a module goes with its function.
+    # The jail cannot import modules from outside site-packages, so the function's module is pickled with it.
     module = sys.modules.get(getattr(function, "__module__", None) or "")
     by_value = module is not None and module.__name__ != "__main__" and not _is_installed(module)
     if by_value:
@@ -435,6 +442,6 @@ def _pickled(function: AgentFunction, file: Path) -> str:
 
 
 def _is_installed(module: Any) -> bool:
-    """Part of Python, or of a package in site-packages."""
+    """Whether the module is part of Python or of a package in site-packages."""
     place = getattr(module, "__file__", None)
     return place is None or any(part in ("site-packages", "dist-packages") for part in Path(place).parts)

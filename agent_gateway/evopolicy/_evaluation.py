@@ -1,4 +1,4 @@
-"""What playing a policy on cases came to."""
+"""The result of playing a policy on cases."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ from evopolicy_common.records.trajectory import decode
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One episode, with its trajectory."""
+    """One episode with its trajectory."""
 
     case: int
     """Train id."""
     episode_return: float | None
-    """Sum of rewards; None where nothing was played, since the first case showed that there is no Policy."""
+    """Sum of rewards; None when nothing was played because the first case showed that the code yields no Policy."""
     length: int
     """Steps."""
     terminated: bool
     truncated: bool
     failure: str | None
-    """How the policy failed; uniform random actions played from that step on."""
+    """Category, step and message of the policy's failure; random actions played from that step on. None: no failure."""
     observations: Any
-    """What the policy received at each step: arrays of shape (length, …), in dicts and tuples as the space has them."""
+    """Observation before each step, in dicts and tuples as in the space. Each leaf is an array of shape (length, …) in
+    the recorded dtype, or a list of strings. None when nothing was played.
+    """
     actions: Any
-    """What it returned: an array of shape (length, …), or a list where actions differ in form."""
+    """The policy's returned actions: an array of shape (length, …), or a list when actions differ in form."""
     rewards: NDArray[np.float64]
-    """Shape (length,)."""
+    """float64, shape (length,)."""
     infos: list[dict[str, Any]]
     stdout: str
     stderr: str
@@ -54,7 +56,7 @@ class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evaluation(Sequence[Episode]):
-    """Episodes in the order of the cases."""
+    """A sequence of episodes in the order of the cases."""
 
     def __init__(self, env: str, episodes: Sequence[Episode]) -> None:
         self.env = env
@@ -71,19 +73,19 @@ class Evaluation(Sequence[Episode]):
 
     @property
     def returns(self) -> NDArray[np.float64]:
-        """Shape (episodes,); NaN where nothing was played."""
+        """float64, shape (episodes,); NaN for episodes that were not played."""
         return np.array(
             [math.nan if one.episode_return is None else one.episode_return for one in self.episodes]
         )
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """Steps, shape (episodes,)."""
+        """Steps, int64, shape (episodes,)."""
         return np.array([one.length for one in self.episodes], dtype=np.int64)
 
     @property
     def mean_return(self) -> float | None:
-        """Over the cases in which the policy did not fail; None where there is none."""
+        """Mean over the cases in which the policy did not fail; None when there are none."""
         known = [
             one.episode_return
             for one in self.episodes
@@ -99,11 +101,11 @@ class Evaluation(Sequence[Episode]):
         return Records(EvaluationRecord, made)
 
     def to_pandas(self) -> Any:
-        """`records` as a pandas.DataFrame."""
+        """`records` as a pandas.DataFrame. Raises ModuleNotFoundError when pandas is not installed."""
         return self.records.to_pandas()
 
     def to_polars(self) -> Any:
-        """`records` as a polars.DataFrame."""
+        """`records` as a polars.DataFrame. Raises ModuleNotFoundError when polars is not installed."""
         return self.records.to_polars()
 
     def __repr__(self) -> str:
@@ -118,7 +120,7 @@ class Evaluation(Sequence[Episode]):
 
 
 def episode_of(case: int, outcome: EpisodeOutcome, packed: bytes | None) -> Episode:
-    """`packed`: the trajectory's bytes."""
+    """Combines an outcome with its trajectory. `packed`: the trajectory's bytes, None when there is none."""
     failed = outcome.failure
     played = None if packed is None else decode(packed)
     failure = None

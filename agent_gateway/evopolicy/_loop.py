@@ -1,4 +1,4 @@
-"""One event loop in a thread of its own: synchronous calls work in scripts, and in notebooks, whose main thread has a loop."""
+"""One event loop in its own thread: synchronous calls work in scripts, and in notebooks, which already run a loop."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ _running: asyncio.AbstractEventLoop | None = None
 
 
 def loop() -> asyncio.AbstractEventLoop:
-    """The loop, which runs from now on.
-
-    The kernel ends child processes with the thread that started them, so this thread lasts as long as the process.
-    """
+    """Returns the loop; the first call starts it."""
     global _running
     with _lock:
         if _running is None:
             setup_notices()
             _running = asyncio.new_event_loop()
+            # The kernel ends child processes with the thread that started them: this one lasts as long as the process.
             threading.Thread(target=_running.run_forever, name="evopolicy", daemon=True).start()
         return _running
 
 
 def call(work: Coroutine[Any, Any, T]) -> T:
-    """The result of `work`. Ctrl-C cancels it, waits until it has put its things in order, and is raised then."""
+    """Returns the result of `work`. Ctrl-C cancels `work`, waits for its cleanup, and is raised as KeyboardInterrupt.
+
+    Raises RuntimeError when called on the loop's own thread.
+    """
     ended = threading.Event()
     where = loop()
 
@@ -53,7 +54,7 @@ def call(work: Coroutine[Any, Any, T]) -> T:
 
 
 async def awaited(work: Coroutine[Any, Any, T]) -> T:
-    """The result of `work`, which runs on the one loop, from any other; cancelled, it is cancelled and waited for."""
+    """Returns the result of `work` to a task of another loop. Cancellation cancels `work` and waits for its cleanup."""
     ended = threading.Event()
 
     async def told() -> T:

@@ -1,4 +1,4 @@
-"""Typed records in a row, as a table where somebody wants one."""
+"""Sequences of typed records that convert to tables."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import msgspec
 R = TypeVar("R", bound=msgspec.Struct)
 
 _SHOWN = 20
-"""Rows that a notebook shows."""
+"""Rows of a table in a notebook."""
 
 
 class Records(Sequence[R], Generic[R]):
-    """Records of one kind, in order; `to_pandas` and `to_polars` make data frames where these are installed."""
+    """Records of one kind, in order; `to_pandas` and `to_polars` make data frames when these packages are installed."""
 
     def __init__(self, kind: type[R], records: Sequence[R]) -> None:
         self._kind = kind
@@ -43,21 +43,21 @@ class Records(Sequence[R], Generic[R]):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The records' fields."""
+        """Names of the records' fields."""
         return self._kind.__struct_fields__
 
     def to_dicts(self) -> list[dict[str, Any]]:
-        """One dict a record."""
+        """One dict per record."""
         return [{name: getattr(one, name) for name in self.columns} for one in self]
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame. ModuleNotFoundError where pandas is not installed."""
+        """Returns a pandas.DataFrame. Raises ModuleNotFoundError when pandas is not installed."""
         import pandas
 
         return pandas.DataFrame(self.to_dicts(), columns=list(self.columns))
 
     def to_polars(self) -> Any:
-        """A polars.DataFrame. ModuleNotFoundError where polars is not installed."""
+        """Returns a polars.DataFrame. Raises ModuleNotFoundError when polars is not installed."""
         import polars
 
         return polars.DataFrame({name: [getattr(one, name) for one in self] for name in self.columns})
@@ -67,7 +67,7 @@ class Records(Sequence[R], Generic[R]):
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """An HTML table of the first rows."""
+    """Returns an HTML table of the first 20 rows."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>"
@@ -82,7 +82,7 @@ def _text(value: Any) -> str:
 
 
 def bars(values: Sequence[float | None], title: str) -> str:
-    """Values as an SVG of bars from zero, the first at the left; gaps for None."""
+    """Returns an SVG bar chart from zero, first value at the left; None leaves a gap. Empty text without values."""
     known = [value for value in values if value is not None]
     if not known:
         return ""

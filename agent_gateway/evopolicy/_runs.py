@@ -25,32 +25,32 @@ _MAX_SHOWN_VIDEO_BYTES = 4 << 20
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """A run in a row."""
+    """One row per run."""
 
     run: str
-    """Its folder."""
+    """Path of its folder."""
     env: str
     entry: str
     model: str
     repeat: int
     status: str
-    """`completed`, `no_ok_submit`, `error`, `cancelled`."""
+    """`completed`, `no_ok_submit`, `error` or `cancelled`."""
     score: float | None
-    """Held-out mean return of the selected checkpoint."""
+    """Held-out mean return of the selected checkpoint; None without an ok submit."""
     random_score: float | None
-    """Of uniform random actions on the same cases."""
+    """Mean return of uniform random actions on the same cases; None when they were not played."""
     best_submit: int | None
     budget: int
     budget_used: int
-    """Train episodes."""
+    """Used train episodes."""
     closed_reason: str
     wall_s: float
     in_question: bool
-    """Audits found results of it disputed, or a forger among those who played it."""
+    """Whether audits disputed one of its results, or found a forger among the workers that played it."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A submit in a row."""
+    """One row per submit."""
 
     run: str
     env: str
@@ -63,21 +63,21 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Population standard deviation."""
     remaining_budget: int
     validation: float | None
-    """Mean return on the hidden validation cases, known once the run is finished."""
+    """Mean return on the hidden validation cases; None when there is none."""
     selected: bool
 
 
 class EpisodeRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """An episode in a row: of a submit (`train`), or of the score (`heldout`)."""
+    """One row per episode, of a submit (`train`) or of the score (`heldout`)."""
 
     run: str
     env: str
     entry: str
     split: str
     submit: int | None
-    """Of a held-out episode, the selected one."""
+    """Index of the submit; for a held-out episode, of the selected submit."""
     episode: int
-    """Counted in the submit, or among the held-out episodes."""
+    """Index within the submit, or within the held-out episodes, from 0."""
     case: int | None
     """Train id; None for held-out episodes, whose cases have no ids."""
     episode_return: float
@@ -97,7 +97,7 @@ class Run:
 
     @property
     def summary(self) -> RunSummary:
-        """All that fits a row."""
+        """The run as one row."""
         told, outcome = self._record, self._record.outcome
         return RunSummary(
             run=str(self.folder),
@@ -118,19 +118,20 @@ class Run:
 
     @property
     def score(self) -> float | None:
-        """Held-out mean return of the selected checkpoint; None where no submit was ok."""
+        """Held-out mean return of the selected checkpoint; None without an ok submit."""
         return self._record.outcome.score
 
     @property
     def status(self) -> str:
-        """`completed`, `no_ok_submit`, `error`, `cancelled`."""
+        """`completed`, `no_ok_submit`, `error` or `cancelled`."""
         return self._record.outcome.status
 
     @property
     def value(self) -> Any:
-        """What an agent function returned, read as JSON; None for nothing, or other agents.
+        """The agent function's return value, decoded from JSON; None for a missing file, such as with other agents.
 
-        ConfigError when the file is none that the function's program writes: an agent can write anything there.
+        An agent can write anything to this file. Raises ConfigError when it is not a regular file, not JSON, or over 1
+        MiB.
         """
         data = _bounded(self.folder / "workspace" / RESULT)
         if data is None:
@@ -142,7 +143,7 @@ class Run:
 
     @property
     def submits(self) -> Records[SubmitRecord]:
-        """In order."""
+        """In the order of their indices."""
         outcome = self._record.outcome
         validated = outcome.val_scores or {}
         return Records(
@@ -167,7 +168,7 @@ class Run:
 
     @property
     def episodes(self) -> Records[EpisodeRecord]:
-        """Train episodes of submits that were ok, then the held-out ones."""
+        """Train episodes of ok submits, then the held-out episodes."""
         known = {"run": str(self.folder), "env": self._record.env, "entry": self._record.agent.entry}
         found = []
         for one in self._summaries:
@@ -204,7 +205,7 @@ class Run:
 
     @property
     def replays(self) -> list[Path]:
-        """Videos of held-out episodes, where the run made any (`replays="first"` or `"all"`)."""
+        """Paths of the existing videos of held-out episodes (`replays="first"` or `"all"`)."""
         return [self.folder / one.path for one in self._record.replays if (self.folder / one.path).is_file()]
 
     def __repr__(self) -> str:
@@ -226,7 +227,7 @@ class Run:
 
 
 class Runs(Sequence[Run]):
-    """Finished runs in order of their folders."""
+    """Finished runs in the order of their folders."""
 
     def __init__(self, runs: Sequence[Run], left_out: Sequence[tuple[Path, str]]) -> None:
         self._runs = tuple(runs)
@@ -243,15 +244,15 @@ class Runs(Sequence[Run]):
         return iter(self._runs)
 
     def summaries(self) -> Records[RunSummary]:
-        """A row a run."""
+        """One row per run."""
         return Records(RunSummary, [run.summary for run in self._runs])
 
     def submits(self) -> Records[SubmitRecord]:
-        """A row a submit."""
+        """One row per submit."""
         return Records(SubmitRecord, [one for run in self._runs for one in run.submits])
 
     def episodes(self) -> Records[EpisodeRecord]:
-        """A row an episode."""
+        """One row per episode."""
         return Records(EpisodeRecord, [one for run in self._runs for one in run.episodes])
 
     def __repr__(self) -> str:
@@ -262,9 +263,10 @@ class Runs(Sequence[Run]):
 
 
 def load_runs(*paths: str | os.PathLike[str]) -> Runs:
-    """All runs of evopolicy at or below these folders. ConfigError where there is none at all.
+    """Reads all runs of evopolicy in or below these folders; unreadable ones go to `Runs.left_out`.
 
-    Runs of the published software are left out; `evopolicy report` reads them.
+    Raises ConfigError without arguments, and when a folder holds no run. Runs of the published software are not read;
+    `evopolicy report` reads them.
     """
     if not paths:
         raise ConfigError("load_runs needs a folder, such as runs/")
@@ -281,7 +283,7 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in `folder`. ProtocolError or OSError when there is none that is finished."""
+    """Reads the run in `folder`. Raises ProtocolError or OSError when it holds no finished run."""
     record = decode_run_record((folder / "run.json").read_bytes())
     feedback = folder / "workspace" / "feedback"
     return Run(folder, record, list(_summaries(feedback, sorted(submit_indices(feedback)))))
@@ -297,7 +299,7 @@ def _summaries(feedback: Path, indices: Iterable[int]) -> Iterator[Summary]:
 
 
 def _bounded(path: Path) -> bytes | None:
-    """The bytes of a regular file that an agent may have written; None where there is none. ConfigError for other things."""
+    """Reads a regular file that an agent may have written; None when missing. Raises ConfigError for anything else."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
