@@ -1,7 +1,7 @@
-"""The gateway's side of the conversation with the coordinator: typed questions about one run.
+"""The gateway's client of the coordinator: typed requests about one run.
 
-Each is asked until it is answered, across restarts of the coordinator, and safe to ask again. Whoever calls decides
-what a refusal means.
+Every request is repeated until it is answered, also across restarts of the coordinator, and is safe to repeat. The
+caller decides how to handle a refusal.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from evopolicy_gateway.http.listener import AgentPlace
 from evopolicy_gateway.submits.journal import Requested
 
 RESULTS_WAIT_S = 10.0
-"""How long the coordinator may hold a question for results."""
+"""How long the coordinator may hold a results request, seconds."""
 HELD_WAIT_S = 1.0
-"""The same while nothing of the submit runs: what it waits is given back to the agent's clock, which must not run out first."""
+"""The same while no episode of the submit runs, seconds. Short: the wait is given back to the agent's clock in time."""
 RENEWAL_S = 5.0
-"""How often a permit is asked for again while the agent may be alive: an operator's word may have ended it by mistake."""
+"""Seconds between permit requests while the agent may be alive: an operator may have ended the permit by mistake."""
 FIRST_PERMIT_WAIT_S = 3.0
-"""A permit that takes longer is shown as waited for."""
+"""Seconds after which the wait for a permit is shown."""
 STATE_TIMEOUT_S = 1.0
 
 
@@ -64,7 +64,7 @@ Wanted = TypeVar("Wanted")
 
 
 class CoordinatorClient:
-    """One run, as its gateway talks about it. RefusedError where the coordinator says no, and not just not now."""
+    """Client for one run. Its methods raise RefusedError for refusals other than temporary ones (`NOT_NOW`)."""
 
     def __init__(self, link: Link, run: str) -> None:
         self._run = run
@@ -74,14 +74,14 @@ class CoordinatorClient:
         )
 
     async def open(self) -> RunOpened:
-        """All that is fixed for the run, and its state."""
+        """Opens the run; returns everything that is fixed for it, and its state."""
         message = OpenRun(run=self._run, token=self._token, asks_permit=True, reads_rendered=True)
         return await self._ask("open", message, RunOpened)
 
     async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
-        """Returns True once the run's agent may be alive at `place`; `on_wait` is told what that waits for.
+        """Returns True once the run's agent may be alive at `place`; calls `on_wait` with the reason while it waits.
 
-        ConfigError where the coordinator knows no permits.
+        Raises ConfigError when the coordinator's version does not support permits.
         """
         wait_s = FIRST_PERMIT_WAIT_S
         while True:
@@ -108,14 +108,14 @@ class CoordinatorClient:
             wait_s = RESULTS_WAIT_S
 
     async def keep_permit(self, place: AgentPlace) -> None:
-        """Asks for the permit again and again, until cancelled or the run takes no more."""
+        """Renews the permit until cancelled, or until the coordinator accepts no more for this run."""
         with contextlib.suppress(RefusedError):
             while True:
                 await asyncio.sleep(RENEWAL_S)
                 await self.permit(place, _permit_lost)
 
     async def state(self) -> RunState | None:
-        """The run's state now; None when the coordinator does not answer at once."""
+        """Returns the run's current state; None when the coordinator does not answer within a second."""
         question = StateRequest(run=self._run, token=self._token)
         try:
             async with asyncio.timeout(STATE_TIMEOUT_S):
@@ -124,11 +124,11 @@ class CoordinatorClient:
             return None
 
     async def upload(self, digest: str, data: bytes) -> None:
-        """Brings a bundle to the coordinator."""
+        """Uploads a bundle to the coordinator."""
         await self._requests.upload(self._run, self._token, digest, data)
 
     async def submit(self, request: Requested) -> SubmitAccepted:
-        """Asks for an evaluation; the same request gives the same answer however often it is sent."""
+        """Requests an evaluation. The same request gets the same answer however often it is sent."""
         message = Submit(
             run=self._run,
             token=self._token,
@@ -140,7 +140,7 @@ class CoordinatorClient:
         return await self._ask("submit", message, SubmitAccepted)
 
     async def results(self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S) -> ResultsPage:
-        """What happened to a submit since `cursor`; comes after `wait_s` seconds at the latest, empty if need be."""
+        """Returns the submit's results since `cursor`, within `wait_s` seconds; the page may be empty."""
         question = ResultsRequest(
             run=self._run,
             token=self._token,
@@ -151,11 +151,11 @@ class CoordinatorClient:
         return await self._ask("results", question, ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
-        """The bytes that `ref` names, checked."""
+        """Returns the bytes that `ref` names, verified."""
         return await self._requests.fetch(self._run, self._token, ref)
 
     async def close(self, reason: str, agent: dict[str, Any]) -> None:
-        """No more submits: to be called when the agent and all its children are gone."""
+        """Closes the run to further submits. Call it only when the agent and all its children are gone."""
         message = CloseRun(run=self._run, token=self._token, reason=reason, agent=agent)
         await self._ask("close", message, RunClosed)
 

@@ -1,11 +1,14 @@
-"""One run's gateway as a process: coordinator client, submit pipeline and HTTP service together, until the run is closed or it is told to stop.
+"""One run's gateway process: coordinator client, submit pipeline and HTTP service.
 
-It holds the run's capability and nothing else of the cluster. Stopped without a word (signal, death, its operator gone) it
-leaves the run open: started again on the same folder it goes on where it was.
-
-Nothing is served, and so no agent started or told of, before the coordinator permits the agent to be alive where it is. The
-run's closing ends the permit, so it comes after the agent's end: the parent says so, or else the operator (`evopolicy finish`).
-Meanwhile the permit is asked for again and again: what was said of an agent that is gone elsewhere may have ended this one's.
+- The gateway serves until the run is closed or the gateway is told to stop.
+- It holds the run's capability and no other credential of the cluster.
+- Ended without an order (signal, crash, end of the parent), it leaves the run open; a restart on the same folder
+  resumes.
+- It serves, and the agent is started or announced, only once the coordinator permits the agent to be alive at its
+  place.
+- Closing the run ends the permit, so it follows the agent's end, which the parent or else the operator (`evopolicy
+  finish`) reports.
+- The gateway keeps renewing the permit: a report that an agent elsewhere is gone may have ended this one's.
 """
 
 from __future__ import annotations
@@ -40,14 +43,14 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Close(msgspec.Struct, frozen=True, kw_only=True):
-    """The agent and all its children are gone: tell the coordinator so."""
+    """The agent and all its children are gone; the gateway reports that to the coordinator."""
 
     reason: str
     agent: dict[str, Any] = {}
 
 
 class Gateway:
-    """Runs once. `tell` may be called from the same event loop at any time."""
+    """Runs once. `tell` may be called at any time on the same event loop."""
 
     def __init__(
         self,
@@ -61,10 +64,10 @@ class Gateway:
         alone: bool,
         place: AgentPlace | None = None,
     ) -> None:
-        """`connect` and `credentials_file` (its folder) replace those of the run; its capability stays.
+        """`connect` and `credentials_file` (its folder) replace those of the run; the run's capability stays.
 
-        `on_wait` is told what it waits for beside the agent, empty for nothing any more. `alone`: nobody else watches the
-        agent. `place`: where the agent is, if not where the run's folder says.
+        `on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over.
+        `alone`: no other process watches the agent. `place`: where the agent is, when it differs from the run's folder.
         """
         self._folder = folder
         self._connect = connect
@@ -75,21 +78,21 @@ class Gateway:
         self._alone = alone
         self._place = place
         self._stopped = asyncio.Event()
-        """Told to leave the run open."""
+        """Set to leave the run open."""
         self.permit_s = 0.0
-        """Seconds for which the agent's permit was waited for."""
+        """Seconds spent waiting for the agent's permit."""
         self._told: asyncio.Future[Close | None] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
 
     def tell(self, close: Close | None) -> None:
-        """Ends the gateway: closing the run, or (None) leaving it open, also where its closing waits."""
+        """Ends the gateway: closes the run, or with None leaves it open, even while the closing waits."""
         if close is None:
             self._stopped.set()
         if not self._told.done():
             self._told.set_result(close)
 
     async def run(self) -> bool:
-        """Serves until told to end; whether the run was closed. Raises what makes it impossible to go on."""
+        """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
         found, run = _load(self._folder, self._connect, self._credentials_file)
         sock, address = await bind(self._folder)
         journal = Journal(self._folder.journal)
@@ -136,7 +139,7 @@ class Gateway:
         return self._place or agent_place(self._folder)
 
     async def _permitted(self, session: CoordinatorClient) -> bool:
-        """Whether the agent may be alive, or need not be any more; False when told to leave the run open first."""
+        """True when the permit is granted or the run is to be closed; False when told to leave the run open first."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
         asked = time.monotonic()
@@ -152,7 +155,7 @@ class Gateway:
         return not self._stopped.is_set()
 
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> Close | None:
-        """Passes changes on until told to end."""
+        """Reports changes until `tell`; returns its argument, or a `Close` when the gateway itself decides to end."""
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
@@ -174,7 +177,7 @@ class Gateway:
     async def _close(
         self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: Close
     ) -> bool:
-        # The agent has no more to say, but what it asked for last is still played and written.
+        # The agent is gone, but its last submit is still played and written.
         pipeline.closed = True
         await pipeline.idle()
         if not await self._agent_gone(pipeline):
@@ -185,7 +188,7 @@ class Gateway:
         return True
 
     async def _agent_gone(self, pipeline: SubmitPipeline) -> bool:
-        """True when the agent has ended, as far as anybody can tell; False when told to leave the run open first."""
+        """True once the agent has ended as far as anyone can tell; False when told to leave the run open first."""
         unseen = self._alone or ends_unseen(self._folder)
         while unseen and not (pipeline.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
             self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
@@ -196,7 +199,7 @@ class Gateway:
         return not self._stopped.is_set()
 
     async def _unless_stopped(self, wanted: Any) -> Any:
-        """The result, or None when told to leave the run open first."""
+        """Returns the result, or None when told to leave the run open first."""
         task, stopped = asyncio.ensure_future(wanted), asyncio.ensure_future(self._stopped.wait())
         await asyncio.wait([task, stopped], return_when=asyncio.FIRST_COMPLETED)
         stopped.cancel()

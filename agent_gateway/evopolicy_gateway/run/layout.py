@@ -1,4 +1,4 @@
-"""Where a run's files are: `runs/<entry>/<env with / as _>/<exp-id>/`, and in it what `protocol.md` lists.
+"""Paths of a run's files: `runs/<entry>/<env with / as _>/<exp-id>/`, with the contents listed in `protocol.md`.
 
 While a run is open its folder also holds `.gateway/` (mode 0700): the gateway's credentials, its port and token, the
 journal and the bundles. It lies outside the workspace and is removed when `run.json` is written.
@@ -35,7 +35,7 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def agents_md(self) -> Path:
-        """The rules."""
+        """The rules for the agent."""
         return self.workspace / "AGENTS.md"
 
     @property
@@ -45,7 +45,7 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def feedback(self) -> Path:
-        """What came of its submits, a folder each."""
+        """The results of its submits, one folder each."""
         return self.workspace / "feedback"
 
     @property
@@ -60,21 +60,21 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def harness_log(self) -> Path:
-        """What gateway and agent supervisor say."""
+        """The log of gateway and agent supervisor."""
         return self.root / "logs" / "harness.log"
 
     @property
     def agent_log(self) -> Path:
-        """All that the agent's programs say, and what they were told."""
+        """The prompts to the agent's programs and all their output."""
         return self.root / "logs" / "agent.jsonl"
 
     @property
     def env_log(self) -> Path:
-        """What was played and what came of it, written at the end."""
+        """Played episodes with their results, written at the end."""
         return self.root / "logs" / "env.log"
 
     def artifacts(self) -> Artifacts:
-        """What there is of a finished run, as `run.json` names it."""
+        """The existing files of a finished run, under their names in `run.json`."""
         places = {
             "workspace": self.workspace,
             "feedback": self.feedback,
@@ -93,17 +93,17 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def credentials(self) -> Path:
-        """The gateway's own, with the run's capability."""
+        """The gateway's credentials, with the run's capability."""
         return self.state / "credentials.json"
 
     @property
     def service(self) -> Path:
-        """Port and token of the HTTP service, so that a restarted gateway has the same."""
+        """Port and token of the HTTP service, which a restarted gateway keeps."""
         return self.state / "service.json"
 
     @property
     def listener(self) -> Path:
-        """Where a remote agent is served: `Listener`. Not there for an agent that is started here."""
+        """The address that serves a remote agent: `Listener`. Missing for an agent that is started here."""
         return self.state / "door.json"
 
     @property
@@ -113,42 +113,42 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def finish(self) -> Path:
-        """Made when the operator says that an agent that is not in our hands has ended."""
+        """Created when the operator reports the end of an agent that was not started here."""
         return self.state / "finish"
 
     @property
     def unwatched(self) -> Path:
-        """Made by a gateway that was started by hand: nobody watches the agent, so only the operator knows its end."""
+        """Created by a gateway that was started by hand: only the operator knows the end of its unwatched agent."""
         return self.state / "unwatched"
 
     @property
     def journal(self) -> Path:
-        """What the gateway has begun; see `journal.py`."""
+        """The gateway's record of requests; see `journal.py`."""
         return self.state / "journal.jsonl"
 
     @property
     def blobs(self) -> Path:
-        """Snapshots of `system/` that were submitted."""
+        """Submitted snapshots of `system/`."""
         return self.state / "bundles"
 
     @property
     def opened(self) -> Path:
-        """Which run this is: `OpenedRun`."""
+        """The id of this run: `OpenedRun`."""
         return self.state / "run.json"
 
     @property
     def lock(self) -> Path:
-        """Held by the process that plays the run, or replaces it: beside the folder, which may be removed meanwhile."""
+        """Lock of the process that plays or replaces the run; beside the folder, which may be removed meanwhile."""
         return self.root.with_name(f".{self.root.name}.lock")
 
     @property
     def supervisor_lock(self) -> Path:
-        """Held by the agent supervisor as long as the agent may be alive, also when the command that started it was killed."""
+        """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
         return self.state / "keeper.lock"
 
     @property
     def intended(self) -> Path:
-        """What the coordinator is asked to open, written before it is asked: `IntendedRun`."""
+        """The request to open the run, written before it is sent: `IntendedRun`."""
         return self.state / "intended.json"
 
     @property
@@ -158,35 +158,35 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def times(self) -> Path:
-        """How long its train side has taken so far: `Times`."""
+        """Time spent on its train side so far: `Times`."""
         return self.state / "times.json"
 
     @property
     def agent(self) -> Path:
-        """What a jailed agent has outside its workspace: home and /tmp."""
+        """A jailed agent's files outside its workspace: home and /tmp."""
         return self.state / "agent"
 
     @property
     def staged(self) -> Path:
-        """What was put into the workspace: `Staged`."""
+        """Hashes and bounds of the staged workspace: `Staged`."""
         return self.state / "staged.json"
 
 
 class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """Which run of the cluster a folder is for."""
+    """The run of the cluster that a folder belongs to."""
 
     run: str
 
 
 class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """What a command that is killed in between must ask again, word for word, to come to the same run."""
+    """The request to open a run. A command that was killed in between repeats it unchanged and gets the same run."""
 
     key: str
     settings: RunSettings
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):
-    """What a workspace started with, for `run.json`. Hashes are SHA-256, hex."""
+    """The initial contents of a workspace, for `run.json`. Hashes are SHA-256, hex."""
 
     agents_md_hash: str
     """Of the rules, with placeholders for the URLs: equal for runs with equal rules."""
@@ -195,13 +195,13 @@ class Staged(msgspec.Struct, frozen=True, kw_only=True):
     initial_policy_hash: str
     """Of `system/policy.py`."""
     n_train: int
-    """Train cases."""
+    """Number of train cases."""
     min_episodes_per_submit: int
     max_episodes_per_submit: int
 
 
 def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
-    """The folder of a run. ConfigError for names that cannot be a folder's."""
+    """Returns the folder of a run. Raises ConfigError for names that cannot be a folder's."""
     if not keys.valid_name(exp_id):
         raise ConfigError(f"--exp-id {exp_id!r}: letters, digits, '.', '_' and '-' only, 63 at most")
     name = _ODD.sub("_", entry).strip(" .")
@@ -211,12 +211,12 @@ def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
 
 
 def save(path: Path, value: msgspec.Struct) -> None:
-    """Writes a small private file of the gateway's folder."""
+    """Writes a small private file (mode 0600) of the gateway's folder."""
     write_atomically(path, msgspec.json.encode(value), mode=0o600)
 
 
 def saved(path: Path, kind: type[T]) -> T:
-    """What `save` wrote. FileNotFoundError where there is nothing, ConfigError where a disk has damaged it."""
+    """Reads a file written by `save`. Raises FileNotFoundError when it is missing, ConfigError when it is damaged."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except DECODE_ERRORS as error:
@@ -226,7 +226,7 @@ def saved(path: Path, kind: type[T]) -> T:
 
 
 def folder_of(path: Path) -> RunFolder:
-    """The run folder at `path`; ConfigError when there is no such folder."""
+    """Returns the run folder at `path`. Raises ConfigError when there is no such folder."""
     if not path.is_dir():
         raise ConfigError(
             f"{path} is not a folder; name a run directory such as runs/evolve/gym_acrobot/first"

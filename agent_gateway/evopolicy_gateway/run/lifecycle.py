@@ -1,10 +1,13 @@
-"""One run from its opening to `run.json`, as the operator's process sees it.
+"""One run from its opening to `run.json`, in the operator's process.
 
-Order is what counts here: the run is opened, the coordinator permits the agent to be alive here, the gateway serves, the agent
-starts; the agent and all that it started are gone before the run is closed or cancelled, which ends the permit; only then its
-hidden cases are scored here, and only this process is told. A gateway that dies is
-started again on the same port while the agent goes on; an agent supervisor that dies is started again with its agent. When this
-process itself is killed its children end, and the folder holds all that going on with the run needs.
+The order matters:
+
+1. The run is opened, the coordinator permits the agent to be alive here, the gateway serves, the agent starts.
+2. The agent and all that it started end before the run is closed or cancelled, which ends the permit.
+3. Only then are its hidden cases scored on this machine; only this process receives the scores.
+
+A gateway that dies is restarted on the same port while the agent continues. An agent supervisor that dies is restarted
+with its agent. When this process is killed, its children end, and the folder holds everything needed to resume the run.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
 END_GRACE_S = 15.0
 GIVE_UP_TIMEOUT_S = 10.0
-"""For telling the coordinator that a run is given up, which may be why it is."""
+"""Limit for reporting a given-up run to the coordinator, whose failure may be the reason for giving up."""
 _QUICK_DEATH_S = 5.0
 _MAX_QUICK_DEATHS = 5
 _MAX_SUPERVISOR_DEATHS = 5
@@ -73,7 +76,7 @@ class RunError(EvopolicyError):
 
 
 class RunLifecycle:
-    """Plays one plan once."""
+    """Plays one plan, once."""
 
     def __init__(
         self,
@@ -87,8 +90,8 @@ class RunLifecycle:
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
-        `stays_open`: when this is cancelled the run is left as it is, to be resumed.
-        `on_agent_gone` is called once the agent's side is over: what is left of the run needs no agent's place.
+        `stays_open`: cancelling this leaves the run open, to be resumed. `on_agent_gone` is called once the agent's
+        side is over; the rest of the run needs no slot for an agent.
         """
         self._plan = plan
         self._folder = plan.folder
@@ -103,38 +106,40 @@ class RunLifecycle:
         self._spent = asyncio.Event()
         self._closed = asyncio.Event()
         self._cancelled = False
-        """Somebody else has ended the run at the coordinator."""
+        """The run was cancelled at the coordinator by someone else."""
         self._on_agent_gone = on_agent_gone
         self._survivors: list[int] = []
-        """Processes of the agent that could not be ended."""
+        """Process ids of the agent that survive being killed."""
         self._submits = child_messages.SubmitsSeen(asked=0, running=False)
-        """As the gateway told it last."""
+        """As last reported by the gateway."""
         self._held_before = 0.0
         """`held_s` of the run when the agent supervisor was started."""
         self._order: CloseRun | None = None
         self._gateway: Child | None = None
         self._supervisor: Child | None = None
         self._stopwatch: Stopwatch
-        """From when it is played: the folder then is new, or holds what earlier commands took."""
+        """Set when the run is played: the folder is new then, or holds the times of earlier commands."""
 
     @property
     def agent_at_work(self) -> bool:
-        """The agent's side is open and nobody has asked to close it."""
+        """Whether the agent's side is open and its closing was not requested yet."""
         return self._supervisor is not None and self._order is None and not self._closed.is_set()
 
     async def play(self) -> RunRecord:
-        """Plays it to `run.json`. Raises our errors; cancelled, it cancels the run and leaves a `run.json` that says so."""
+        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run, as its `run.json`
+        records.
+        """
         with alone(self._folder.lock, self._folder.root):
             return await self._play()
 
     async def go_on(self) -> RunRecord:
-        """What the folder asks for: `play` where nothing was begun, `resume` where it was; a finished run's record."""
+        """Plays a new run, resumes an open one, or returns the record of a finished one, as the folder requires."""
         with alone(self._folder.lock, self._folder.root):
             return await self._go_on()
 
     async def _play(self) -> RunRecord:
         plan = self._plan
-        # Checking starts programs to try the jail, which a search for another run's orphans would take for strays.
+        # Checking starts programs that try the jail; the orphan search of another run would take them for orphans.
         async with child_process.starting():
             plan.check_held()
         await self._operations.drop(self._folder)
@@ -163,7 +168,7 @@ class RunLifecycle:
     async def _go_on(self) -> RunRecord:
         folder = self._folder
         if folder.run_json.exists():
-            # Killed between the two, the command has left the gateway's folder.
+            # The command was killed after it wrote `run.json` and before it removed the gateway's folder.
             remove_tree(folder.state)
             return decode_run_record(folder.run_json.read_bytes())
         if folder.opened.exists():
@@ -209,7 +214,7 @@ class RunLifecycle:
         return await record.write(self._folder, plan, finished, self._operations, self._stopwatch.times)
 
     async def _agents_side(self) -> None:
-        """Until the run is closed."""
+        """Runs gateway and agent until the run is closed."""
         serving = asyncio.create_task(self._keep_gateway())
         following = asyncio.create_task(self._follow())
         keeping: asyncio.Task[AgentEnded] | None = None
@@ -262,8 +267,9 @@ class RunLifecycle:
             await self._gateway.tell(self._order)
 
     async def _follow(self) -> None:
-        """Says what a run waits for that is not served yet; has the agent ended when the run is cancelled at the
-        coordinator, which its gateway may not hear of."""
+        """Prints the reason while the run waits to be served. Ends the agent when the run is cancelled at the
+        coordinator, because the gateway may not learn of that.
+        """
         waiting = Waiting()
         async for progress in self._operations.wait(self.run):
             if not self._ready.done() and waiting.worth_saying(progress.waits_for):
@@ -274,7 +280,7 @@ class RunLifecycle:
                 self._spent.set()
 
     async def _keep_gateway(self) -> None:
-        """Runs the gateway, again when it dies, until it has closed the run."""
+        """Runs the gateway, with restarts, until it has closed the run."""
         program = [
             sys.executable,
             "-P",
@@ -327,7 +333,7 @@ class RunLifecycle:
             self._closed.set()
 
     async def _give_back(self, held_s: float) -> None:
-        """What the agent's submits waited for hidden episodes is given back to its clock."""
+        """Gives the time for which submits waited for hidden episodes back to the agent's clock."""
         before, held = self._stopwatch.times.held_s, self._stopwatch.held_told(held_s)
         if held > before and self._supervisor is not None:
             await self._supervisor.tell(HeldTime(seconds=held - self._held_before))
@@ -339,7 +345,7 @@ class RunLifecycle:
             await self._supervisor.tell(self._submits)
 
     def _tell_where(self, ready: Ready) -> None:
-        """What the operator hands to a remote agent."""
+        """Prints the facts that the operator passes on to a remote agent."""
         if self._plan.listener is None:
             if not host.boot_id():
                 why = f"{host.NO_BOOT_ID}; until then no hidden case that this run shares is played while its agent lives"
@@ -365,9 +371,9 @@ class RunLifecycle:
         return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
 
     async def _keep_agent(self, ready: Ready) -> AgentEnded:
-        """Plays the agent to its end, beginning again when its agent supervisor dies: that is our failure, and not the agent's.
+        """Runs the agent to its end. Restarts it when its supervisor dies, which is our failure and not the agent's.
 
-        An agent with a session goes on in it; any other program is started anew in its workspace.
+        An agent with a session continues in it; any other program starts anew in its workspace.
         """
         for _ in range(_MAX_SUPERVISOR_DEATHS):
             ended = await self._keep_agent_once(ready)
@@ -383,7 +389,7 @@ class RunLifecycle:
         return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
 
     async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
-        """How the agent ended; None when its agent supervisor died."""
+        """Returns how the agent ended; None when its supervisor died."""
         self._stopwatch.agent_begins()
         self._held_before = self._stopwatch.times.held_s
         left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
@@ -420,7 +426,7 @@ class RunLifecycle:
             elif isinstance(event, AgentEnded):
                 ended = event
         await self._supervisor.ended()
-        # What an agent supervisor that died has left behind has become ours.
+        # Processes left behind by a supervisor that died have become our children.
         while left := await child_rpc.end_orphans():
             if left != self._survivors:
                 self._survivors = left
@@ -445,16 +451,16 @@ class RunLifecycle:
         raise AssertionError("waiting ends with the finished run")
 
     async def _tell_gone(self, run: str) -> None:
-        """Tells the coordinator that the agent of a run that was not closed is gone; it needs another permit to go on."""
+        """Reports to the coordinator that the agent of an open run is gone; resuming the run needs a new permit."""
         if self._plan.listener is not None:
-            return  # nobody here knows
+            return  # nobody here knows about a remote agent
         with contextlib.suppress(EvopolicyError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
-                # From here alone: the run may have been resumed elsewhere by the time that this arrives.
+                # Only for this machine: the run may have been resumed elsewhere before this arrives.
                 await self._operations.agent_gone(run, agent_place(self._folder).boot_id)
 
     async def _give_up(self, run: str, why: str | None) -> None:
-        """Cancels the run at the coordinator, so that it plays nothing more of it, and writes down that it was."""
+        """Cancels the run at the coordinator, so that it plays no more episodes, and records that in `run.json`."""
         with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
                 await self._operations.cancel(run)

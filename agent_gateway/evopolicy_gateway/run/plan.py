@@ -1,4 +1,4 @@
-"""What is to be played: a run's settings, its agent, and the folder that it is played in."""
+"""A run to be played: its settings, its agent and its folder."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from evopolicy_gateway.operator.locks import check_free
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, run_folder, saved
 
 WALL_S = 12 * 3600.0
-"""An agent's time where nobody says otherwise."""
+"""Default wall limit of an agent, seconds."""
 _OPERATIONAL = frozenset(
     ("retries", "backoff_s", "silence_s", "pause_s", "max_pause_s", "pass_environment", "prices")
 )
-"""Settings of a coding agent that change nothing of what a run measures."""
+"""Settings of a coding agent that do not affect the run's measurements."""
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
-    """A run to be played: for itself, or as one of a sweep."""
+    """A run to be played, alone or as part of a sweep."""
 
     name: str = ""
-    """How its operator is told of it, unique within a command: its environment, in a sweep `agent/environment/repeat`."""
+    """The run's name in messages, unique within a command: its environment, in a sweep `agent/environment/repeat`."""
     settings: RunSettings
     agent: str
-    """As `--agent` takes it."""
+    """In the form of `--agent`."""
     runs: Path
     started_in: Path
     wall_limit_s: float
-    """The agent's time, seconds."""
+    """The agent's wall limit, seconds."""
     silence_s: float = SILENCE_S
-    """A program that does nothing for so long is ended, seconds."""
+    """A program without activity for this long is ended, seconds."""
     overwrite: bool = False
     resume: bool = False
-    """What the folder holds of this run is gone on with."""
+    """Whether to resume the run that the folder holds."""
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
     parallel: int | None = None
-    """Most runs of its entry at once; None: as many as there may be."""
+    """Maximum number of simultaneous runs of its entry; None: no limit of its own."""
     jail: JailSettings = JailSettings()
     listener: Listener | None = None
-    """Where a remote agent is served; None for an agent that is started here."""
+    """The address that serves a remote agent; None for an agent that is started here."""
 
     @property
     def folder(self) -> RunFolder:
@@ -66,30 +66,31 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def provider(self) -> str:
-        """Whom its agent asks: runs with a provider that is away wait together."""
+        """Name of the agent's model provider; while a provider is away its runs wait together."""
         return self.config.provider_name if self.config is not None else self.agent.partition(":")[0]
 
     @property
     def defining(self) -> dict[str, Any]:
-        """Everything that makes it this run and no other; the attempt and operational settings do not.
+        """Everything that identifies this run; the attempt and operational settings do not.
 
-        What is as usual is left out, so that a setting which a later version adds makes no other run of it.
+        Settings at their default are left out, so that a setting added by a later version does not change a run's
+        identity.
         """
         config = None
         if self.config is not None:
             told = _unusual(msgspec.to_builtins(self.config), msgspec.to_builtins(AgentConfig(harness="")))
             config = {name: value for name, value in told.items() if name not in _OPERATIONAL}
         settings = self.settings
-        # Without a published limit both kinds are the same.
+        # Without a published limit both kinds of step limit are equal.
         both = catalogue.entry(settings.env).published_steps is not None
         limit: StepLimit = "natural" if both else settings.step_limit
         usual = RunSettings(env="", entry="", model="", exp_id="", attempt=settings.attempt, step_limit=limit)
         told = _unusual(msgspec.to_builtins(settings), msgspec.to_builtins(usual))
-        told.pop("replays", None)  # recorded once all is over, it changes nothing of the run
+        told.pop("replays", None)  # videos are recorded after the run and do not affect it
         found = {"agent": self.agent, "config": config, "settings": told, "agent_wall_s": self.wall_limit_s}
         if self.silence_s != SILENCE_S:
             found["agent_silence_s"] = self.silence_s
-        # What a jail shows (`read`) is where programs lie, which differs from host to host.
+        # The jail's `read` names the places of programs, which differ from host to host.
         reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
         if reached or self.jail.mode != JailSettings().mode:
             found["jail"] = {"mode": self.jail.mode, **reached}
@@ -97,19 +98,20 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """Of all that defines it."""
+        """First 16 hex digits of the SHA-256 of `defining`."""
         return hashlib.sha256(msgspec.json.encode(list(self.defining.values()), order="sorted")).hexdigest()[
             :16
         ]
 
     def check(self) -> None:
-        """ConfigError when the agent cannot start, or its jail or the run's folder cannot be had, such as one that may not
-        be overwritten."""
+        """Raises ConfigError when the agent cannot start, its jail is not available, or the run's folder is not, such
+        as a folder that may not be overwritten.
+        """
         check_free(self.folder.lock, self.folder.root)
         self.check_held()
 
     def check_held(self) -> None:
-        """`check` for who may hold the folder's lock."""
+        """`check` for the holder of the folder's lock."""
         check_text(self.started_in, "cd")
         msgspec.json.encode((self.settings, self.agent))  # UnicodeEncodeError for an option that is not UTF-8
         check_installed("gateway")
@@ -138,14 +140,14 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             )
 
     def intended(self) -> IntendedRun | None:
-        """What was begun in the folder; None for nothing."""
+        """The request that opened the run in the folder; None when there is none."""
         try:
             return saved(self.folder.intended, IntendedRun)
         except FileNotFoundError:
             return None
 
     def claim(self) -> None:
-        """Makes the run's folder, empty, for who holds its lock. ConfigError as `check`."""
+        """Creates the run's empty folder; only for the holder of its lock. Raises ConfigError as `check`."""
         self.check_held()
         if self.folder.root.exists():
             remove_tree(self.folder.root)
@@ -153,7 +155,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _unusual(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
-    """What differs from the usual, inner tables too."""
+    """Values that differ from the defaults, also within inner tables."""
     found = {name: value for name, value in told.items() if name not in usual or value != usual[name]}
     return {
         name: _unusual(value, usual[name])

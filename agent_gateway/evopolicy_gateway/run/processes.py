@@ -1,4 +1,4 @@
-"""Process trees: nothing that an agent started may outlive it, also not what left its process group or its parent."""
+"""Process trees: no process that an agent started may outlive it, even outside its process group or orphaned."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _reaps = False
 
 
 def become_subreaper() -> None:
-    """From now on descendants whose parent dies become children of this process, so that none is lost sight of.
+    """Makes descendants whose parent dies become children of this process, so that none escapes.
 
-    For processes all of whose children are ours: `end_orphans` and `end_descendants` take every other for a stray.
+    Only for processes all of whose children are ours: `end_orphans` and `end_descendants` treat all others as orphans.
     """
     global _reaps
     _reaps = True
@@ -29,9 +29,9 @@ def become_subreaper() -> None:
 
 
 def leave_session_keyring() -> None:
-    """From now on this process and its children have an empty session keyring: that of a login holds its keys.
+    """Gives this process and its children an empty session keyring; a login's keyring holds its keys.
 
-    No namespace divides keyrings. Where the kernel has none there is nothing to leave.
+    Namespaces do not separate keyrings. Does nothing when the kernel has no keyrings.
     """
     number = {"x86_64": 250, "aarch64": 219}.get(os.uname().machine)
     if number is not None:
@@ -39,10 +39,10 @@ def leave_session_keyring() -> None:
 
 
 def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
-    """Ids of the live processes below `root`, parents before children; zombies are not listed.
+    """Returns the ids of the live processes below `root`, parents before children, without zombies.
 
-    What is in `spare`, and all that is below it, is left out. One look at the process table decides: compared with a
-    second one, a process that a spared one starts in between would be taken for a stray.
+    Leaves out `spare` and everything below it. Reads the process table only once: with two reads, a process started by
+    a spared one in between would look like an orphan.
     """
     children: dict[int, list[int]] = {}
     for pid, parent, state in _table():
@@ -57,7 +57,7 @@ def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
 
 
 def cpu_below() -> float:
-    """Processor seconds of all that lives below this process, and of what its processes have waited for."""
+    """CPU seconds of all live processes below this one, and of the dead children that these have waited for."""
     total = 0
     for pid in descendants(os.getpid()):
         with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{pid}/stat", "rb") as file:
@@ -68,10 +68,10 @@ def cpu_below() -> float:
 def end_descendants(
     grace_s: float, *, spare: Collection[int] = (), waited: Collection[int] = ()
 ) -> list[int]:
-    """Ends everything below this process: SIGTERM, then after `grace_s` seconds SIGKILL until nothing is left.
+    """Ends everything below this process: SIGTERM, then SIGKILL after `grace_s` seconds until no process is left.
 
-    Blocks. `spare`: process ids that are left alone with all that is below them. `waited`: ids whose exit status
-    somebody else takes. Returns what survived `KILL_TIMEOUT_S` seconds of killing: nothing, unless the kernel holds it.
+    Blocks. `spare`: process ids that stay alive with everything below them. `waited`: ids whose exit status other code
+    collects. Returns the ids that survive `KILL_TIMEOUT_S` seconds of killing: none, unless the kernel holds them.
     """
     kept = {*spare, *waited}
     _signal_all(_below(spare), signal.SIGTERM)
@@ -81,7 +81,7 @@ def end_descendants(
         time.sleep(_PAUSE_S)
     deadline = time.monotonic() + KILL_TIMEOUT_S
     while (left := _below(spare)) and time.monotonic() < deadline:
-        # Stopped first: what forks faster than it is found must not outrun the killing.
+        # Stopped first: a process that forks faster than it is found must not outrun the killing.
         _signal_all(left, signal.SIGSTOP)
         _signal_all(_below(spare), signal.SIGKILL)
         _reap(kept)
@@ -91,9 +91,10 @@ def end_descendants(
 
 
 def end_orphans(known: Collection[int]) -> list[int]:
-    """Ends what has become this process's child by its parent's death: all but the `known` and what is below them.
+    """Ends processes that became this one's children by their parent's death: all but `known` and those below them.
 
-    Returns what survives. Does nothing in a process that has not become a subreaper: its other children are not ours to end.
+    Returns the ids that survive. Does nothing unless this process is a subreaper: its other children are not ours to
+    end.
     """
     return end_descendants(0.0, spare=known) if _reaps else []
 
@@ -107,7 +108,7 @@ def _table() -> list[tuple[int, int, bytes]]:
                 contextlib.suppress(OSError, IndexError, ValueError),
                 open(f"/proc/{name}/stat", "rb") as file,
             ):
-                # The command's name is in parentheses and may hold anything, spaces and parentheses too.
+                # The command's name is in parentheses and may contain spaces and parentheses itself.
                 fields = file.read().rpartition(b")")[2].split()
                 rows.append((int(name), int(fields[1]), fields[0]))
     return rows
@@ -124,7 +125,7 @@ def _signal_all(pids: list[int], number: signal.Signals) -> None:
 
 
 def _reap(kept: Collection[int]) -> None:
-    """Takes the exit status of dead children, so that no zombies pile up."""
+    """Collects the exit status of dead children, so that no zombies accumulate."""
     me = os.getpid()
     for pid, parent, state in _table():
         if parent == me and state == b"Z" and pid not in kept:

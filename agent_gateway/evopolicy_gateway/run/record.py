@@ -1,7 +1,7 @@
-"""What a finished run leaves: `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`;
-`run.json` comes last.
+"""Writes the files of a finished run.
 
-Holds hidden scores, so it is called only when the agent and all its children are gone.
+These are `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`, and `run.json` last.
+They hold hidden scores, so `write` is called only when the agent and all its children are gone.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ async def write(
     times: Times,
     error: str | None = None,
 ) -> RunRecord:
-    """Writes everything and removes the gateway's folder. StorageError when the disk refuses.
+    """Writes all files and removes the gateway's folder. Raises StorageError when the disk refuses.
 
-    `error` tells why this command gave the run up, when it was not the operator who cancelled it.
+    `error`: why this command gave the run up, unless the operator cancelled it.
     """
     selected: Bundle | None = None
     code: dict[int, CodeMetrics] = {}
@@ -101,7 +101,9 @@ def run_record(
     artifacts: Artifacts | None = None,
     transitions: Transitions | None = None,
 ) -> RunRecord:
-    """The record of a finished run; pure. `staged` None: it ended before its workspace was made. `code`: by submit."""
+    """The record of a finished run; pure. `staged` None: the run ended before its workspace existed. `code`: by
+    submit.
+    """
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns
@@ -260,13 +262,13 @@ def _std(values: Sequence[float]) -> float:
 
 
 async def _bundle(folder: RunFolder, digest: str, operations: Operations) -> Bundle:
-    """From the gateway's own store, or else from the coordinator."""
+    """Reads the bundle from the gateway's store, or else from the coordinator."""
     own = await asyncio.to_thread(_own_bundle, folder, digest)
     return own if own is not None else bundles.load(await operations.download(digest), digest)
 
 
 def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
-    """From the gateway's own store; None where it is not there."""
+    """Reads the bundle from the gateway's store; None when it is missing there."""
     if digest is None or not folder.blobs.is_dir():
         return None
     try:
@@ -284,7 +286,7 @@ def _journal(folder: RunFolder) -> list[AnyEntry]:
 
 
 def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
-    """Submit index to the bundle of a `system/` that held no policy, which the coordinator does not have."""
+    """Maps a submit's index to the digest of a `system/` without a policy, which the coordinator does not have."""
     kept = {
         entry.key: entry.kept for entry in entries if isinstance(entry, Requested) and entry.kept is not None
     }
@@ -295,7 +297,7 @@ def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
 def _write_checkpoint(
     folder: RunFolder, finished: RunFinished, submit: SubmitRecord, bundle: Bundle | None
 ) -> CodeMetrics:
-    """`checkpoints/submit_NNN/`: the policy as it was submitted, unchangeable, and its numbers."""
+    """Writes `checkpoints/submit_NNN/`: the submitted policy, read-only, and its numbers."""
     requested = len(submit.env_instances)
     charged = 0 if submit.status == CANCELLED else requested
     meta = CheckpointMeta(
@@ -314,7 +316,7 @@ def _write_checkpoint(
 
 
 def _env_log(finished: RunFinished) -> bytes:
-    """JSON lines: what was played in which version of the environment, and what came of it."""
+    """JSON lines: the environment's version, the played episodes and their results."""
     lines: list[dict[str, Any]] = [
         {"event": "environment", "env": finished.settings.env, "version": finished.env_version}
     ]
@@ -349,9 +351,9 @@ def _env_log(finished: RunFinished) -> bytes:
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
-    """Replaces `system`, whatever its agent has left there, by the bundle."""
+    """Replaces `system`, whatever the agent left there, by the bundle."""
     give_back_rights(system.parent)
-    # Only a folder is removed as one: to open a pipe would wait for its other end.
+    # Only a real folder is removed recursively; opening a pipe would block until its other end opens.
     if system.is_dir() and not system.is_symlink():
         remove_tree(system)
     else:
@@ -371,7 +373,7 @@ def _write_record(
     staged = None
     if folder.staged.exists():
         staged = saved(folder.staged, Staged)
-        # The agent's log is there also where nothing was said.
+        # The agent's log exists even when the agent printed nothing.
         folder.agent_log.touch()
     write_atomically(folder.env_log, _env_log(finished))
     transitions = count_transitions(folder.feedback)

@@ -1,8 +1,10 @@
-"""`replays/heldout_NNN/video.mp4`: the selected checkpoint's held-out episodes, as workers recorded them.
+"""`replays/heldout_NNN/video.mp4`: videos of the selected checkpoint's held-out episodes, recorded by workers.
 
-Rules: which episodes there are is the run's option `replays` (off, first, all), or `video` where that is not given. NNN is
-the position in the split, from 0; the case's seed is nowhere. A recording is an extra: one that a worker could not make, or
-the cluster has no more, is left out, and nothing else of the run depends on it. What was fetched before is not fetched again.
+- The run's option `replays` (off, first, all), or else `video`, selects the episodes.
+- NNN is the position in the split, from 0; the case's seed appears nowhere.
+- Recordings are optional: one that a worker could not make, or that the cluster no longer has, is left out, and nothing
+  else of the run depends on it.
+- Videos that are already in place are not fetched again.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ FOLDER = "replays"
 
 
 async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tuple[Replay, ...]:
-    """Writes the recordings under the run directory `root`; one `Replay` each, in the split's order."""
+    """Writes the recordings below the run directory `root`; returns one `Replay` each, in the split's order."""
     index = finished.best_submit_index
     if finished.settings.recorded_heldout == "off" or index is None:
         return ()

@@ -1,7 +1,6 @@
-"""How long a run's train side has taken, over every command that has played it: on disk while the run is open.
+"""How long a run's train side has taken, over all commands that have played it; on disk while the run is open.
 
-The agent's wall limit and `run.json`'s phases are of the whole run, so a run that was interrupted ten times has no more time
-than one that was not.
+The agent's wall limit and the phases in `run.json` cover the whole run, so interruptions give a run no extra time.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Seconds so far."""
 
     agent_s: float = 0.0
-    """Of the agent's wall limit: its clock stands still while its provider is away."""
+    """Used of the agent's wall limit; the clock stops while the agent's provider is away."""
     open_s: float = 0.0
     """The agent's side was open."""
     in_flight_s: float = 0.0
@@ -28,16 +27,16 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     feedback_s: float = 0.0
     """From the last episode's result to the submit's answer."""
     held_s: float = 0.0
-    """Submits waited because hidden episodes had the machines; not in `agent_s`."""
+    """Submits waited because hidden episodes used the machines; not counted in `agent_s`."""
     permit_s: float = 0.0
-    """The agent's start waited for hidden episodes that its machine played; in no other figure."""
+    """The agent's start waited for hidden episodes on its machine; not counted in any other field."""
 
 
 class Stopwatch:
-    """Adds up what the processes of a run tell, each of which begins at nought."""
+    """Adds up the reports of a run's processes, each of which counts from zero."""
 
     def __init__(self, path: Path, now: Callable[[], float] = time.monotonic) -> None:
-        """`path`: where earlier commands have left theirs, if there were any."""
+        """`path`: file with the times of earlier commands; may be missing."""
         self._path = path
         self._now = now
         self._base = _load(path)
@@ -61,23 +60,23 @@ class Stopwatch:
         self._opened = self._now()
 
     def closed(self) -> None:
-        """It no longer is."""
+        """The agent's side is closed from now on."""
         self._base, self._opened = self.times, None
         self._agent_s = self._in_flight_s = self._feedback_s = 0.0
         self.keep()
 
     def agent_begins(self) -> None:
-        """An agent supervisor is started: its agent's clock begins anew."""
+        """A new agent supervisor starts: its agent's clock counts from zero."""
         self._base = msgspec.structs.replace(self._base, agent_s=self.times.agent_s)
         self._agent_s = 0.0
 
     def agent_told(self, seconds: float) -> None:
-        """How far the clock of the agent that runs now is."""
+        """Sets the clock of the current agent, seconds."""
         self._agent_s = seconds
         self.keep()
 
     def gateway_begins(self) -> None:
-        """A gateway is started: its counts begin anew."""
+        """A new gateway starts: its counts begin at zero."""
         now = self.times
         self._base = msgspec.structs.replace(
             self._base, in_flight_s=now.in_flight_s, feedback_s=now.feedback_s
@@ -85,20 +84,20 @@ class Stopwatch:
         self._in_flight_s = self._feedback_s = 0.0
 
     def gateway_told(self, in_flight_s: float, feedback_s: float) -> None:
-        """The counts of the gateway that runs now."""
+        """Sets the counts of the current gateway, seconds."""
         self._in_flight_s, self._feedback_s = in_flight_s, feedback_s
 
     def held_told(self, seconds: float) -> float:
-        """The run's `held_s` so far, as the coordinator counts it; returns it, which never falls."""
+        """Sets the run's `held_s` as counted by the coordinator; returns the stored value, which never decreases."""
         self._base = msgspec.structs.replace(self._base, held_s=max(self._base.held_s, seconds))
         return self._base.held_s
 
     def permit_told(self, seconds: float) -> None:
-        """A permit was waited for, so long."""
+        """Adds time spent waiting for a permit, seconds."""
         self._base = msgspec.structs.replace(self._base, permit_s=self._base.permit_s + seconds)
 
     def keep(self) -> None:
-        """Writes it down; what the disk refuses is told by something that matters more."""
+        """Saves the times. Ignores a disk error, since other, more important writes report it."""
         try:
             save(self._path, self.times)
         except (StorageError, OSError):

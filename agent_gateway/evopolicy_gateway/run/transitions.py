@@ -1,4 +1,4 @@
-"""Counts the steps of a run's train episodes, and those whose action was repaired, from the feedback that was written."""
+"""Counts a run's train steps, and those with a repaired action, from the written feedback."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import msgspec
 from evopolicy_common.processes.left_files import left_files
 
 MAX_READ_BYTES = 8 << 30
-"""Feedback beyond this is not counted: an agent without a jail may leave files of any size that take no room."""
+"""Larger feedback is not counted: an agent without a jail may leave sparse files of any size."""
 _CHUNK_BYTES = 1 << 22
 _INVALID = b'"action_invalid":true'
-"""As `json_text.rows_text` writes it. Quotes within a text are escaped there, so no text can hold these bytes."""
+"""As written by `json_text.rows_text`. Quotes within a text are escaped there, so no text contains these bytes."""
 
 
 class Transitions(msgspec.Struct, frozen=True, kw_only=True):
-    """Of all train episodes that were recorded."""
+    """Counts over all recorded train episodes."""
 
     steps: int
     action_invalid: int
-    """Steps whose action was outside the action space, and was repaired."""
+    """Steps whose action was outside the action space and was repaired."""
 
 
 def count_transitions(feedback: Path) -> Transitions | None:
-    """None where the feedback is too large to be read, or cannot be read."""
+    """Returns None when the feedback is too large or cannot be read."""
     try:
         if not stat.S_ISDIR(os.lstat(feedback).st_mode):
             return None
