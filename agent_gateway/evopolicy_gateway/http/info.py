@@ -19,7 +19,7 @@ def info_document(
     in_flight: Ticket | None,
     last_warning: str | None = None,
 ) -> dict[str, Any]:
-    """What an agent may know of the run, as plain values."""
+    """Everything that an agent may know of the run, as plain values."""
     env = run.env
     env_meta: dict[str, Any] = {
         "env": env.env,
@@ -63,9 +63,9 @@ def info_document(
 
 
 def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str, Any]:
-    """A submit that runs: how far it is and, when nothing of it runs, what it waits for.
+    """The progress of a running submit, and the reason it waits when no episode of it runs.
 
-    `held_s`: seconds that it waited because the cluster's other work had the machines; they count against no limit.
+    `held_s`: seconds of waiting because the cluster's other work used the machines; they count against no limit.
     """
     n_done, waits_for, held_s = ticket.n_done, ticket.waits_for, ticket.held_s
     seen = state.in_flight if state is not None else None

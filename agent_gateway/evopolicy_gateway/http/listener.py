@@ -1,9 +1,12 @@
-"""Where a run is served when its agent is in a container or on another host, `run --agent remote --http HOST:PORT`, and where
-an agent is alive.
+"""The address that serves a remote agent (`run --agent remote --http HOST:PORT`), and the machine where an agent is
+alive.
 
-Rules: an address is listened on only because the operator named it; then every request needs the bearer token, on loopback
-too; the token is a file of mode 0600 beside the gateway's other secrets, and no command's argument or output. An agent that
-is not started here counts as being on every machine unless its operator says which, and as alive until he says that it is not.
+- The service listens on an address other than loopback only when the operator names it. Then every request needs the
+  bearer token, even on loopback.
+- The token is a file of mode 0600 beside the gateway's other secrets; it never appears in a command's arguments or
+  output.
+- An agent that is not started here counts as present on every machine unless its operator names one, and as alive until
+  the operator reports its end.
 """
 
 from __future__ import annotations
@@ -22,24 +25,24 @@ from evopolicy_common.processes import host
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, saved
 
 AGENT = "remote"
-"""What `--agent` calls an agent that somebody else starts."""
+"""Value of `--agent` for an agent that is started elsewhere."""
 TOKEN_VARIABLE = "EVOPOLICYGYM_TOKEN"
-"""Where the staged rules tell an agent to find its bearer token."""
+"""Variable with the agent's bearer token, as the staged rules name it."""
 _BOOT_ID = re.compile(r"[0-9a-fA-F]{8}(-[0-9a-fA-F]{4}){3}-[0-9a-fA-F]{12}")
 
 
 class Listener(msgspec.Struct, frozen=True, kw_only=True):
-    """What the operator chose."""
+    """The operator's choice of address."""
 
     host: str
-    """An address of this machine, or a name of it."""
+    """Address or name of this machine."""
     port: int
     url: str = ""
-    """How the agent reaches it where that is not `http://host:port`: a TLS front, a forwarded port. No `/` at its end."""
+    """URL for the agent when it is not `http://host:port`: a TLS proxy, a forwarded port. Without a trailing `/`."""
 
 
 class AgentPlace(msgspec.Struct, frozen=True, kw_only=True):
-    """The kernel that an agent runs on, as `RequestPermit` tells it."""
+    """The kernel that an agent runs on, as sent in `RequestPermit`."""
 
     boot_id: str = ""
     """Empty: unknown, which counts as every kernel."""
@@ -48,7 +51,7 @@ class AgentPlace(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def listener_of(http: str, url: str | None) -> Listener:
-    """The door of `--http HOST:PORT` and `--http-url`. ConfigError for what is none."""
+    """Parses `--http HOST:PORT` and `--http-url`. Raises ConfigError for invalid values."""
     address, colon, port = http.rpartition(":")
     address = address.removeprefix("[").removesuffix("]")
     if not colon or not address or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
@@ -70,7 +73,7 @@ def listener_of(http: str, url: str | None) -> Listener:
 
 
 def check_agent(agent: str, listener: Listener | None) -> None:
-    """ConfigError where a remote agent has no door, or a door no remote agent."""
+    """Raises ConfigError for a remote agent without a listener, or a listener without a remote agent."""
     if (agent == AGENT) == (listener is not None):
         return
     if listener is None:
@@ -81,7 +84,7 @@ def check_agent(agent: str, listener: Listener | None) -> None:
 
 
 def agent_host_of(agent: str, named: str) -> str:
-    """The kernel that `--agent-host` names, or `ELSEWHERE`. ConfigError for what is neither."""
+    """Parses `--agent-host`: a kernel's boot id or `ELSEWHERE`. Raises ConfigError for anything else."""
     if agent != AGENT:
         raise ConfigError(
             "--agent-host goes with --agent remote; an agent that is started here is alive on this machine"
@@ -95,7 +98,7 @@ def agent_host_of(agent: str, named: str) -> str:
 
 
 def place_of(named: str) -> AgentPlace:
-    """The place of `evopolicy-gateway --agent-host`. ConfigError for what names none."""
+    """Parses `evopolicy-gateway --agent-host`: a boot id or `unknown`. Raises ConfigError for anything else."""
     if named == "unknown":
         return AgentPlace()
     if not _BOOT_ID.fullmatch(named):
@@ -107,7 +110,7 @@ def place_of(named: str) -> AgentPlace:
 
 
 def agent_place(folder: RunFolder) -> AgentPlace:
-    """Where the agent of an open run is alive: where its gateway is, unless somebody else starts it."""
+    """Where the agent of an open run is alive: on the gateway's kernel, unless it is started elsewhere."""
     if not folder.listener.exists():
         return AgentPlace(boot_id=host.boot_id(), machine_id=host.machine_id(), host=platform.node())
     named = _agent_host(folder)
@@ -115,7 +118,9 @@ def agent_place(folder: RunFolder) -> AgentPlace:
 
 
 def ends_unseen(folder: RunFolder) -> bool:
-    """Whether only the operator can tell that the agent has ended: it is on machines that count, and not in our hands."""
+    """Whether only the operator can report the agent's end: it was not started here and may use the cluster's
+    machines.
+    """
     return folder.listener.exists() and _agent_host(folder) != ELSEWHERE
 
 
@@ -127,7 +132,7 @@ def _agent_host(folder: RunFolder) -> str:
 
 
 def said_of_place(agent_host: str, root: Path) -> str:
-    """What `--agent-host` means for a remote agent's run, for its operator."""
+    """Explains to the operator of a remote agent the effect of `--agent-host`."""
     if agent_host == ELSEWHERE:
         return "you vouch that the agent is on no machine of the cluster: run.json will say hidden_isolation: waived"
     until = f"has ended and you have said so: evopolicy finish {root}"
@@ -140,7 +145,7 @@ def said_of_place(agent_host: str, root: Path) -> str:
 
 
 def finish(folder: RunFolder) -> None:
-    """Says that the agent of an open run has ended. ConfigError where there is none that only the operator can see."""
+    """Reports the end of an open run's agent. Raises ConfigError unless the agent is remote or unwatched."""
     if not folder.listener.exists() and not folder.unwatched.exists():
         raise ConfigError(f"{folder.root} is no open run of a remote agent, nor of one that nobody watches")
     folder.finish.touch(mode=0o600)

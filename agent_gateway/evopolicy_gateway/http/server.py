@@ -1,6 +1,6 @@
-"""The HTTP service on a loopback port, or where the operator's `Listener` says; the same after every restart.
+"""The HTTP service, on a loopback port or at the operator's `Listener`; its address stays the same after every restart.
 
-A client that takes its time is cut off: over its headers, over reading an answer, and between two requests.
+Slow clients are disconnected: while they send headers, while they read an answer, and between two requests.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ CLOSE_GRACE_S = 1
 
 
 class Address(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a run's service is, kept through restarts."""
+    """A run's service address, kept across restarts."""
 
     host: str
     port: int
     token: str
     """128 random bits, hex: the first part of every path."""
     bearer: str = ""
-    """256 random bits, hex, that every request carries; empty on loopback where no door was asked for."""
+    """256 random bits, hex, required in every request; empty on loopback without a `Listener`."""
     url: str = ""
-    """How the agent reaches it; empty for `http://host:port`."""
+    """URL for the agent; empty for `http://host:port`."""
 
     def urls(self) -> Urls:
         if self.url:
@@ -49,9 +49,9 @@ class Address(msgspec.Struct, frozen=True, kw_only=True):
 
 
 async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
-    """A bound socket: on the port of the last time, or on a free one and then noted for the next time.
+    """Returns a bound socket, on the port of the last start or else on a free one, which is saved for the next start.
 
-    ConfigError when the old port, or the one that was asked for, is not to be had.
+    Raises ConfigError when the saved or the requested port is not available.
     """
     if folder.service.exists():
         address = saved(folder.service, Address)
@@ -81,7 +81,7 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
 
 @contextlib.asynccontextmanager
 async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Task[None]]:
-    """Serves `app` inside the `async with`; the task ends early only when the service failed."""
+    """Serves `app` inside the `async with`; the task ends early only when the service fails."""
     config = uvicorn.Config(
         app,
         http=TimedProtocol,
@@ -99,7 +99,7 @@ async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Ta
         h11_max_incomplete_event_size=32 << 10,
     )
     server = _Server(config)
-    sock.listen(config.backlog)  # from here on nobody is refused, whenever the server gets to it
+    sock.listen(config.backlog)  # connections queue from here on, before the server accepts them
     task = asyncio.create_task(server.serve(sockets=[sock]), name="http")
     try:
         yield task
@@ -112,7 +112,7 @@ async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Ta
 class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leaves signals to the process: a submit in flight must be left in order."""
+        """Leaves signals to the process, so that a submit in flight is left in order."""
         yield
 
 
@@ -132,7 +132,7 @@ async def _rebind(address: Address) -> socket.socket:
 def _bound(host: str, port: int) -> socket.socket:
     family, kind, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     sock = socket.socket(family, kind)
-    # An address whose last connections are still in TIME_WAIT must be had again at once.
+    # Allows binding while old connections to the address are in TIME_WAIT.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         sock.bind(where)

@@ -1,9 +1,11 @@
 """The agent's HTTP service: `/info`, `/task`, `/submit`, all below a secret path token.
 
-Rules: the token is compared in constant time and everything else is the same 404; where the service is open to other hosts
-a bearer token comes before that, and without it everything is the same 401; nothing of a request is ever a path of
-the file system; a body is read only as far as a submit may be long; an error says what the agent can act on and nothing
-of this machine; no answer depends on whether the one who asked still listens.
+- The token is compared in constant time; every path without it gets the same 404.
+- When the service is open to other hosts, a bearer token is checked first; without it every request gets the same 401.
+- No part of a request is ever used as a path of the file system.
+- A body is read only up to the maximum length of a submit.
+- An error names what the agent can act on, and nothing of this machine.
+- No answer depends on whether its client is still connected.
 """
 
 from __future__ import annotations
@@ -32,18 +34,18 @@ from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 BODY_WAIT_S = 30.0
-"""A body that has not arrived by then is not waited for."""
+"""A body must arrive within this time, seconds."""
 DECIDED_WAIT_S = 5.0
-"""How long `?wait=false` waits for the coordinator's word before it answers 202 all the same."""
+"""How long `?wait=false` waits for the coordinator's acceptance before it answers 202 regardless, seconds."""
 MAX_KEY_CHARS = 200
 LINGER = (256 << 20, 120.0)
-"""Bytes and seconds for which the rest of a refused body is read before the connection is closed."""
+"""Limits, in bytes and seconds, for reading the rest of a refused body before the connection is closed."""
 STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
-"""The same for one without the bearer token."""
+"""The same for a client without the bearer token."""
 
 
 def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
-    """The service of one run; `bearer` empty: none is asked for."""
+    """Builds the service of one run. An empty `bearer` means that no bearer token is required."""
     task = task_markdown(pipeline.run).encode()
 
     async def info(request: Request) -> Response:
@@ -91,7 +93,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
             Route("/task", task_text, methods=["GET"]),
             Route("/submit", submit, methods=["POST"]),
             Route("/submit/{submit_id}", ask_submit, methods=["GET"]),
-            # The published service ends a run by itself and says so of this path.
+            # The published service finalises a run by itself and answers this path with 405.
             Route("/finalize", finalize, methods=["GET", "POST"]),
         ],
         exception_handlers={
@@ -106,7 +108,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
 
 
 def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
-    """The answer to a submit: its summary byte for byte as in the file, how far it is, or why it was not taken."""
+    """The answer to a submit: its summary as in the file, byte for byte, or its progress. Raises its refusal."""
     if ticket.error is not None:
         raise ticket.error
     summary = ticket.summary()
@@ -128,7 +130,7 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
 
 
 async def _read_body(request: Request) -> bytes:
-    """The body, or a refusal as soon as it is known to be too long."""
+    """Returns the body. Raises RequestError as soon as it is known to be too long, or when it arrives too late."""
     told = request.headers.get("content-length", "")
     if told.isdecimal() and (len(told) > 18 or int(told) > MAX_BODY_BYTES):
         refuse_size(int(told[:18]))
@@ -206,7 +208,7 @@ async def _our_error(request: Request, error: Exception) -> Response:
 
 
 class _TokenGate:
-    """Lets through what knows the token, without it; lets a client that is still sending hear a refusal."""
+    """Removes the token from requests that carry it. Lets a client that is still sending receive a refusal."""
 
     def __init__(self, app: ASGIApp, token: str, bearer: str) -> None:
         self._app = app
@@ -229,12 +231,13 @@ class _TokenGate:
         try:
             await self._app(inner, exchange.receive, exchange.send)
         except asyncio.CancelledError:
-            # The service ends while this request waits. Nobody is told to stop: the server only waits for this to return.
+            # The service stops while this request waits. The cancellation may end here: the server only waits for this
+            # to return.
             if not exchange.answered:
                 await _STOPPING(scope, exchange.receive, exchange.send)
 
     def _bears(self, scope: Scope) -> bool:
-        """Whether the request carries the bearer token, once."""
+        """Whether the request carries the bearer token in exactly one header."""
         given = [value for name, value in scope["headers"] if name == b"authorization"]
         kind, _, word = b"".join(given[:1]).partition(b" ")
         alike = hmac.compare_digest(word.strip(), self._bearer)
@@ -242,7 +245,7 @@ class _TokenGate:
 
 
 class _Exchange:
-    """Ends a refusal only when the rest of the body was read and thrown away, within bounds.
+    """Delays the end of a refusal until the rest of the body was read and discarded, within limits.
 
     A server that closes while the client still sends resets the connection, and the client never reads the refusal.
     """
@@ -253,8 +256,8 @@ class _Exchange:
         self._send = send
         self._refused = False
         self.answered = False
-        """Whether the answer has begun."""
-        # Who waits for "100 Continue" sends no body to a refusal.
+        """Whether the answer has started."""
+        # A client that waits for "100 Continue" sends no body to a refusal.
         self._unread = (b"expect", b"100-continue") not in scope["headers"]
 
     async def receive(self) -> Message:

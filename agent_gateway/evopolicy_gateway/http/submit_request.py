@@ -1,12 +1,13 @@
-"""The body of `POST /submit`, parsed strictly but for fields that are not known, which are ignored as published; pure.
+"""Strict parsing of the body of `POST /submit`; pure. Unknown fields are ignored, as published.
 
 Two statuses, both without charge:
-- `budget_invalid`: the request's form (JSON, keys, type of `env_instances`, size of the body) or how many episodes it
-  asks for (none, too few, too many for one submit, more than remain);
-- `invalid_env_instance`: a single id or range (not an integer, outside the train cases, backwards, not to be read).
 
-Order and repeats are kept. Ranges are checked against the train ids and counted before they are written out, so no text
-makes more ids than a submit may hold.
+- `budget_invalid`: the request's form (JSON, keys, type of `env_instances`, size of the body) or its number of episodes
+  (none, too few, too many for one submit, more than remain);
+- `invalid_env_instance`: a single id or range (not an integer, outside the train cases, backwards, unreadable).
+
+Order and repeats are kept. Ranges are checked against the train ids and counted before they are expanded, so no text
+produces more ids than a submit may hold.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import orjson
 from evopolicy_common.errors import RequestError
 
 MAX_BODY_BYTES = 1 << 20
-"""A body longer than this is refused unread."""
+"""A longer body is refused unread."""
 
 _FIELD = "env_instances"
 _PART = re.compile(r"\s*([0-9]{1,18})\s*(?:-\s*([0-9]{1,18})\s*)?", re.ASCII)
@@ -28,7 +29,7 @@ _FORM = '{"env_instances": [0, 1, 1, 7]} or {"env_instances": "0-3,7"}'
 
 
 class Bounds(msgspec.Struct, frozen=True, kw_only=True):
-    """What a submit may ask for now."""
+    """The current limits of a submit."""
 
     n_env_instances: int
     """Train ids are 0 … n − 1."""
@@ -38,7 +39,7 @@ class Bounds(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
-    """The train ids that `body` asks for, in order. RequestError with one of the two statuses and what to do."""
+    """Returns the requested train ids in order. Raises RequestError with one of the two statuses and the remedy."""
     if len(body) > MAX_BODY_BYTES:
         refuse_size(len(body))
     wanted = _field(body)
@@ -55,7 +56,7 @@ def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
 
 
 def refuse_size(n_bytes: int | None) -> NoReturn:
-    """Refuses a body that is too long to be read; `n_bytes` None when its length is not told."""
+    """Raises RequestError for a body that is too long; `n_bytes` None when its length is unknown."""
     size = f"{n_bytes:,} bytes" if n_bytes is not None else "longer"
     _budget(f"the request's body is {size}; at most {MAX_BODY_BYTES:,} bytes are read. Send {_FORM}")
 
@@ -81,7 +82,7 @@ def _listed(item: object, index: int, bounds: Bounds) -> int:
 
 
 def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
-    """The ids of a text of ids and ranges, at most `bounds.max_episodes`; none for an empty text. RequestError."""
+    """Expands a text of ids and ranges, at most `bounds.max_episodes` ids, none if it is empty. Raises RequestError."""
     if not text.strip():
         return ()
     ranges: list[range] = []

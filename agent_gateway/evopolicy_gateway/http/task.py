@@ -1,4 +1,4 @@
-"""The markdown of `GET /task`: the environment in its own words, then what holds for every run; pure."""
+"""The markdown of `GET /task`: the environment's own text, then the rules of every run; pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evopolicy_gateway.submits.episode_files import episode_share
 
 
 def task_markdown(run: RunOpened) -> str:
-    """All that an agent needs to write a policy and to submit it."""
+    """Everything that an agent needs to write a policy and to submit it."""
     parts = [
         run.env.task_text.strip(),
         f"This environment is `{run.env.env}`: {run.env.env_version}.",
@@ -157,7 +157,7 @@ the timing of threads are not seeded: a policy that uses them may play the same 
 
 
 def _schema(space: SpaceSchema, depth: int = 0) -> str:
-    """JSON with a line for each field, but lists of numbers and short spaces on one line."""
+    """JSON with one line per field, except that lists of numbers and short spaces stay on one line."""
     text = json.dumps(space)
     if len(text) < 90:
         return text

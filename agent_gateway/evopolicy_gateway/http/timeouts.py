@@ -1,8 +1,11 @@
-"""How long the HTTP service waits for a slow client: `uvicorn`'s protocol with a clock where that has none.
+"""Timeouts of the HTTP service for slow clients, added to `uvicorn`'s protocol.
 
-A request's headers must be there `HEADERS_WAIT_S` after its first byte, the first request as long after the connection, and
-an answer must be read `ANSWER_WAIT_S` after the client has stopped reading. The body's time is `http.BODY_WAIT_S`, the pause
-between two requests the server's keep-alive. Who is late is cut off without a word.
+- A request's headers must arrive within `HEADERS_WAIT_S` of its first byte, those of the first request within
+  `HEADERS_WAIT_S` of the connection.
+- A client must resume reading an answer within `ANSWER_WAIT_S` after it has stopped.
+- `service.BODY_WAIT_S` limits the body, and the server's keep-alive limits the pause between two requests.
+
+A late client is disconnected without an answer.
 """
 
 from __future__ import annotations
@@ -34,11 +37,11 @@ class TimedProtocol(H11Protocol):
             self._stop_headers_timer()
 
     def on_response_complete(self) -> None:
-        # Asked before the next request, which may have arrived already, is begun.
+        # Read before the next request, which may have arrived already, changes the state.
         unread = self.conn.their_state is h11.SEND_BODY
         super().on_response_complete()
         if unread:
-            # As much was read of a body whose request has its answer as ever will be.
+            # The request has its answer, so the rest of its body will never be read.
             self.transport.close()
             self._start_headers_timer()
 
@@ -51,7 +54,7 @@ class TimedProtocol(H11Protocol):
         self._stop_answer_timer()
 
     def timeout_keep_alive_handler(self) -> None:
-        # What a client has not read by now, it does not want.
+        # A client that has not read its answer by now is not going to.
         if self.transport.get_write_buffer_size():
             self._cut_off()
         else:
@@ -66,7 +69,7 @@ class TimedProtocol(H11Protocol):
         self.transport.abort()
 
     def _start_headers_timer(self) -> None:
-        # Once for each request: another byte now and then wins no time.
+        # Once per request: a client that sends single bytes gains no time.
         if self._headers_timer is None:
             self._headers_timer = self.loop.call_later(HEADERS_WAIT_S, self._cut_off)
 

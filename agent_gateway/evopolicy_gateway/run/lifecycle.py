@@ -126,9 +126,7 @@ class RunLifecycle:
         return self._supervisor is not None and self._order is None and not self._closed.is_set()
 
     async def play(self) -> RunRecord:
-        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run, as its `run.json`
-        records.
-        """
+        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run; `run.json` records it."""
         with alone(self._folder.lock, self._folder.root):
             return await self._play()
 

@@ -101,9 +101,7 @@ def run_record(
     artifacts: Artifacts | None = None,
     transitions: Transitions | None = None,
 ) -> RunRecord:
-    """The record of a finished run; pure. `staged` None: the run ended before its workspace existed. `code`: by
-    submit.
-    """
+    """The record of a finished run; pure. `staged` None: the run ended before it had a workspace. `code`: by submit."""
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns

@@ -1,4 +1,4 @@
-"""The staged `AGENTS.md`: the rules of a run, with the literal URLs and commands that run as they stand. Pure."""
+"""The staged `AGENTS.md`: a run's rules, with literal URLs and commands that run unchanged. Pure."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from evopolicy_gateway.submits.names import episode_name, submit_id
 
 
 class Urls(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a run's agent finds its gateway."""
+    """URLs of a run's gateway for its agent."""
 
     info: str
     task: str
     submit: str
     bearer: bool = False
-    """Every request needs the bearer token in `EVOPOLICYGYM_TOKEN`."""
+    """Whether every request needs the bearer token in `EVOPOLICYGYM_TOKEN`."""
 
     @property
     def api(self) -> str:
-        """What the other three are below."""
+        """Common base of the other three."""
         return self.info.rpartition("/")[0]
 
     def environment(self) -> dict[str, str]:
-        """As the variables that an agent's process is started with."""
+        """The environment variables of an agent's process that hold URLs."""
         return {
             "EVOPOLICYGYM_API": self.api,
             "EVOPOLICYGYM_INFO_URL": self.info,
@@ -36,7 +36,7 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def urls_at(host: str, port: int, token: str) -> Urls:
-    """The URLs of a service on that address."""
+    """The URLs of a service at that address."""
     return urls_below(f"http://{f'[{host}]' if ':' in host else host}:{port}", token)
 
 
@@ -65,10 +65,10 @@ _WITH_BEARER = {
 }
 
 LAST_WORDS_S = 10.0
-"""What an agent gets to end by itself once its budget is spent."""
+"""Seconds that an agent has to end by itself once its budget is spent."""
 
 NO_URLS = Urls(info="INFO_URL", task="TASK_URL", submit="SUBMIT_URL")
-"""What stands for the URLs where only the rules count: for the hash in `run.json`."""
+"""Placeholders for the URLs in the hash of the rules in `run.json`."""
 
 _TEXT = Template("""\
 # Improve a policy
@@ -278,7 +278,7 @@ def agents_md(run: RunOpened, urls: Urls) -> str:
 
 
 def _ranges(n_episodes: int, n_ids: int) -> str:
-    """So many episodes as a text of ranges."""
+    """`n_episodes` ids as a text of ranges."""
     whole, rest = divmod(n_episodes, n_ids)
     lengths = [n_ids] * whole + [rest] * (rest > 0)
     return ",".join("0" if length == 1 else f"0-{length - 1}" for length in lengths)

@@ -1,4 +1,4 @@
-"""The `policy.py` that a workspace starts with: works at once and always returns one valid action. Pure."""
+"""The initial `policy.py` of a workspace, which always returns one valid action. Pure."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def initial_policy(action_space: SpaceSchema) -> str:
 
 
 def constant_action(space: SpaceSchema) -> Any:
-    """One action inside `space`, in plain Python values: zero where that is inside, else the nearest bound.
+    """One action inside `space`, in plain Python values: zero if it is inside, else the nearest bound.
 
-    ValueError for a kind of space that the protocol has no form for.
+    Raises ValueError for an unknown kind of space.
     """
     kind = space["type"]
     if kind == "Discrete":

@@ -1,4 +1,4 @@
-"""Stages the workspace before the agent starts: `AGENTS.md`, `system/policy.py`, `feedback/`. Once, and never again."""
+"""Stages the workspace once, before the agent starts: `AGENTS.md`, `system/policy.py`, `feedback/`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evopolicy_gateway.workspace.initial_policy import initial_policy
 
 
 def variables(folder: RunFolder) -> dict[str, str]:
-    """What an agent's process is told beside the URLs, as the published variables."""
+    """Variables of an agent's process other than the URLs, named as published."""
     return {
         "EVOPOLICYGYM_WORKSPACE": str(folder.workspace),
         "EVOPOLICYGYM_SYSTEM": str(folder.system),
@@ -22,9 +22,9 @@ def variables(folder: RunFolder) -> dict[str, str]:
 
 
 def stage(folder: RunFolder, run: RunOpened, urls: Urls) -> Staged:
-    """Makes the workspace of `run`, or leaves it as it is when that was done before.
+    """Creates the workspace of `run`; leaves an existing one unchanged.
 
-    `AGENTS.md` gets mode 0444. StorageError when the disk refuses.
+    `AGENTS.md` gets mode 0444. Raises StorageError when the disk refuses.
     """
     if folder.staged.exists():
         return saved(folder.staged, Staged)
