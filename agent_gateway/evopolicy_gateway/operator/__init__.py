@@ -1,1 +1,1 @@
-"""Operators' commands: several runs at once, the questions that they ask a cluster, and the view of it."""
+"""Operators' commands: several runs at once, requests to a cluster, and its live view."""

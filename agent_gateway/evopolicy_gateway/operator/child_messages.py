@@ -1,6 +1,6 @@
-"""What a parent and its child processes say to each other: JSON lines on the child's stdin and stdout.
+"""Messages between a parent and its child processes: JSON lines on the child's stdin and stdout.
 
-The child's stdout holds nothing else. When its stdin ends, its parent is gone, and it ends too.
+The child's stdout carries nothing else. The end of its stdin means that its parent is gone; the child then ends too.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ class Ready(Event, frozen=True, kw_only=True, tag="ready"):
     variables: dict[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs."""
     notes: tuple[str, ...] = ()
-    """What the operator should know of the run that was opened."""
+    """Notes for the operator about the opened run."""
     held_s: float = 0.0
     """As in `Progress`."""
     permit_s: float = 0.0
-    """Seconds for which the agent's permit was waited for."""
+    """Seconds spent waiting for the agent's permit."""
 
 
 class Waits(Event, frozen=True, kw_only=True, tag="waits"):
-    """The gateway waits, and not for the agent: before `Ready` for the agent's permit, at the end for the agent's end."""
+    """The gateway waits: before `Ready` for the agent's permit, at the end for the agent's end."""
 
     waits_for: str
-    """Empty: no longer."""
+    """Empty: the wait is over."""
 
 
 class Progress(Event, frozen=True, kw_only=True, tag="progress"):
-    """How far a run's train side is."""
+    """Progress of a run's train side."""
 
     episode_budget: int
     remaining_budget: int
     n_submits: int
     n_rejected: int = 0
     submit_id: str | None = None
-    """The submit that runs."""
+    """The running submit."""
     n_episodes: int = 0
     n_done: int = 0
     waits_for: str = ""
     last_submit_id: str | None = None
-    """The last one with a verdict."""
+    """The last submit with a verdict."""
     last_status: str | None = None
     last_mean: float | None = None
     best_mean: float | None = None
@@ -63,41 +63,41 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     in_flight_s: float = 0.0
     """Seconds in which a submit was in flight."""
     feedback_s: float = 0.0
-    """Of these, from the last result's arrival to the committed feedback."""
+    """Of these, seconds from the last result's arrival to the committed feedback."""
     held_s: float = 0.0
-    """Seconds for which submits of the run have waited so far because hidden episodes had the machines."""
+    """Seconds so far for which submits of the run waited because hidden episodes used the machines."""
     spent: bool = False
-    """No further submit can be taken, and none runs."""
+    """No further submit is possible, and none runs."""
     cancelled: bool = False
-    """The operator has ended the run."""
+    """The operator has cancelled the run."""
 
 
 class RunClosed(Event, frozen=True, kw_only=True, tag="closed"):
-    """The coordinator knows that no more submits come."""
+    """The coordinator has recorded that the run takes no more submits."""
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
-    """The agent has said something."""
+    """The agent has printed a message."""
 
     turn: int
     text: str
 
 
 class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
-    """The agent is at something else, has used more tokens, or waits for its provider."""
+    """The agent's activity changed, it used more tokens, or it waits for its provider."""
 
     action: str = ""
     tokens: dict[str, Any] | None = None
     """Of the run so far, as in `run.json`."""
     note: str = ""
-    """What the operator should know."""
+    """Note for the operator."""
     paused_s: float = 0.0
-    """It waits that long for `provider`; 0.0: it does not, or no longer."""
+    """Seconds that it waits for `provider`; 0.0 when it does not wait, or no longer."""
     provider: str = ""
 
 
 class AgentSurvives(Event, frozen=True, kw_only=True, tag="agent_survives"):
-    """Its time is over, but the kernel holds processes of it that were killed; `AgentEnded` comes when they are gone."""
+    """The agent was ended, but the kernel holds killed processes of it; `AgentEnded` follows when they are gone."""
 
     pids: tuple[int, ...]
 
@@ -112,9 +112,9 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """Prompts that it answered."""
     retries: int = 0
     facts: dict[str, Any] = {}
-    """What else `run.json` tells: `cli_version`, `model_string`, `settings`, `tokens`."""
+    """Further fields of `run.json`: `cli_version`, `model_string`, `settings`, `tokens`."""
     said: tuple[str, ...] = ()
-    """What a failed agent said last on stderr, without keys."""
+    """A failed agent's last lines on stderr, without keys."""
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
@@ -129,7 +129,7 @@ class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
 
 
 class AgentTime(Event, frozen=True, kw_only=True, tag="agent_time"):
-    """How much of its wall limit the agent has used since it was started."""
+    """Seconds of its wall limit that the agent has used since it was started."""
 
     used_s: float
 
@@ -138,39 +138,39 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """The first line to an agent supervisor."""
 
     agent: str
-    """As `--agent` takes it."""
+    """In the form of `--agent`."""
     workspace: str
     agent_log: str
     urls: dict[str, str]
-    """The `EVOPOLICYGYM_*` variables that hold URLs: what its jail lets through."""
+    """The `EVOPOLICYGYM_*` variables that hold URLs; the jail lets these URLs through."""
     variables: dict[str, str] = {}
-    """The others."""
+    """The other variables."""
     started_in: str
-    """Where the operator's command was given: file names in the agent's command are meant from there."""
+    """The operator's working directory; relative file names in the agent's command start there."""
     wall_limit_s: float
     config: dict[str, Any] | None = None
     """A coding agent's settings: `AgentConfig`."""
     session_file: str | None = None
     silence_s: float | None = None
-    """A program that does nothing for so long is ended; None: never for that."""
+    """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None
     """None: not jailed."""
     lock: str | None = None
-    """File that the agent supervisor holds while the agent may be alive; it waits for an agent supervisor before it that still does."""
+    """Lock file that the agent supervisor holds while the agent may be alive; it first waits for an earlier holder."""
 
 
 class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):
-    """To an agent supervisor: submits have waited so long in all since it was started, which counts against no limit of the agent."""
+    """To an agent supervisor: total seconds that submits waited since its start; they count against no agent limit."""
 
     seconds: float
 
 
 class SubmitsSeen(Order, frozen=True, kw_only=True, tag="submits_seen"):
-    """To an agent supervisor: the submits that the agent has asked for so far, refused ones too."""
+    """To an agent supervisor: the number of submits that the agent has requested so far, refused ones included."""
 
     asked: int
     running: bool
-    """One of them has no answer yet."""
+    """Whether one of them has no answer yet."""
 
 
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
@@ -186,14 +186,14 @@ _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
 
 MAX_LINE_BYTES = 1 << 20
-"""A line is no longer; whoever reads it takes four times as much."""
+"""Maximum length of a line; the reader accepts four times as much."""
 _MAX_TEXT = 2000
 
 
 def line(message: Event | Order) -> bytes:
-    """A message as one line of JSON; without what would make it too long, which an agent's CLI may have said.
+    """Encodes a message as one line of JSON, shortened if it is too long, which an agent's CLI may cause.
 
-    The operator's own settings, in `StartAgent`, are left whole.
+    `StartAgent`, with the operator's own settings, is never shortened.
     """
     data = msgspec.json.encode(message) + b"\n"
     if len(data) <= MAX_LINE_BYTES or isinstance(message, StartAgent):
@@ -210,7 +210,7 @@ def line(message: Event | Order) -> bytes:
 
 
 def event_of(data: bytes) -> AnyEvent:
-    """The event in a line; ProtocolError for anything else."""
+    """Decodes a line. Raises ProtocolError when it is no event."""
     try:
         return _events.decode(data)
     except DECODE_ERRORS as error:
@@ -218,7 +218,7 @@ def event_of(data: bytes) -> AnyEvent:
 
 
 def emit(event: Event) -> None:
-    """Tells the parent; what it no longer hears is dropped."""
+    """Sends an event to the parent; dropped when the parent is gone."""
     try:
         os.write(sys.stdout.fileno(), line(event))
     except BrokenPipeError:
@@ -226,20 +226,20 @@ def emit(event: Event) -> None:
 
 
 class Orders:
-    """The parent's orders, on the event loop; None when its end of the pipe is gone."""
+    """The parent's orders, on the event loop; None when the parent's end of the pipe is closed."""
 
     def __init__(self) -> None:
         self._queue: asyncio.Queue[AnyOrder | None] = asyncio.Queue()
         loop = asyncio.get_running_loop()
-        # A thread, since a pipe inherited as stdin may not be set non-blocking: it is shared with the parent.
+        # In a thread: a pipe inherited as stdin is shared with the parent and may not be set non-blocking.
         threading.Thread(target=self._read, args=(loop,), name="orders", daemon=True).start()
 
     async def next(self) -> AnyOrder | None:
-        """The next order; waits for it."""
+        """Waits for the next order."""
         return await self._queue.get()
 
     def end(self) -> None:
-        """As if the parent were gone: for a signal."""
+        """Acts as if the parent were gone; for a signal handler."""
         self._queue.put_nowait(None)
 
     def _read(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -252,6 +252,6 @@ class Orders:
                         continue
                     loop.call_soon_threadsafe(self._queue.put_nowait, order)
         finally:
-            # Who hears no more orders, for whatever reason, ends as when its parent is gone.
+            # A child that can no longer read orders, for whatever reason, ends as if its parent were gone.
             with contextlib.suppress(RuntimeError):  # the loop is closed already
                 loop.call_soon_threadsafe(self._queue.put_nowait, None)

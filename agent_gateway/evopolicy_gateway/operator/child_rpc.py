@@ -1,4 +1,4 @@
-"""Child processes of an operator's command that speak the lines of `control.py`, and the end of what they leave behind."""
+"""Child processes of an operator's command that exchange the lines of `child_messages.py`; ending their orphans."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evopolicy_gateway.run import processes
 
 
 async def end_orphans() -> list[int]:
-    """Ends what has become this process's child by its parent's death; returns what survives, which the kernel holds."""
+    """Ends children inherited from dead parents; returns the ids of survivors, which the kernel holds."""
     async with child_process.starting():
         return await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
 
@@ -22,13 +22,13 @@ class Child(ChildProcess):
     """A running child, started with `talks=True`."""
 
     async def events(self) -> AsyncIterator[AnyEvent]:
-        """What it says, until it ends."""
+        """Yields the child's events until it ends."""
         assert self._process.stdout is not None
         while data := await self._process.stdout.readline():
             yield event_of(data)
 
     async def tell(self, order: Order) -> None:
-        """Gives an order; one to a child that is gone is dropped."""
+        """Sends an order; dropped when the child is gone."""
         stdin = self._process.stdin
         assert stdin is not None
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):

@@ -1,4 +1,4 @@
-"""The cluster that a command uses: an operator's, or one of this machine brought up for it."""
+"""The cluster of a command: an operator's, or a local one that the command starts."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from evopolicy_gateway.operator.operations import Operations, find_credentials
 
 
 class Cluster(msgspec.Struct, frozen=True, kw_only=True):
-    """Which cluster a command uses: a local one with so many slots, or the one that is named (or this machine's own)."""
+    """Which cluster a command uses: a local one with `local_slots` slots, the named one, or this machine's own."""
 
     connect: tuple[str, ...] = ()
     file: Path | None = None
     """The operator's credentials."""
     local_slots: int | None = None
     state: Path | None = None
-    """Of a local one: its folder; None for one that is thrown away."""
+    """State folder of a local cluster; None for a temporary one."""
     unjailed: bool = False
-    """Of a local one with a state: agents could read it."""
+    """For a local cluster with a state: its agents have no jail and could read that state."""
     data: Path | None = None
     audit: float = 0.0
-    """Of a local one: share of the episodes that a second worker plays again."""
+    """For a local cluster: share of the episodes, 0 to 1, that a second worker replays."""
     hidden_isolation: str | None = None
-    """Of a local one: as `evopolicy-coordinator --hidden-isolation` takes it; None for its default."""
+    """For a local cluster: as `--hidden-isolation` of `evopolicy-coordinator`; None for its default."""
     web: Path | None = None
     """Folder of runs that a live view shows meanwhile; None for no view."""
 
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
-        """ConfigError where a local one has not the case files that a run plays."""
+        """Raises ConfigError when a local cluster lacks the case files that a run plays."""
         if (
             self.local_slots is not None
             and self.data is None
@@ -55,18 +55,18 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Reached(NamedTuple):
-    """A cluster that answers."""
+    """A reachable cluster."""
 
     operations: Operations
     gateway: Credentials
-    """The gateways'."""
+    """Credentials of the gateway role."""
     local: LocalCluster | None
-    """One that was brought up here."""
+    """The local cluster that was started here."""
 
 
 @contextlib.asynccontextmanager
 async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterator[Reached]:
-    """A link to the cluster, which is brought up where it is a local one, with these workers."""
+    """Connects to the cluster; a local one is started first, with `workers`."""
     async with contextlib.AsyncExitStack() as stack:
         local: LocalCluster | None = None
         file, opened = where.file, None
@@ -96,9 +96,9 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
 async def connected(
     where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
 ) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
-    """A link to the cluster, the gateways' credentials, and what fails when a local cluster cannot be kept up.
+    """Connects to the cluster. Yields operations, gateway credentials, and a future that fails with a local cluster.
 
-    `tiers`: sandbox tiers that will be asked for, without which a local cluster fails.
+    `tiers`: sandbox tiers that will be requested; a local cluster without them fails.
     """
     end_on_sigterm()
     workers = None if where.local_slots is None else Workers(env_ids, where.local_slots, tiers)

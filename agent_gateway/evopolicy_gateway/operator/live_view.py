@@ -1,4 +1,4 @@
-"""`--web`: the live view of a command's runs, as a process of its own that ends with the command."""
+"""`--web`: the live view of a command's runs, in its own process that ends with the command."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _GRACE_S = 5.0
 
 @contextlib.asynccontextmanager
 async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> AsyncIterator[None]:
-    """Shows the runs in `root` and the cluster inside the `async with`, and says where. ConfigError when it does not start."""
+    """Shows the runs in `root` and the cluster inside the `async with`; prints the URL.
+
+    Raises ConfigError when the view does not start.
+    """
     root.mkdir(parents=True, exist_ok=True)
     with scratch_folder("view") as folder:
         address, log = folder / "address", folder / "view.log"
@@ -44,7 +47,7 @@ async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> As
                     f" `evopolicy web {root}`"
                 ) from error
             say(f"view: {address.read_text()}", err=True)
-            address.unlink()  # it holds the token, and an agent without a jail reads this user's files
+            address.unlink()  # it holds the token, and an agent without a jail can read this user's files
             yield
         finally:
             await child.end(_GRACE_S)

@@ -1,4 +1,4 @@
-"""One command at a time: a lock file that names who holds it, and that its holder's death lets go of, whatever killed it."""
+"""One command at a time: a lock file that names its holder and is released by the holder's death, however it dies."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _PAUSE_S = 0.2
 
 @contextlib.contextmanager
 def alone(lock: Path, what: Path) -> Iterator[None]:
-    """Holds `lock`, a file that is made for it and removed at the end, for the use of `what`.
+    """Holds `lock`, a file created for it and removed at the end, for the use of `what`. Not re-entrant.
 
-    ConfigError with who holds it when somebody does. It is not re-entrant.
+    Raises ConfigError that names the holder when the lock is taken.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     fd = _taken(lock, what)
@@ -38,7 +38,7 @@ def alone(lock: Path, what: Path) -> Iterator[None]:
 
 
 def check_free(lock: Path, what: Path) -> None:
-    """ConfigError with who holds the lock, when somebody does."""
+    """Raises ConfigError that names the holder when the lock is taken."""
     try:
         fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -50,7 +50,7 @@ def check_free(lock: Path, what: Path) -> None:
 
 
 async def until_free(lock: Path, what: Path) -> None:
-    """Returns once nobody holds the lock."""
+    """Waits until nobody holds the lock."""
     while True:
         try:
             return check_free(lock, what)
@@ -63,7 +63,7 @@ def _taken(lock: Path, what: Path) -> int:
         fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             _lock(fd, what)
-            # The one who held it may have removed the file between the two calls: then it locks nobody out.
+            # The previous holder may have removed the file between the two calls; a lock on that file excludes nobody.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(fd), lock.stat()):
                     return fd

@@ -1,4 +1,4 @@
-"""What an operator's command asks the coordinator: opening and following runs, playing cases outside any run."""
+"""Requests of an operator's command to the coordinator: opening and following runs, playing cases outside any run."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ _UNAVAILABLE_PAUSE_S = 1.0
 
 
 class Operations(OperatorClient):
-    """An operator's link as runs need it: where settings are why the coordinator says no, it is a ConfigError."""
+    """An operator's client for runs. Raises ConfigError when the coordinator refuses because of settings."""
 
     def __init__(self, link: Link, opened: Callable[[str, Sequence[Path]], None] | None = None) -> None:
-        """`opened`: as `LocalCluster.opened`; None for a cluster that is not ours."""
+        """`opened`: as `LocalCluster.opened`; None for a cluster that was not started here."""
         super().__init__(link)
         self._opened = opened
 
     def watched_by(self, run: str, locks: Sequence[Path]) -> None:
-        """The run's agent is alive only as long as one of these locks is held."""
+        """Declares that the run's agent is alive only while one of these locks is held."""
         if self._opened is not None:
             self._opened(run, locks)
 
     async def create(self, settings: RunSettings, key: str) -> RunCreated:
-        """Opens a run; the same key gives the same run."""
+        """Opens a run; the same key returns the same run. Raises ConfigError for refused settings."""
         message = CreateRun(token=self._token, key=key, settings=settings)
         try:
             return await self._once_available("create", message, RunCreated, timeout_s=TIMEOUT_S)
@@ -61,7 +61,7 @@ class Operations(OperatorClient):
             raise _settings_error(error) from error
 
     async def wait(self, run: str) -> AsyncIterator[RunProgress]:
-        """How far the run is, every few seconds; the last one holds the finished run."""
+        """Yields the run's progress every few seconds; the last one holds the finished run."""
         while True:
             message = WaitRun(token=self._token, run=run, wait_s=WAIT_S)
             progress = await self._requests.until_answered("wait", message, RunProgress, wait_s=WAIT_S)
@@ -70,7 +70,7 @@ class Operations(OperatorClient):
                 return
 
     async def phase(self, run: str) -> str | None:
-        """Where the run is now, as `RunProgress.phase`; None when the cluster does not know it."""
+        """The run's current phase, as `RunProgress.phase`; None when the cluster does not know the run."""
         message = WaitRun(token=self._token, run=run, wait_s=0.0)
         try:
             return (await self._requests.until_answered("wait", message, RunProgress, wait_s=0.0)).phase
@@ -86,7 +86,7 @@ class Operations(OperatorClient):
         run: str = "",
         result: dict[str, Any] | None = None,
     ) -> ClaimState:
-        """Takes, renews, gives back (`ttl_s` 0) or settles (`result`) a run of a sweep."""
+        """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
         message = Claim(
             token=self._token, suite=suite, name=name, holder=holder, ttl_s=ttl_s, run=run, result=result
         )
@@ -95,7 +95,7 @@ class Operations(OperatorClient):
     async def _once_available(
         self, verb: str, message: Message, wanted: type[T], timeout_s: float | None = None
     ) -> T:
-        """The answer, asked for again as long as the coordinator takes nothing new; says once why it does not."""
+        """Returns the answer; retries while the coordinator is unavailable, and logs the reason once."""
         told = ""
         while True:
             try:
@@ -109,10 +109,10 @@ class Operations(OperatorClient):
             await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
 
     async def drop(self, folder: RunFolder) -> None:
-        """Ends the run that a folder holds open, so that it is played no more and its agent's permit ends with it.
+        """Cancels the open run of a folder, so that it plays no more and its agent's permit ends.
 
-        The agent of a command that was killed may still be ending: that is waited for. Does nothing where there is none, or
-        the cluster does not know it.
+        Waits for the agent of a killed command, which may still be ending. Does nothing without such a run, or when the
+        cluster does not know it.
         """
         if not folder.opened.exists():
             return
@@ -136,7 +136,9 @@ class Operations(OperatorClient):
 
 
 def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Credentials, Credentials]:
-    """The operator's credentials, and the gateways' that lie beside them. ConfigError says where it looked."""
+    """Returns the operator's and the gateways' credentials, which lie side by side. ConfigError names the places
+    searched.
+    """
     operator = credentials.find("operator", connect, file)
     beside = file if file is None or file.is_dir() else file.parent / "gateway.json"
     return operator, credentials.find("gateway", connect, beside)

@@ -1,4 +1,4 @@
-"""Playing cases outside any run: `evopolicy try` and `evopolicy random`."""
+"""Plays cases outside any run: `evopolicy try` and `evopolicy random`."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 
     case: int
     episode_return: float | None
-    """None where nothing was played, because the first case showed that there is no Policy to play."""
+    """None when nothing was played, because the first case showed that the code yields no Policy."""
     length: int
     failure: str | None = None
-    """Category, step and message, when the policy failed. Uniform random actions played from that step on."""
+    """Category, step and message of the policy's failure; uniform random actions played from that step on."""
     failed_at: int | None = None
-    """The step at which it failed; None where it did not, or failed before its first."""
+    """Step of the failure; None without a failure, or before the first step."""
     folder: str | None = None
 
     @property
     def played_by(self) -> str:
-        """Whose actions the return is of."""
+        """Whose actions produced the return."""
         if self.episode_return is None:
             return "not played"
         if self.failure is None:
@@ -65,23 +65,26 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a trial came to."""
+    """The result of a trial."""
 
     env: str
     mean_return: float | None
-    """Over the cases in which the policy did not fail; None where there is none."""
+    """Mean over the cases in which the policy did not fail; None when there are none."""
     std_return: float | None
     """Population standard deviation over the same cases."""
     n_failed: int
-    """Cases in which the policy failed; their returns, mostly of random actions, are in no mean."""
+    """Cases in which the policy failed; their returns, mostly of random actions, are excluded from the mean."""
     episodes: tuple[TriedEpisode, ...]
     folder: str | None = None
     other_cases_next_time: bool = False
-    """The cases came from the secret of a cluster that is gone now: another call has others under the same ids."""
+    """The cases derive from the secret of a temporary cluster: another call has other cases under the same ids."""
 
 
 async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
-    """Plays the policy and prints what came of it; 1 when it failed in an episode, else 0. ConfigError for no policy."""
+    """Plays the policy and prints the results; returns 1 if it failed in an episode, else 0.
+
+    Raises ConfigError when the folder holds no policy.
+    """
     bundle = policy_bundle(trial.policy)
     check_writable(trial.out, "--out")
     console = terminal(stderr=as_json)
@@ -137,7 +140,7 @@ async def play_random(
                 split=msgspec.convert(split, Split),
                 cases=cases,
                 record="actions",
-                # No policy plays, so nothing needs a sandbox; a worker of another cluster may offer no tier `none`.
+                # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
                 sandbox_tier="bwrap" if where.local_slots is None else "none",
                 step_limit="published",
                 definition=catalogue.pinned(env_id),
@@ -160,7 +163,7 @@ async def play_random(
 
 
 async def _outcomes(operations: Operations, message: Evaluate, console: Terminal) -> list[EpisodeOutcome]:
-    """All outcomes in the order asked for."""
+    """Returns all outcomes in the requested order."""
     outcomes: list[EpisodeOutcome] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(message.env, total=None)
@@ -206,7 +209,9 @@ def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
 
 
 def policy_bundle(policy: Path) -> bundles.Bundle:
-    """The policy in a folder, or in `system/` below it. ConfigError where there is none that can be sent."""
+    """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or not
+    sendable.
+    """
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
         raise ConfigError(f"{policy} holds no policy.py")

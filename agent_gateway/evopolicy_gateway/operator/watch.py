@@ -1,7 +1,7 @@
-"""What an operator sees of runs while they go on: a live table on a terminal, plain lines elsewhere.
+"""The operator's view of running runs: a live table on a terminal, plain lines elsewhere.
 
-A view keeps what it is told of each run, and makes events of it. On a terminal the table shows what is kept, and a few
-kinds of events scroll by above it; elsewhere every event that has words is a line.
+A view stores the reports of each run and derives events from them. On a terminal the table shows the stored state, and
+a few kinds of events scroll by above it; elsewhere every event with a text is printed as a line.
 """
 
 from __future__ import annotations
@@ -31,36 +31,36 @@ PHASES = {
 
 
 class Watch(Protocol):
-    """Is told what happens to runs; `run` is a run's short name."""
+    """Receives the reports of runs; `run` is a run's short name."""
 
     def held(self, run: str, what: str) -> None:
-        """It may not begin, or not be closed, before `what`; empty: it may now."""
+        """The run may not start, or may not be closed, before `what`; empty: it may now."""
 
     def note(self, run: str, text: str) -> None:
         """Something worth a line."""
 
     def progress(self, run: str, progress: Progress) -> None:
-        """The agent's side has moved."""
+        """The train side has progressed."""
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        """The agent has said something."""
+        """The agent has printed a message."""
 
     def doing(self, run: str, doing: AgentDoing) -> None:
-        """The agent is at something else, or has used more tokens."""
+        """The agent's activity changed, or it used more tokens."""
 
     def phase(self, run: str, progress: RunProgress) -> None:
-        """Finalisation has moved."""
+        """The finalisation has progressed."""
 
 
 class Row:
-    """What is known of one run."""
+    """The known state of one run."""
 
     def __init__(self) -> None:
         self.progress: Progress | None = None
         self.phase: RunProgress | None = None
         self.action = ""
         self.held = ""
-        """What it may not begin before; also in `waits_for`."""
+        """What it waits for before it may start or close; also in `waits_for`."""
         self.waits_for = ""
 
 
@@ -68,16 +68,16 @@ R = TypeVar("R", bound=Row)
 
 
 class View(ABC, Generic[R]):
-    """A `Watch` with a row a run."""
+    """A `Watch` with one row per run."""
 
     new_row: Callable[[], R]
     no_news: tuple[str, ...] = ("",)
-    """What a run may wait for without an event."""
+    """Reasons for waiting that produce no event."""
     above: tuple[str, ...]
-    """Kinds of events that are told above the table."""
+    """Kinds of events that are printed above the table."""
 
     def __init__(self, console: Terminal | None) -> None:
-        """`console` None: it tells nobody."""
+        """`console` None: prints nothing."""
         self.rows: dict[str, R] = {}
         self._console = console
         self._drawn = console is not None and console.is_terminal
@@ -85,7 +85,7 @@ class View(ABC, Generic[R]):
 
     @contextlib.contextmanager
     def shown(self) -> Iterator[Self]:
-        """As a table, where the console is a terminal."""
+        """Shows the table inside the `with` if the console is a terminal."""
         with contextlib.ExitStack() as stack:
             if self._drawn:
                 stack.enter_context(
@@ -100,10 +100,10 @@ class View(ABC, Generic[R]):
 
     @abstractmethod
     def render(self) -> RenderableType:
-        """The table as it is now."""
+        """Returns the current table."""
 
     def words(self, kind: str, run: str, told: dict[str, Any]) -> str:
-        """An event as people read it; empty for one that is not worth a line."""
+        """The event's text for people; empty if it is not worth a line."""
         if kind == "phase":
             return PHASES[told["phase"]]
         if kind == "turn":
@@ -113,13 +113,13 @@ class View(ABC, Generic[R]):
         return str(told.get("text", ""))
 
     def event(self, kind: str, run: str, **more: Any) -> None:
-        """Says that something happened."""
+        """Reports an event."""
         if self._console is None or (self._drawn and kind not in self.above):
             return
         if text := self.words(kind, run, more):
             self._print(f"{run}: {text}" if run else text)
 
-    # What a run tells.
+    # Reports of a run.
 
     def note(self, run: str, text: str) -> None:
         self.row(run)
@@ -163,7 +163,7 @@ class View(ABC, Generic[R]):
         self.waits_for(run, progress.waits_for)
 
     def waits_for(self, run: str, what: str, kind: str = "waits") -> None:
-        """It waits for that now; told once."""
+        """Stores the reason for the run's wait; reports it once."""
         self.row(run).waits_for = what
         if what not in self.no_news and self.is_new(run, "waits", what):
             self.event(kind, run, what=what)
@@ -174,7 +174,7 @@ class View(ABC, Generic[R]):
         return self.rows[run]
 
     def is_new(self, run: str, kind: str, value: object) -> bool:
-        """Whether another value of that kind was told of the run last."""
+        """Whether the last value of that kind for the run differs from `value`."""
         key = f"{run} {kind}"
         if self._said.get(key) == value:
             return False
@@ -187,7 +187,7 @@ class View(ABC, Generic[R]):
 
 
 class RunView(View[Row]):
-    """Of the runs of `evopolicy run` and `evopolicy local`."""
+    """The view of `evopolicy run` and `evopolicy local`."""
 
     new_row = Row
     above = ("note", "held")
@@ -246,5 +246,5 @@ def _bar(part: int, whole: int, width: int = 12) -> str:
 
 
 def first_line(text: str) -> str:
-    """The start of a text's first line, harmless."""
+    """The start of a text's first line, at most 120 characters, with unprintable characters replaced."""
     return harmless((text.strip().splitlines() or [""])[0][:120])
