@@ -1,5 +1,4 @@
-"""The address that serves a remote agent (`run --agent remote --http HOST:PORT`), and the machine where an agent is
-alive.
+"""The address that serves a remote agent (`run --agent remote --http HOST:PORT`), and the machine of an agent.
 
 - The service listens on an address other than loopback only when the operator names it. Then every request needs the
   bearer token, even on loopback.
@@ -118,9 +117,7 @@ def agent_place(folder: RunFolder) -> AgentPlace:
 
 
 def ends_unseen(folder: RunFolder) -> bool:
-    """Whether only the operator can report the agent's end: it was not started here and may use the cluster's
-    machines.
-    """
+    """Whether only the operator can report the agent's end: it was not started here and may be on a cluster machine."""
     return folder.listener.exists() and _agent_host(folder) != ELSEWHERE
 
 

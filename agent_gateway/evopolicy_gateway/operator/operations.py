@@ -136,9 +136,7 @@ class Operations(OperatorClient):
 
 
 def find_credentials(connect: tuple[str, ...], file: Path | None) -> tuple[Credentials, Credentials]:
-    """Returns the operator's and the gateways' credentials, which lie side by side. ConfigError names the places
-    searched.
-    """
+    """Returns the operator's and the gateways' credentials, from one folder. ConfigError names the places searched."""
     operator = credentials.find("operator", connect, file)
     beside = file if file is None or file.is_dir() else file.parent / "gateway.json"
     return operator, credentials.find("gateway", connect, beside)

@@ -209,9 +209,7 @@ def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
 
 
 def policy_bundle(policy: Path) -> bundles.Bundle:
-    """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or not
-    sendable.
-    """
+    """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or invalid."""
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
         raise ConfigError(f"{policy} holds no policy.py")

@@ -265,8 +265,9 @@ class RunLifecycle:
             await self._gateway.tell(self._order)
 
     async def _follow(self) -> None:
-        """Prints the reason while the run waits to be served. Ends the agent when the run is cancelled at the
-        coordinator, because the gateway may not learn of that.
+        """Prints why the run is not served yet, and ends the agent when the run is cancelled at the coordinator.
+
+        The gateway may not learn of such a cancellation.
         """
         waiting = Waiting()
         async for progress in self._operations.wait(self.run):

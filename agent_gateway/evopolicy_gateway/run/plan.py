@@ -104,8 +104,9 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         ]
 
     def check(self) -> None:
-        """Raises ConfigError when the agent cannot start, its jail is not available, or the run's folder is not, such
-        as a folder that may not be overwritten.
+        """Raises ConfigError when the agent cannot start, or when its jail or the run's folder is not available.
+
+        A folder that holds a run is not available unless `overwrite` or `resume` is set.
         """
         check_free(self.folder.lock, self.folder.root)
         self.check_held()
