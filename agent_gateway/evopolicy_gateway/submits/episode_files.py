@@ -12,20 +12,20 @@ from evopolicy_common.records.summary import SCHEMA_VERSION, utc_text
 from evopolicy_gateway.submits.formatting import cut_text, failure_line
 
 FEEDBACK_ERROR = "feedback_error"
-"""Category of the line in `error.txt` that tells of a fault of ours: the policy did not fail."""
+"""Category of the line in `error.txt` that reports an infrastructure failure; the policy did not fail."""
 
 
 LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "trajectory.jsonl")
-"""What an episode does without, in this order, until its files fit into its share."""
+"""Files that are left out, in this order, until the episode's files fit into its share."""
 
 
 def episode_share(limits: ResourceLimits, episode_budget: int) -> int:
-    """What the files of one episode may take, bytes."""
+    """Maximum size of one episode's files, bytes."""
     return limits.feedback_bytes // max(1, episode_budget)
 
 
 def within_share(files: dict[str, bytes], share: int) -> dict[str, bytes]:
-    """The files that fit into `share` bytes; `left_out.txt` names the others."""
+    """Returns the files that fit into `share` bytes; `left_out.txt` names the others."""
     size = sum(map(len, files.values()))
     told: list[str] = []
     kept = dict(files)
@@ -49,10 +49,10 @@ def episode_files(
     at: float,
     share: int,
 ) -> dict[str, bytes]:
-    """What `episodes/ep_XXX/` holds, in at most `share` bytes beside what the policy printed.
+    """Returns the files of `episodes/ep_XXX/`, at most `share` bytes without the policy's printed output.
 
-    `packed` is a rendered episode or, from workers of earlier versions, a trajectory; `at` the Unix time written into
-    `error.txt`. ProtocolError when it is neither, or not of the length and return that were declared.
+    `packed`: a rendered episode or, from workers of earlier versions, a trajectory. `at`: Unix time for `error.txt`,
+    seconds. Raises ProtocolError when `packed` is neither, or has another length or return than declared.
     """
     if rendered.is_rendered(packed):
         files = rendered.checked_files(packed, episode.length, episode.episode_return)
@@ -64,7 +64,7 @@ def episode_files(
 
 
 def set_aside_files(episode: EpisodeFeedback, why: str, *, at: float) -> dict[str, bytes]:
-    """What the folder of an episode holds whose trajectory cannot be written: all but that, and the reason."""
+    """Returns the files of an episode whose trajectory cannot be written: all others, and the reason."""
     files = _told_files(episode, at)
     line = {
         "schema_version": SCHEMA_VERSION,

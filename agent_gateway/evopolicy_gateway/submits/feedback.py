@@ -1,8 +1,10 @@
-"""The feedback tree on disk: episodes stream into `submit_NNN.partial/`, one rename makes it `submit_NNN/`.
+"""The feedback tree on disk: episodes are written to `submit_NNN.partial/`, which one rename turns into `submit_NNN/`.
 
-Rules: everything in a folder is durable before the rename, `summary.json` is written last; a folder without `.partial`
-is whole and never changes; what an agent may have put in the way is removed, never followed. What is in a `.partial`
-need not be durable, as it is written again after a crash: one flush of the file system at the end serves all its files.
+- Everything in a folder is durable before the rename; `summary.json` is written last.
+- A folder without `.partial` is complete and never changes.
+- Whatever an agent may have put in the way is removed, never followed.
+- A `.partial` folder need not be durable, because it is rewritten after a crash: one flush of the file system at the
+  end covers all its files.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ SUMMARY = "summary.json"
 class SubmitTree:
     """One submit's folder while it is written. Not thread-safe; every call may block on the disk and raise OSError.
 
-    After an OSError call `begin` and write everything again.
+    After an OSError, call `begin` and write everything again.
     """
 
     def __init__(self, feedback: Path, submit_id: str) -> None:
@@ -34,7 +36,7 @@ class SubmitTree:
         return self._final
 
     def begin(self) -> None:
-        """An empty `.partial` folder, whatever was there before."""
+        """Creates an empty `.partial` folder, replacing an earlier one."""
         give_back_rights(self._feedback.parent)
         if self._feedback.is_symlink() or not self._feedback.is_dir():
             _remove(self._feedback)
@@ -43,7 +45,7 @@ class SubmitTree:
         (self._partial / "episodes").mkdir(parents=True)
 
     def put_episode(self, name: str, files: Mapping[str, bytes]) -> None:
-        """An episode's folder with its files; shows up whole."""
+        """Writes an episode's folder with its files; the folder appears complete."""
         episodes = self._partial / "episodes"
         hidden, shown = episodes / f".{name}", episodes / name
         try:
@@ -57,21 +59,21 @@ class SubmitTree:
         try:
             os.rename(hidden, shown)
         except OSError:
-            # Something stands there: it is removed, never followed.
+            # The name is taken: its entry is removed, never followed.
             _remove(shown)
             os.rename(hidden, shown)
 
     def drop_episode(self, name: str) -> None:
-        """Takes an episode's folder back; what is not there is no error."""
+        """Removes an episode's folder, if it exists."""
         _remove(self._partial / "episodes" / name)
 
     def commit(self, summary: bytes, errors: bytes | None) -> None:
-        """Writes `errors.txt` (unless None), then `summary.json`, and gives the folder its name."""
+        """Writes `errors.txt` (unless None), then `summary.json`, and renames the folder."""
         if errors is not None:
             _write(self._partial / "errors.txt", errors)
         _write(self._partial / SUMMARY, summary)
         sync_filesystem(self._partial)
-        # Left by a gateway that died between the rename and its journal, or put there by the agent.
+        # Left by a gateway that died between the rename and its journal entry, or put there by the agent.
         _remove(self._final)
         self._partial.rename(self._final)
         fsync_directory(self._feedback)

@@ -1,6 +1,6 @@
-"""Feedback as bytes: pure functions from what happened to what the files hold, the same bytes every time.
+"""Feedback as bytes: pure functions from results to file contents, deterministic to the byte.
 
-How values are spelled is `records.json_text`'s.
+`records.json_text` defines how values are written.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from evopolicy_common.records.json_text import json_bytes, plain
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
 
 MAX_TEXT_BYTES = 64 << 10
-"""Of stdout.txt, stderr.txt, error.txt, errors.txt each."""
+"""Maximum size of each of stdout.txt, stderr.txt, error.txt and errors.txt."""
 
 
 _MAX_WARNED = 300
@@ -27,7 +27,7 @@ _MAX_WARNED = 300
 
 
 class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
-    """What the summary needs of one episode."""
+    """One episode's values for the summary."""
 
     index: int
     """Request index."""
@@ -38,18 +38,18 @@ class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
     """How the policy failed; None when it did not."""
     reward_components: dict[str, float] = {}
     success: bool | None = None
-    """Whether the task was solved; None where nothing tells."""
+    """Whether the task was solved; None when the environment does not report it."""
 
 
 def cut_text(data: bytes) -> bytes:
-    """At most `MAX_TEXT_BYTES` of a stream."""
+    """The first `MAX_TEXT_BYTES` of a stream."""
     return data[:MAX_TEXT_BYTES]
 
 
 def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes:
     """A failure as a line of `errors.txt` or, with the step, of an episode's `error.txt`; cut to 64 KiB.
 
-    `at` is Unix time in seconds.
+    `at`: Unix time, seconds.
     """
     line: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -66,9 +66,9 @@ def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes
 
 
 def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes:
-    """The line of `errors.txt` that says why a submit is not ok; its category is the submit's status.
+    """The line of `errors.txt` with the reason why a submit is not ok; its category is the submit's status.
 
-    The cause's own category leads the message where the two differ.
+    The failure's own category precedes the message when the two differ.
     """
     if failure is None:
         message = {
@@ -93,7 +93,10 @@ def summary_bytes(
     scores: Sequence[EpisodeScore],
     observations: ObservationForm = "arrays",
 ) -> bytes:
-    """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order."""
+    """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order.
+
+    Raises ValueError when an ok submit lacks an episode.
+    """
     told = plain(msgspec.to_builtins(_summary(env, submit_index, done, scores, observations)))
     return msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n"
 
@@ -144,7 +147,7 @@ def _summary(
 
 
 def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm) -> str | None:
-    """What an agent must not overlook in the numbers of an ok submit; None where no episode failed."""
+    """The warning to the agent about policy failures in an ok submit; None when no episode failed."""
     failures = [score.failure for score in scores if score.failure is not None]
     if not failures:
         return None
@@ -162,7 +165,7 @@ def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm) -> s
 
 
 def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) -> tuple[int, ...]:
-    """Local indices of the episodes that failed in one of `categories` (None: in any)."""
+    """Request indices of the episodes that failed in one of `categories` (None: in any)."""
     return tuple(
         score.index
         for score in scores
@@ -176,7 +179,7 @@ def _component_means(components: Sequence[dict[str, float]]) -> dict[str, float]
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Arithmetic mean, correctly rounded; NaN or infinite when a value is."""
+    """Arithmetic mean, correctly rounded; NaN or infinite if a value is."""
     return _exact_sum(values) / len(values)
 
 
@@ -195,7 +198,9 @@ def _exact_sum(values: Sequence[float]) -> float:
 
 
 def _fitting(line: dict[str, Any]) -> bytes:
-    """The line with its traceback, then its message, cut until it fits 64 KiB; of a traceback the end tells most."""
+    """The line, its traceback and then its message cut to fit 64 KiB. A traceback keeps its end, the most useful
+    part.
+    """
     for field in ("traceback", "message"):
         text = str(line[field])
         keep = len(text)

@@ -1,7 +1,7 @@
-"""What the gateway must not forget: every request before it is sent, and what came of it. JSON lines, fsynced.
+"""The gateway's journal: every request before it is sent, and its result. JSON lines, fsynced.
 
-It lies outside the workspace. After a restart the gateway asks again by key whatever has no end here, and completes the
-feedback tree from the answers. A torn last line (the machine died while it was written) is cut off.
+It lies outside the workspace. After a restart the gateway repeats, by key, every request without a result here, and
+completes the feedback tree from the answers. An incomplete last line (from a machine crash) is cut off.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     """A submit that passed the checks; written before anything of it is sent."""
 
     key: str
-    """Idempotency key towards the coordinator."""
+    """Idempotency key for the coordinator."""
     client_key: str | None
     """The agent's `Idempotency-Key`."""
     body_digest: str
@@ -41,7 +41,7 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
 
 
 class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
-    """The coordinator has it: durable and charged."""
+    """The coordinator has accepted it: durable and charged."""
 
     key: str
     submit_index: int
@@ -59,7 +59,7 @@ class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
 
 
 class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
-    """The coordinator did not take it; nothing was charged."""
+    """The coordinator refused it; nothing was charged."""
 
     key: str
     status: str
@@ -67,33 +67,33 @@ class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
 
 
 class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
-    """A request that broke the format or the bounds: refused here, before the snapshot."""
+    """A request with an invalid form or outside the bounds, refused here before the snapshot."""
 
     status: str
     message: str
     at: float
     """Unix time, seconds."""
     after_submits: int
-    """Accepted submits before it."""
+    """Number of submits accepted before it."""
 
 
 class Died(Entry, frozen=True, kw_only=True, tag="died"):
-    """A gateway ended while it worked on a submit, or on the feedback of some of its episodes."""
+    """A gateway died while it worked on a submit, or on the feedback of some of its episodes."""
 
     key: str
     episodes: tuple[int, ...] = ()
-    """Their request indexes; empty: it was the submit as a whole."""
+    """Request indices of these episodes; empty: the submit as a whole."""
 
 
 class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
-    """A submit that the gateway could not go on with, twice: it has no feedback, and is not tried again."""
+    """A submit on which the gateway failed twice: it has no feedback and is not retried."""
 
     key: str
     message: str
 
 
 class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
-    """The coordinator was told that no more submits come."""
+    """The coordinator has recorded that no more submits come."""
 
     reason: str
 
@@ -103,18 +103,19 @@ _decoder = msgspec.json.Decoder(AnyEntry)
 
 
 class AtWork:
-    """Which episodes' files are being made, kept so that a process which is killed over one is known to have been.
+    """Records which episodes' files are being made, so that the next process knows what this one died over.
 
-    One small record each, written in place: it has to survive the process only, and costs microseconds.
+    One small record per episode, written in place without fsync: it only has to survive the process, and costs
+    microseconds.
     """
 
     _RECORD = 64
 
     def __init__(self, path: Path) -> None:
-        """`died_over` holds what the last process left; it is to be written down before the first `begin`."""
+        """Reads the last process's records into `died_over`; journal them before the first call of `on`."""
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self.died_over: list[tuple[str, int]] = []
-        """Submit's key and request index."""
+        """Pairs of a submit's key and a request index."""
         data = os.pread(self._fd, 1 << 16, 0)
         for at in range(0, len(data), self._RECORD):
             key, _, index = (
@@ -127,12 +128,12 @@ class AtWork:
         self._n_records = 0
 
     def clear(self) -> None:
-        """What was left is written down elsewhere."""
+        """Removes the records, once they are in the journal."""
         os.ftruncate(self._fd, 0)
 
     @contextlib.contextmanager
     def on(self, key: str, index: int) -> Iterator[None]:
-        """While inside, the episode is being worked on. For several threads."""
+        """Marks the episode as in work inside the `with`. Thread-safe."""
         with self._lock:
             if not self._free:
                 self._free.append(self._n_records * self._RECORD)
@@ -154,14 +155,14 @@ class Journal:
     """The journal's file, opened for appending. `append` blocks on the disk."""
 
     def __init__(self, path: Path) -> None:
-        """Opens or makes it. StorageError when a line other than the last cannot be read."""
+        """Opens or creates the file. Raises StorageError when a line other than the last is damaged."""
         self._path = path
         self.at_work = AtWork(path.with_name("at-work"))
         """The episodes whose files are being made."""
         self.entries: list[AnyEntry] = []
-        """The lines that were there when it was opened, oldest first."""
+        """The entries found when it was opened, oldest first."""
         self.places: list[int] = []
-        """Where each of these begins, for `read`."""
+        """File offsets of these entries, for `read`."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._file = os.fdopen(fd, "r+b", buffering=0)
         try:
@@ -172,9 +173,9 @@ class Journal:
             raise
 
     def append(self, entry: AnyEntry) -> int:
-        """Durable when it returns its place, for `read`; StorageError when the disk refuses, and then nothing was added.
+        """Appends an entry durably; returns its file offset, for `read`. Raises StorageError, with nothing added.
 
-        It is not kept in memory: a run has thousands of episodes, and the answers name each.
+        The entry is not kept in memory: a run has thousands of episodes, and each answer lists its own.
         """
         start = self._file.seek(0, os.SEEK_END)
         try:
@@ -186,14 +187,14 @@ class Journal:
         return start
 
     def read(self, place: int) -> AnyEntry:
-        """The line that begins there."""
+        """Returns the entry at a file offset."""
         with self._path.open("rb") as file:
             file.seek(place)
             entry: AnyEntry = _decoder.decode(file.readline())
             return entry
 
     def forget(self) -> None:
-        """Lets go of the lines that were there when it was opened."""
+        """Drops the entries found when it was opened, to free memory."""
         self.entries, self.places = [], []
 
     def close(self) -> None:

@@ -1,18 +1,18 @@
-"""How submits and episodes are named in answers, folders and rules. Commands import this, and so no numpy."""
+"""Names of submits and episodes in answers, folders and rules. Imports no numpy, because commands import it."""
 
 from __future__ import annotations
 
 
 def _digits(episode_budget: int) -> int:
-    """Width of submit and episode numbers in names."""
+    """Number of digits in the names of submits and episodes."""
     return max(3, len(str(episode_budget)))
 
 
 def submit_id(index: int, episode_budget: int) -> str:
-    """`submit_NNN`: a submit's name in answers and its folder's."""
+    """`submit_NNN`: the name of a submit in answers, and of its folder."""
     return f"submit_{index:0{_digits(episode_budget)}d}"
 
 
 def episode_name(global_index: int, episode_budget: int) -> str:
-    """`ep_XXX`: counts attempted episodes through the run."""
+    """`ep_XXX`: the name of an episode, counted over all attempted episodes of the run."""
     return f"ep_{global_index:0{_digits(episode_budget)}d}"

@@ -1,10 +1,10 @@
-"""The submit pipeline: one submit at a time, from a request's bytes to committed feedback, whatever dies on the way.
+"""The submit pipeline: one submit at a time, from a request's bytes to committed feedback, despite crashes.
 
-Rules:
-- a request is checked before anything is read from `system/`; what breaks the format or the bounds costs nothing;
-- what passed is in the journal before it is sent, and is asked for again by its key after a restart;
-- a submit goes on when nobody waits for it any more; its answer is kept;
-- what cannot be explained ends the gateway process: the next one goes on from the journal.
+- A request is checked before anything is read from `system/`; one with an invalid form or outside the bounds costs
+  nothing.
+- A valid request is in the journal before it is sent, and is repeated by its key after a restart.
+- A submit continues when no client waits for it any more; its answer is kept.
+- An unexpected error ends the gateway process; the next one resumes from the journal.
 """
 
 from __future__ import annotations
@@ -57,36 +57,36 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 LINGER_S = 0.02
 LINGER_EPISODES = 8
-"""With at least so many to come, the next results are asked for a little later: of short episodes several come at once."""
+"""With at least this many episodes left, a pause before the next request collects several results of short episodes."""
 DISK_PAUSE_S = 2.0
-"""Between tries to write feedback while the disk refuses."""
+"""Seconds between retries while the disk refuses feedback."""
 MAX_REJECTED_KEPT = 1000
 FETCHES_AT_ONCE = 4
 RUN_CLOSED = "run_closed"
-"""What the published protocol calls a submit's refusal after the last one."""
+"""The published protocol's status for a submit after the run was closed."""
 MAX_DEATHS = 2
-"""So often a gateway may end over one submit, or over the files of one episode, before that is put aside."""
+"""Number of gateway deaths over one submit, or over one episode's files, after which that is given up."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
 class _Fetched(NamedTuple):
-    """An episode, and the bytes that its files are made of."""
+    """An episode and the bytes of its files."""
 
     episode: EpisodeFeedback
     trajectory: bytes = b""
     video: bytes | None = None
     why: str = ""
-    """Why there are no bytes."""
+    """Why the bytes are missing."""
 
 
 def _is_whole(episode: EpisodeFeedback) -> bool:
-    """Whether its bytes have come with it."""
+    """Whether the result page contains the episode's bytes."""
     refs = (episode.trajectory, episode.video)
     return all(ref is None or ref.inline is not None for ref in refs)
 
 
 class SubmitPipeline:
-    """Takes submits for one run. Lives on one event loop."""
+    """Takes submits for one run, on one event loop."""
 
     def __init__(
         self,
@@ -98,25 +98,25 @@ class SubmitPipeline:
         on_change: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        """`on_change` is called whenever something that a watcher shows has changed; `clock` is Unix time."""
+        """`on_change` is called after every change that a watcher shows; `clock` returns Unix time, seconds."""
         self.run = run
         self.state: RunState = run.state
-        """As far as this gateway knows; `refresh` asks."""
+        """The state known to this gateway; `refresh` updates it."""
         self.closed = run.state.is_finalized
         self.cancelled = run.state.cancelled
-        """The operator has ended the run."""
+        """The operator has cancelled the run."""
         self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Fails with what this process cannot go on from."""
+        """Fails with the error that ends this process."""
         self.in_flight: Ticket | None = None
         self.tickets: list[Ticket] = []
-        """Accepted submits by index, then perhaps one that is not yet."""
+        """Accepted submits by index, followed by at most one that is not accepted yet."""
         self.n_rejected = 0
         self.in_flight_s = 0.0
-        """Seconds in which a submit was in flight, of this process."""
+        """Seconds in which a submit was in flight, in this process."""
         self.held_s = run.state.held_s
-        """Seconds for which submits of the run have waited because hidden episodes had the machines."""
+        """Seconds for which submits of the run waited because hidden episodes used the machines."""
         self.feedback_s = 0.0
-        """Of these, from the last result's arrival to the committed feedback."""
+        """Of `in_flight_s`, seconds from the last result's arrival to the committed feedback."""
         self._client = client
         self._workspace = workspace
         self._journal = journal
@@ -126,25 +126,25 @@ class SubmitPipeline:
         self._task: asyncio.Task[None] | None = None
         self._journal_lock = asyncio.Lock()
         self._deaths: Counter[tuple[str, int | None]] = Counter()
-        """Gateways that ended over an episode of a submit, or (None) over the submit as a whole."""
+        """Number of gateways that died over an episode of a submit, or (None) over the submit as a whole."""
         self._write_down_deaths()
         self._recover()
 
     @property
     def spent(self) -> bool:
-        """Whether no further submit can be taken, and none runs."""
+        """Whether no further submit is possible, and none runs."""
         too_little = self.state.remaining_budget < max(1, self.run.min_episodes_per_submit)
         return self.in_flight is None and (too_little or self.closed)
 
     @property
     def last_warning(self) -> str | None:
-        """How the policy failed in the last submit that was answered; None when it did not."""
+        """The warning of the last answered submit about its policy; None when the policy did not fail."""
         answered = (ticket for ticket in reversed(self.tickets) if ticket.status is not None)
         last = next(answered, None)
         return None if last is None else last.warning
 
     def bounds(self) -> Bounds:
-        """What a submit may ask for now."""
+        """The current limits of a submit."""
         return Bounds(
             n_env_instances=self.run.n_env_instances,
             min_episodes=self.run.min_episodes_per_submit,
@@ -153,9 +153,9 @@ class SubmitPipeline:
         )
 
     async def submit(self, body: bytes, client_key: str | None) -> Ticket:
-        """Takes a request, or finds the one that it repeats.
+        """Takes a request, or returns the ticket of the one that it repeats.
 
-        Raises RequestError (refused, nothing charged) and ConflictError (another submit runs, or the key was used for
+        Raises RequestError (refused, nothing charged) and ConflictError (another submit runs, or the key belongs to
         another body).
         """
         body_digest = digest_of(body)
@@ -192,18 +192,18 @@ class SubmitPipeline:
             len(self.tickets),
             self.run.episode_budget,
         )
-        # No await between the check above and this: two requests cannot both pass.
+        # No await between the checks above and this call: two requests cannot both pass.
         self._start(ticket, fresh=True)
         return ticket
 
     def find(self, name: str) -> Ticket | None:
-        """The submit of that index or folder name."""
+        """Returns the submit with that index or folder name; None when there is none."""
         return next(
             (ticket for ticket in self.tickets if name in (str(ticket.index), ticket.submit_id)), None
         )
 
     async def note_rejected(self, error: RequestError) -> None:
-        """Keeps a refused request for `run.json`."""
+        """Records a refused request for `run.json`."""
         self.n_rejected += 1
         if self.n_rejected <= MAX_REJECTED_KEPT:
             await self._note(
@@ -216,13 +216,15 @@ class SubmitPipeline:
             )
 
     async def refresh(self) -> RunState:
-        """The state as the coordinator sees it, or as last known when it does not answer at once."""
+        """Returns the coordinator's state of the run, or the last known state if the coordinator does not answer at
+        once.
+        """
         try:
             state = await self._client.state()
         except RefusedError as error:
             self._refused(error)
             state = None
-        # While a submit is on its way, an answer may be older than what its acceptance told.
+        # While a submit is being sent, this answer may be older than its acceptance.
         if state is not None and state.n_submits >= self.state.n_submits:
             self.state = state
             self.held_s = max(self.held_s, state.held_s)
@@ -230,7 +232,7 @@ class SubmitPipeline:
         return self.state
 
     async def idle(self) -> None:
-        """Returns when no submit runs."""
+        """Waits until no submit runs."""
         while self._task is not None and not self._task.done():
             await asyncio.wait([self._task])
 
@@ -241,7 +243,7 @@ class SubmitPipeline:
             await asyncio.gather(self._task, return_exceptions=True)
 
     def _write_down_deaths(self) -> None:
-        """Puts into the journal what the last process was killed over."""
+        """Journals the episodes over which the last process died."""
         left = self._journal.at_work
         for key in dict.fromkeys(key for key, _ in left.died_over):
             episodes = tuple(index for of, index in left.died_over if of == key)
@@ -255,7 +257,7 @@ class SubmitPipeline:
         self._deaths.update((died.key, index) for index in died.episodes or (None,))
 
     def _recover(self) -> None:
-        """Rebuilds the tickets from the journal and goes on with the one that has no end."""
+        """Rebuilds the tickets from the journal and resumes the unfinished one."""
         by_key: dict[str, Ticket] = {}
         for place, entry in zip(self._journal.places, self._journal.entries, strict=True):
             if isinstance(entry, Requested):
@@ -314,7 +316,9 @@ class SubmitPipeline:
         self._on_change()
 
     async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
-        """Whether the submit is put aside. The first time this gateway ends over it instead, for the next one to try."""
+        """Returns True when the submit is given up. The first failure ends this gateway instead; the next one
+        retries.
+        """
         key = ticket.request.key
         log.error("submit failed", submit=ticket.submit_id, exc_info=error)
         self._deaths[key, None] += 1
@@ -332,7 +336,7 @@ class SubmitPipeline:
         return True
 
     async def _snapshot(self, ticket: Ticket) -> None:
-        """Takes the bundle as it is now, and writes the request down."""
+        """Takes the bundle of the current `system/` and journals the request."""
         while True:
             try:
                 taken = await asyncio.to_thread(snapshots.take, self._workspace / "system", self._blobs)
@@ -344,7 +348,7 @@ class SubmitPipeline:
         await self._note(ticket.request)
 
     async def _send(self, ticket: Ticket) -> None:
-        """Uploads the bundle and has the submit accepted."""
+        """Uploads the bundle and waits until the submit is accepted. Raises RequestError when it is refused."""
         request = ticket.request
         if ticket.accepted is not None:
             self._charged(ticket.accepted)
@@ -392,13 +396,13 @@ class SubmitPipeline:
         )
 
     async def _collect(self, ticket: Ticket) -> None:
-        """Writes the feedback tree from the results, again from the start when the disk refused."""
+        """Writes the feedback tree from the results; starts over when the disk refuses."""
         while True:
             try:
                 status, summary = await self._write_feedback(ticket)
                 break
             except (OSError, StorageError) as error:
-                # Not the error itself, which names paths: an agent reads this.
+                # Without the error's paths: an agent reads this text.
                 why = error.strerror if isinstance(error, OSError) else None
                 ticket.waits_for = f"the gateway cannot write feedback: {why or 'its disk refuses'}"
                 log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
@@ -409,7 +413,7 @@ class SubmitPipeline:
         log.info("submit committed", submit=ticket.submit_id, status=status)
 
     async def _write_feedback(self, ticket: Ticket) -> tuple[str, bytes]:
-        """Status and summary of the committed folder."""
+        """Returns status and summary of the committed folder."""
         assert ticket.accepted is not None
         index, first = ticket.accepted.submit_index, ticket.accepted.first_global_episode
         tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
@@ -442,9 +446,9 @@ class SubmitPipeline:
     ) -> None:
         gate = asyncio.Semaphore(FETCHES_AT_ONCE)
         wanted = [episode for episode in page.episodes if episode.index not in scores]
-        # What a gateway has ended over is written alone, so that no other episode is blamed for it.
+        # Episodes over which a gateway died are written alone, so that no other episode is blamed.
         suspects = [episode for episode in wanted if self._deaths[key, episode.index]]
-        # Those that have come with the page are written by one call of the thread; the others as their bytes come.
+        # One thread call writes all episodes that came with the page; the others are written as their bytes arrive.
         whole = [episode for episode in wanted if _is_whole(episode) and episode not in suspects]
         others = [episode for episode in wanted if not _is_whole(episode) and episode not in suspects]
 
@@ -462,7 +466,7 @@ class SubmitPipeline:
                         success=episode.success,
                     )
 
-        # All have ended before an error is raised: nothing may write on into a tree that is begun again.
+        # All writes end before an error is raised: none may write into a tree that is started over.
         writes = [write(whole), *(write([episode]) for episode in others)]
         for outcome in await asyncio.gather(*writes, return_exceptions=True):
             if isinstance(outcome, BaseException):
@@ -471,7 +475,7 @@ class SubmitPipeline:
             await write([episode])
 
     async def _fetched(self, key: str, episode: EpisodeFeedback) -> _Fetched:
-        """An episode with its bytes; without them where they cannot be had, or a gateway has ended over it before."""
+        """Fetches an episode's bytes. Leaves them out when they are missing or damaged, or gateways died over them."""
         if self._deaths[key, episode.index] >= MAX_DEATHS:
             why = f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
             return _Fetched(episode, why=why)
@@ -493,13 +497,13 @@ class SubmitPipeline:
         return _Fetched(episode, trajectory, video)
 
     def _put(self, tree: SubmitTree, key: str, first: int, fetched: list[_Fetched]) -> None:
-        """Writes episodes' folders, one after another."""
+        """Writes episodes' folders one after another."""
         for each in fetched:
             name = episode_name(first + each.episode.index, self.run.episode_budget)
             tree.put_episode(name, self._files_of(key, each))
 
     def _files_of(self, key: str, fetched: _Fetched) -> dict[str, bytes]:
-        """An episode's files; without its trajectory where there is none, or none of its length and return."""
+        """Returns an episode's files; without its trajectory if that is missing or has another length or return."""
         episode, at = fetched.episode, self._clock()
         why = fetched.why
         if not why:
@@ -541,20 +545,20 @@ class SubmitPipeline:
         self._close(True, error.status == Refusal.RUN_CANCELLED)
 
     def _close(self, closed: bool, cancelled: bool) -> None:
-        """Takes no more submits from now on, if `closed`; `cancelled`: because the operator has ended the run."""
+        """If `closed`, takes no more submits; `cancelled`: because the operator cancelled the run."""
         if closed and not (self.closed and (self.cancelled or not cancelled)):
             self.closed, self.cancelled = True, self.cancelled or cancelled
             self._on_change()
 
     def _refusal(self, status: str = RUN_CLOSED) -> RequestError:
-        """What a submit is answered once no more are taken."""
+        """The refusal of a submit to a closed or spent run."""
         if self.cancelled:
             return RequestError(CANCELLED, "the operator cancelled the run: no more submits are taken")
         why = "the run is closed" if self.closed else "the episode budget is spent"
         return RequestError(status, f"{why}: no more submits are taken")
 
     def _summary_at(self, place: int) -> Callable[[], bytes]:
-        """Reads the summary that was written down there; not from the feedback, which is the agent's to lose."""
+        """Returns a reader of the journalled summary; the copy in the feedback may have been lost by the agent."""
 
         def load() -> bytes:
             entry = self._journal.read(place)
@@ -564,7 +568,7 @@ class SubmitPipeline:
         return load
 
     async def _note(self, entry: AnyEntry) -> int:
-        """Appends to the journal off the event loop, in order, and returns the place; waits while the disk refuses."""
+        """Appends to the journal off the event loop, in order; returns the offset. Retries while the disk refuses."""
         async with self._journal_lock:
             while True:
                 try:

@@ -1,4 +1,4 @@
-"""What a submit takes from `system/`: the bundle, or the verdict of a folder that cannot be one."""
+"""The snapshot of `system/` for a submit: a bundle, or the verdict on a folder that cannot be one."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     digest: str | None
     error: PolicyFailure | None
     kept: str | None = None
-    """Digest of a bundle that holds no policy: stored for the run's checkpoint, and not sent."""
+    """Digest of a bundle without a policy: stored for the run's checkpoint, and not sent."""
 
 
 def take(system: Path, blobs: BlobStore) -> Snapshot:
-    """Snapshots `system` as it is now and stores the bundle.
+    """Snapshots the current `system` and stores the bundle.
 
-    A folder that cannot be a bundle is the policy's failure and charged: `missing_policy` when `policy.py` is not there
-    as a regular file, else `import_error`; the message names file, value and limit. StorageError when the store refuses.
+    A folder that cannot be a bundle is the policy's failure and is charged: `missing_policy` when `policy.py` is
+    missing or no regular file, else `import_error`; the message names file, value and limit. Raises StorageError when
+    the store refuses.
     """
     try:
         bundle = bundles.snapshot(system)

@@ -1,4 +1,4 @@
-"""One submit as those who wait for it see it."""
+"""The state of one submit, for everyone who waits for it."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from evopolicy_gateway.submits.snapshots import Snapshot
 
 
 class ConflictError(RequestError):
-    """The request contradicts one that was taken before: another submit runs, or the key has another body."""
+    """The request contradicts an earlier one: another submit runs, or the key belongs to another body."""
 
     def __init__(self, index: int, message: str) -> None:
         super().__init__("conflict", message)
         self.index = index
-        """Of the submit that it contradicts."""
+        """Index of the earlier submit."""
 
 
 class _Told(msgspec.Struct):
-    """What is kept of a summary."""
+    """The stored fields of a summary."""
 
     mean_return: float | str | None
     policy_failures: int | None = None
@@ -35,7 +35,7 @@ class Ticket:
     """A submit that passed the checks."""
 
     def __init__(self, request: Requested, index: int, episode_budget: int) -> None:
-        """`index` is the number it will have: this gateway is the only one that submits for its run."""
+        """`index`: its future number, known because this gateway is the run's only submitter."""
         self.request = request
         self.index = index
         self.submit_id = submit_id(index, episode_budget)
@@ -44,42 +44,42 @@ class Ticket:
         """Episodes whose feedback is written."""
         self.waits_for = ""
         self.held_s = 0.0
-        """Seconds for which none of its episodes ran because hidden episodes had the machines."""
+        """Seconds in which none of its episodes ran because hidden episodes used the machines."""
         self.accepted: Accepted | None = None
         self.decided = asyncio.Event()
-        """Set once it is accepted, or never will be."""
+        """Set once it is accepted, or certainly will not be."""
         self.done = asyncio.Event()
-        """Set once `status` and the summary, or `error`, are there."""
+        """Set once `status` and the summary, or `error`, are available."""
         self.status: str | None = None
         self.mean: float | None = None
-        """Of its returns, once it is settled and has some."""
+        """Mean of its returns once it is settled; None without returns, or when the mean is not finite."""
         self.policy_failures: int | None = None
         """Episodes in which the policy failed; None unless it is ok."""
         self.warning: str | None = None
-        """How it failed, for the agent."""
+        """The warning to the agent about policy failures."""
         self.error: RequestError | None = None
-        """Why it was not taken after all."""
+        """Why it was given up or refused."""
         self.n_episodes = len(request.env_instances)
         self._episode_budget = episode_budget
         self._load: Callable[[], bytes] | None = None
 
     def attach(self, taken: Snapshot) -> None:
-        """The bundle, or why there is none."""
+        """Stores the bundle's digest, or the reason for its absence."""
         self.request = msgspec.structs.replace(
             self.request, bundle=taken.digest, bundle_error=taken.error, kept=taken.kept
         )
 
     def accept(self, accepted: Accepted) -> None:
-        """The coordinator has taken it: from now on it has its name."""
+        """The coordinator has accepted it; from now on its name is fixed."""
         self.accepted = accepted
         self.index = accepted.submit_index
         self.submit_id = submit_id(accepted.submit_index, self._episode_budget)
         self.decided.set()
 
     def settle(self, status: str, summary: bytes, load: Callable[[], bytes]) -> None:
-        """It is answered: its feedback is written. `load` gives the summary's bytes again.
+        """Its feedback is committed. `load` returns the summary's bytes again.
 
-        What it has of its single episodes is let go of: a run has thousands.
+        Its list of episodes is dropped to save memory: a run has thousands.
         """
         self.status, self._load = status, load
         told = msgspec.json.decode(summary, type=_Told)
@@ -93,11 +93,11 @@ class Ticket:
         self.done.set()
 
     def summary(self) -> bytes | None:
-        """The bytes of `summary.json`, read from the disk; None while there is none."""
+        """The bytes of `summary.json`, read from the disk; None before it is settled."""
         return None if self._load is None else self._load()
 
     def fail(self, error: RequestError) -> None:
-        """It came to nothing."""
+        """Ends it with an error."""
         self.error = error
         self.decided.set()
         self.done.set()
