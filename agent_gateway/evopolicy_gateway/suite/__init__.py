@@ -1,1 +1,1 @@
-"""Sweeps: agents × environments × repeats, unattended, on one host or several, stopped and resumed."""
+"""Sweeps: agents × environments × repeats, unattended, on one or several hosts, with stop and resume."""

@@ -1,12 +1,13 @@
-"""A suite's sweep on this host: keeps its claims on the runs that it plays, and the index up to date.
+"""A suite's sweep on this host: renews the claims on the runs that it plays, and keeps the index up to date.
 
-Rules, beside those of every sweep:
-- A run is played only while this host holds its claim at the coordinator. A claim that another host has meanwhile ends
-  the run here, and its folder stays as it is.
-- Cancelled, it leaves runs open and gives no claim back: the same host goes on with them, and another takes them over
-  once their time is up.
-- A provider that is away holds back further runs with it; those that go on wait by themselves.
-- A cap that is used up holds back all further runs, and leaves those of coding agents open as a cancelled sweep does.
+Rules, in addition to those of every sweep:
+
+- A run is played only while this host holds its claim at the coordinator. If another host has taken the claim, the run
+  ends here and its folder stays unchanged.
+- Cancelled, the sweep leaves runs open and keeps its claims: the same host can resume them, and others can take them
+  over once the claims expire.
+- A provider that is away also holds back further runs of that provider; running ones wait by themselves.
+- A used-up cap holds back all further runs, and leaves those of coding agents open as a cancelled sweep does.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ ATTEMPTS = ".attempts"
 
 
 class ClaimedSweep(Sweep):
-    """Plays a suite's decisions beside the other hosts that take part."""
+    """Plays a suite's decisions together with the other hosts of the sweep."""
 
     stays_open = True
 
@@ -71,7 +72,7 @@ class ClaimedSweep(Sweep):
         self._not_before: dict[str, float] = {}
         self._paused_until: dict[str, float] = {}
         self._ending: set[str] = set()
-        """Runs that have been cancelled and are not done with it."""
+        """Cancelled runs that have not ended yet."""
         self._unsaved = False
         self._paused = False
         view.on_doing = self._on_doing
@@ -79,7 +80,7 @@ class ClaimedSweep(Sweep):
     async def play(self, decisions: Sequence[Decision]) -> None:
         renewing = asyncio.create_task(self._renew())
         try:
-            # Claims that nobody renews would go to another host while their runs go on here.
+            # Unrenewed claims would pass to another host while their runs continue here.
             await unless_failed(asyncio.create_task(super().play(decisions)), renewing)
         finally:
             renewing.cancel()
@@ -88,7 +89,7 @@ class ClaimedSweep(Sweep):
                 self._save()
 
     def _startable(self) -> list[Decision]:
-        """As ever; none while the sweep is paused."""
+        """As in `Sweep`; empty while the sweep is paused."""
         was_paused, self._paused = self._paused, (self._root / PAUSED).exists()
         if self._paused and not was_paused:
             self._view.say(f"paused: no further run begins while {self._root / PAUSED} is there")
@@ -109,7 +110,7 @@ class ClaimedSweep(Sweep):
         await super()._wait(active)
 
     def _stop_at_the_cap(self) -> None:
-        """Interrupts what still uses tokens once a cap of the sweep is used up."""
+        """Interrupts the runs that still use tokens once a cap of the sweep is used up."""
         why = self._used_up()
         for name, task in self._active.items() if why is not None else ():
             play = self._plays.get(name)
@@ -117,7 +118,7 @@ class ClaimedSweep(Sweep):
                 self._end(name, task, f"interrupted: {why}; it goes on where it was once the cap is raised")
 
     def _end(self, name: str, task: asyncio.Task[None], why: str) -> None:
-        """Ends a run here and leaves it open; once, as a second time would break the ending off."""
+        """Ends a run here and leaves it open; only once, since a second cancellation would abort its shutdown."""
         if name not in self._ending:
             self._ending.add(name)
             self._view.note(name, why)
@@ -128,13 +129,13 @@ class ClaimedSweep(Sweep):
         if not task.cancelled():
             task.result()
             return
-        # Another host has it, whose result is asked for in time; or a cap is used up.
+        # Another host has the run, and its result is requested later; or a cap is used up.
         self._not_before[name] = time.monotonic() + _ASK_AGAIN_S
         self._view.waits(name)
         self._todo.append(self._decided[name])
 
     async def _begin(self, decision: Decision) -> bool:
-        """Claims the run and starts it; False when another host has it at the moment."""
+        """Claims the run and starts it; False when another host currently holds it."""
         run = decision.run
         claim = await self._ask(run)
         if claim.result is not None:
@@ -187,13 +188,13 @@ class ClaimedSweep(Sweep):
         return claim.result is not None or not claim.granted
 
     async def _renew(self) -> None:
-        """Keeps the claims of what goes on here, and tells soon which run of the cluster is played for each."""
+        """Renews the claims of active runs, and reports soon which run of the cluster belongs to each."""
         every_s = self._limits.claim_ttl_s / 4
         told: dict[str, tuple[str, float]] = {}
         while True:
             await asyncio.sleep(min(sweep.LOOK_S, every_s))
             if self._unsaved:
-                # Claims are renewed whatever the disk says.
+                # Claims are renewed even when the disk refuses.
                 with contextlib.suppress(EvopolicyError):
                     self._save()
             for name, task in list(self._active.items()):
@@ -206,14 +207,14 @@ class ClaimedSweep(Sweep):
                     told[name] = (self._run_of(run), time.monotonic())
                     claim = await self._ask(run)
                     if not claim.granted and claim.holder != self._holder and not task.done():
-                        # That host has ended our run at the cluster.
+                        # That host has cancelled our run at the cluster.
                         self._anew(name)
                         self._end(name, task, f"another host has it now ({claim.holder}): ended here")
 
     async def _ask(
         self, run: Plan, ttl_s: float | None = None, result: dict[str, Any] | None = None
     ) -> ClaimState:
-        # With other settings it is another run, whatever has become of the one before.
+        # The digest makes a run with other settings another run, whatever the result of the earlier one.
         name = f"{run.name}@{run.digest}"
         return await self._operations.claim(
             self._suite.name,
@@ -225,7 +226,7 @@ class ClaimedSweep(Sweep):
         )
 
     async def _put_aside(self, folder: RunFolder, attempt: int) -> None:
-        """Keeps what there is of an earlier attempt, and ends its run at the cluster."""
+        """Keeps the files of an earlier attempt, and ends its run at the cluster."""
         if not folder.root.exists():
             return
         await self._operations.drop(folder)
@@ -242,7 +243,7 @@ class ClaimedSweep(Sweep):
             await self._operations.cancel(run)
 
     def _anew(self, name: str) -> Decision:
-        """What becomes of a run that another host has had meanwhile."""
+        """The new decision for a run that another host has taken over meanwhile: a restart as a new attempt."""
         before = self._decided[name]
         self._decided[name] = msgspec.structs.replace(before, kind="restart", attempt=before.attempt + 1)
         return self._decided[name]
@@ -252,7 +253,7 @@ class ClaimedSweep(Sweep):
         return "" if play is None else play.run
 
     def _used_before(self, decision: Decision) -> dict[str, Any]:
-        """What a run that is gone on with, or the attempts before it, have used."""
+        """Tokens used before: by the resumed run itself, and by its earlier attempts."""
         entry = self._index.runs.get(decision.run.name)
         if entry is None:
             return {}
@@ -263,7 +264,7 @@ class ClaimedSweep(Sweep):
     def _on_doing(self, name: str, doing: AgentDoing) -> None:
         entry = self._index.runs.get(name)
         if entry is not None and doing.tokens is not None:
-            # Written with the next look: a stream may tell it many times a second.
+            # Saved with the next renewal: a stream may report tokens many times a second.
             self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
             self._unsaved = True
         if doing.provider:
@@ -288,7 +289,7 @@ class ClaimedSweep(Sweep):
 
 
 async def look(run: Plan, index: Index, operations: Operations) -> Found:
-    """What there is of a run."""
+    """Collects the known facts about a run."""
     folder = run.folder
     status: str | None = None
     with contextlib.suppress(OSError, EvopolicyError):

@@ -1,12 +1,12 @@
-"""What is done with each run of a sweep at a start: rules without I/O, said before anything is done.
+"""Decisions for each run of a sweep at its start: rules without I/O, reported before they are carried out.
 
-- A finished run is kept. One that ended in an error, ours or its provider's, or that was cancelled, is played again as a
-  new attempt.
-- A run that the cluster has closed is only finished. One still open goes on in its agent's session; without a session it
-  is begun again as a new attempt, and what there is of it is kept aside.
-- Where the file now wants other settings than a run was played with, the operator decides.
-- Runs that share no hidden case are begun side by side where there are such, as agents and hidden episodes of runs that do
-  must not be on one machine and wait for each other.
+- A finished run is kept. One that ended in an error, ours or its provider's, or was cancelled, is restarted as a new
+  attempt.
+- A run that the cluster has closed is only finished. An open run resumes in its agent's session; without a session it
+  is restarted as a new attempt, and its files are kept aside.
+- If the file's settings differ from those that a run was played with, the operator decides.
+- Runs without common hidden cases are preferred for playing side by side. Runs with common ones wait for each other,
+  because the agent of one may not share a machine with hidden episodes of the other.
 """
 
 from __future__ import annotations
@@ -36,33 +36,33 @@ _WORDS: dict[Kind, str] = {
 
 
 class Found(msgspec.Struct, frozen=True, kw_only=True):
-    """What there is of a run."""
+    """The known facts about a run."""
 
     entry: Entry | None = None
-    """In the index."""
+    """Its entry in the index."""
     status: str | None = None
-    """In its `run.json`."""
+    """The status in its `run.json`."""
     opened: bool = False
-    """Its folder holds a run that is not finished."""
+    """Whether its folder holds an unfinished run."""
     phase: str | None = None
-    """Of that run at the cluster; None when the cluster does not know it."""
+    """That run's phase at the cluster; None when the cluster does not know it."""
     has_session: bool = False
-    """Its agent can go on where it was."""
+    """Whether its agent can resume its session."""
 
 
 class Decision(msgspec.Struct, frozen=True, kw_only=True):
-    """For one run."""
+    """The decision for one run."""
 
     run: Plan
     kind: Kind
     attempt: int
     why: str = ""
     changed: bool = False
-    """The file has other settings for it than it was played with."""
+    """Whether the file's settings differ from those that it was played with."""
 
 
 def decide(run: Plan, found: Found, changed: Changed = "refuse") -> Decision:
-    """What becomes of a run."""
+    """Returns the decision for a run."""
     entry = found.entry
     attempt = 1 if entry is None else entry.attempt
     exists = found.status is not None or found.opened or (entry is not None and entry.state != "pending")
@@ -93,16 +93,16 @@ def decide(run: Plan, found: Found, changed: Changed = "refuse") -> Decision:
 
 
 def side_by_side(waiting: Sequence[Decision], under_way: Iterable[Plan]) -> list[Decision]:
-    """The order in which waiting runs are best begun: those first that share hidden cases with the fewest runs under way.
+    """Orders waiting runs for starting: first those that share hidden cases with the fewest runs under way.
 
-    Otherwise as they stand. `under_way`: runs whose agent is at work or whose hidden cases are being played.
+    Otherwise their order is kept. `under_way`: runs whose agent is alive or whose hidden cases are being played.
     """
     shared = Counter(_hidden_cases(run) for run in under_way)
     return sorted(waiting, key=lambda one: shared[_hidden_cases(one.run)])
 
 
 def _hidden_cases(run: Plan) -> str:
-    """Equal for runs that share hidden cases."""
+    """A key that is equal for runs with common hidden cases."""
     return run.settings.env if run.settings.hidden_cases == "shared" else run.name
 
 
@@ -118,7 +118,7 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Settings by their dotted names, as the suite's file has them."""
+    """Settings by their dotted names in the suite's file."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _leaves(name if path in ("", "settings") else f"{path}.{name}", inner)
@@ -131,7 +131,7 @@ def _told(value: Any) -> str:
 
 
 def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:
-    """ConfigError naming the runs whose settings have changed, unless the operator has said what to do."""
+    """Raises ConfigError that names the runs with changed settings, unless the operator has decided about them."""
     names = [one.run.name for one in decisions if one.changed]
     if names and changed == "refuse":
         shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
@@ -142,7 +142,7 @@ def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:
 
 
 def feedback_bytes(decisions: Sequence[Decision]) -> int:
-    """What the feedback of the runs that will be played takes at most, without videos."""
+    """Upper bound for the feedback of the runs to be played, bytes, without videos."""
     played = [one.run.settings for one in decisions if one.kind in ("new", "resume", "restart")]
     return sum(
         catalogue.entry(settings.env).feedback_bytes(
@@ -153,7 +153,7 @@ def feedback_bytes(decisions: Sequence[Decision]) -> int:
 
 
 def told(decisions: Sequence[Decision], left_alone: Sequence[str]) -> list[str]:
-    """What will be done, in lines: counts first, then each run that is neither new nor simply kept."""
+    """The decisions as lines: counts first, then each run that is neither new nor simply kept."""
     counts = {kind: sum(one.kind == kind for one in decisions) for kind in _WORDS}
     parts = [f"{n} {_WORDS[kind]}" for kind, n in counts.items() if n]
     lines = [f"{len(decisions)} runs: {', '.join(parts)}"]

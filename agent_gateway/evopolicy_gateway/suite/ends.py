@@ -1,4 +1,4 @@
-"""What a command's runs came to: the exit code with its reasons."""
+"""The exit code of a command that plays runs, and its reasons."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite.suite_index import Entry, Index
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
-"""Of a command that plays runs, the gravest first; 0 when every run completed."""
+"""Exit codes of a command that plays runs, most severe first; 0 when every run completed."""
 _AGENT_FAILED = ("agent_failed", "silent")
 
 
 def exit_code(runs: Sequence[Plan], index: Index) -> int:
-    """For the gravest of these runs' ends: see `EXIT_CODES`. Says on stderr of each run that did not complete why."""
+    """The code of the most severe end, see `EXIT_CODES`. Prints why each incomplete run did not complete on stderr."""
     ends = [(run, index.runs.get(run.name)) for run in runs]
     say_lines((_why(run, entry) for run, entry in ends if _kind(entry) != "completed"), err=True)
     kinds = {_kind(entry) for _, entry in ends}
@@ -33,7 +33,7 @@ def _kind(entry: Entry | None) -> str:
 
 
 def _why(run: Plan, entry: Entry | None) -> str:
-    """In a line."""
+    """The reason in one line."""
     if entry is None or entry.state == "pending":
         return f"{run.name}: it was not begun"
     said = {
@@ -46,5 +46,5 @@ def _why(run: Plan, entry: Entry | None) -> str:
 
 
 def next_step(runs: Path) -> str:
-    """What to do with the runs in that folder."""
+    """The suggested next command for the runs in that folder."""
     return f"next: evopolicy report {shlex.quote(str(runs))} --out report"

@@ -27,15 +27,15 @@ from evopolicy_gateway.suite.sweep import Sweep
 
 
 class Played(msgspec.Struct, frozen=True):
-    """What the runs came to."""
+    """The results of the runs."""
 
     plans: Sequence[Plan]
     index: Index
-    """Of this command alone; on no disk."""
+    """Of this command alone; not saved."""
     records: dict[str, RunRecord]
-    """`run.json` of those that came so far, by name."""
+    """The existing `run.json` records, by run name."""
     wrong: set[str]
-    """Names of those that were never opened, for an option's sake."""
+    """Names of runs that were never opened because of a wrong option."""
 
 
 class _Runs(Sweep):
@@ -50,7 +50,7 @@ class _Runs(Sweep):
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
         run = decision.run
         record = self._told.records[run.name] = await self._played(decision, run)
-        # Here no run is played again because its agent never played, so it keeps its own end.
+        # Unlike a suite, this never repeats a run whose agent did not play, so the run keeps its own status.
         return msgspec.structs.replace(
             entry_of(run, record), state=record.outcome.status, error=record.outcome.error
         )
@@ -65,8 +65,10 @@ class _Runs(Sweep):
 
 
 async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> Played:
-    """Plays all plans, so many agents at once; one that fails does not stop the others. ConfigError when an option is wrong
-    for each of them."""
+    """Plays all plans, `parallel` agents at once; a failed run does not stop the others.
+
+    Raises ConfigError when an option is wrong for every run.
+    """
     played = Played(plans, Index(suite=""), {}, set())
     decided = [Decision(run=plan, kind="resume" if plan.resume else "new", attempt=1) for plan in plans]
     with RunView(console).shown() as watch:
@@ -83,7 +85,7 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
 
 
 def documents(played: Played) -> list[dict[str, Any]]:
-    """What the runs came to, for scripts."""
+    """The results of the runs, for scripts."""
     return [_document(run, played.index.runs[run.name], played) for run in played.plans]
 
 
@@ -108,7 +110,7 @@ def _document(run: Plan, entry: Entry, played: Played) -> dict[str, Any]:
 
 
 def report(played: Played, runs: Path, console: Terminal) -> None:
-    """A table of what the runs came to, where each of them is, and what to do with all that are in the folder `runs`."""
+    """Prints a table of the results, the run directories, and the next command for the folder `runs`."""
     headings = ("environment", "score", "random", "best submit", "budget used", "ended")
     made = table(*headings, right=("score", "random"))
     told = documents(played)

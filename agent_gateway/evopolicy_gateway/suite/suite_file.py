@@ -1,7 +1,7 @@
-"""A suite's TOML file, and the runs that it comes to.
+"""A suite's TOML file, and its expansion into runs.
 
-`docs/how-to/sweeps.md` explains it with examples. A setting of a run is looked for in the last `[[overrides]]` that fits, then in
-the agent's `[agents.run]`, then in `[defaults]`; what is nowhere is the environment suite's own. Unknown keys are refused.
+`docs/how-to/sweeps.md` explains it with examples. A setting of a run comes from the last matching `[[overrides]]`, else
+from the agent's `[agents.run]`, else from `[defaults]`, else from the environment's suite. Unknown keys are refused.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Positive = Annotated[int, Meta(ge=1)]
 
 
 class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a run; None: look further."""
+    """Settings of a run; None: not set here."""
 
     budget: Positive | None = None
     min_episodes: Positive | None = None
@@ -68,33 +68,33 @@ class AgentTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     name: str
     agent: str = ""
-    """As `--agent` takes it; or `config`."""
+    """In the form of `--agent`; alternative to `config`."""
     config: AgentConfig | None = None
     """A coding agent's settings."""
     environments: tuple[str, ...] = ()
     """In place of the suite's."""
     parallel: Positive | None = None
-    """Runs of it at once."""
+    """Maximum number of its simultaneous runs."""
     run: RunTable = RunTable()
     jail: JailSettings = JailSettings()
-    """What its jail shows and lets through besides its harness's own."""
+    """Paths and hosts that its jail allows in addition to its harness's."""
 
 
 class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How many runs go on at once; an agent's own limit is in its table."""
+    """Maximum numbers of simultaneous runs; an agent's own limit is in its table."""
 
     machine: Positive = 4
-    """On each host that takes part."""
+    """On each participating host."""
     agent: Positive | None = None
     """Of each agent, on each host."""
     providers: dict[str, Positive] = {}
     """Of each provider, on each host."""
     claim_ttl_s: Annotated[float, Meta(ge=1, le=3600)] = 60.0
-    """A host that is not heard of for so long loses its runs to the others."""
+    """A host that is silent for this long loses its runs to the others, seconds."""
 
 
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What all runs of this host may use together; once it is used no further run is begun, and coding agents are stopped."""
+    """Joint limits of all runs of this host. A used-up limit stops coding agents and prevents further runs."""
 
     max_tokens: Positive | None = None
     max_cost: Annotated[float, Meta(gt=0)] | None = None
@@ -107,7 +107,7 @@ class SuiteFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     name: str
     """Names the sweep on the cluster and in the run directories."""
     environments: tuple[str, ...]
-    """Suites, suite ids, globs."""
+    """Names of suites, ids of environments, or globs."""
     agents: tuple[AgentTable, ...]
     description: str = ""
     defaults: RunTable = RunTable()
@@ -117,7 +117,10 @@ class SuiteFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 def find(name: str) -> tuple[Path | None, bytes]:
-    """The bytes of a suite's file: a path, or the name of a shipped one such as `core16.toml`."""
+    """Reads a suite's file by its path or shipped name, such as `core16.toml`. Raises ConfigError when it is missing.
+
+    Returns the path, None for a shipped file, and the bytes.
+    """
     path = Path(name)
     if path.is_file():
         return path, path.read_bytes()
@@ -130,7 +133,7 @@ def find(name: str) -> tuple[Path | None, bytes]:
 
 
 def read(name: str) -> SuiteFile:
-    """The suite in a file. ConfigError says what is wrong and where."""
+    """Reads and validates a suite's file. Raises ConfigError with the problem and its place."""
     _, data = find(name)
     try:
         suite = msgspec.toml.decode(data, type=SuiteFile)
@@ -144,10 +147,10 @@ def read(name: str) -> SuiteFile:
 
 
 def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...] = ()) -> list[Plan]:
-    """The runs in the order in which they are begun. `root`: the sweep's folder. `only`: globs of run names.
+    """Returns the runs in their starting order. `root`: the sweep's folder. `only`: globs of run names.
 
-    Environments come before agents, so that a sweep that is stopped early compares its agents on some environments rather
-    than having one agent on all. ConfigError for what cannot be a run.
+    Environments come before agents, so that a sweep stopped early compares all agents on some environments, not one
+    agent on all. Raises ConfigError for impossible runs.
     """
     names = [agent.name for agent in suite.agents]
     doubled = sorted({name for name in names if names.count(name) > 1})
@@ -180,7 +183,7 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
 
 
 def check_agents_start(runs: Iterable[Plan]) -> None:
-    """ConfigError where an agent of these runs cannot be started on this machine, such as a CLI that is missing."""
+    """Raises ConfigError when an agent of these runs cannot start on this machine, such as a missing CLI."""
     for run in {run.entry: run for run in runs}.values():
         try:
             harnesses.make(run.agent, run.started_in, run.config).check()

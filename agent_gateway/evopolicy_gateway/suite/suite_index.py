@@ -1,6 +1,6 @@
-"""`suite.json`: what a sweep has come to, run by run. Rewritten whole and atomically after every change.
+"""`suite.json`: the state of each run of a sweep, rewritten atomically after every change.
 
-It is an index: whether a run is finished its own `run.json` says, and the index is brought in line with it at a start.
+It is only an index: a run's own `run.json` decides whether the run is finished, and a start updates the index from it.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     repeat: int
     digest: str
-    """Of the settings that it is or was played with."""
+    """Digest of `settings`."""
     settings: dict[str, Any] = {}
-    """Those settings."""
+    """The settings that it is or was played with."""
     state: State = "pending"
     attempt: int = 1
     directory: str = ""
-    """Relative to the sweep's folder; empty for a run that another host has."""
+    """Relative to the sweep's folder; empty for a run on another host."""
     run: str = ""
     """The cluster's id."""
     host: str = ""
@@ -52,7 +52,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     budget_used: int = 0
     tokens: dict[str, Any] | None = None
     earlier: dict[str, Any] | None = None
-    """Tokens of the attempts before this one."""
+    """Tokens of the earlier attempts."""
     closed_reason: str = ""
     """Why its agent stopped, as in `run.json`."""
     error: str | None = None
@@ -70,7 +70,10 @@ class Index(msgspec.Struct, kw_only=True):
 
 
 def load(root: Path, suite: str) -> Index:
-    """The index in a sweep's folder; a new one where there is none. ConfigError for one that is another sweep's."""
+    """Reads the index in a sweep's folder, or returns a new one.
+
+    Raises ConfigError for one that is damaged, of another sweep or from a newer version.
+    """
     path = root / INDEX
     try:
         index = msgspec.json.decode(path.read_bytes(), type=Index)
@@ -86,24 +89,24 @@ def load(root: Path, suite: str) -> Index:
 
 
 def save(root: Path, index: Index) -> None:
-    """Replaces `suite.json`; StorageError when the disk refuses."""
+    """Replaces `suite.json`. Raises StorageError when the disk refuses."""
     index.updated_at = utc_text(time.time())
     root.mkdir(parents=True, exist_ok=True)
     write_atomically(root / INDEX, msgspec.json.format(msgspec.json.encode(index), indent=2) + b"\n")
 
 
 def state_of(record: RunRecord) -> State:
-    """How a sweep takes a finished run: one whose agent never played was no run of that agent."""
+    """A finished run's state in a sweep: an error when its agent never played, else its status."""
     return "error" if record.outcome.agent_never_played else record.outcome.status
 
 
 def directory_of(run: Plan) -> str:
-    """A run's folder as the index tells it."""
+    """A run's folder, relative to the sweep's."""
     return str(run.folder.root.relative_to(run.runs.absolute()))
 
 
 def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
-    """What the index tells of a finished run."""
+    """The index entry of a finished run."""
     outcome = record.outcome
     state = state_of(record)
     return Entry(
@@ -128,7 +131,7 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
 
 
 def waiting(plan: Plan) -> Entry:
-    """What the index tells of a run that has not begun."""
+    """The index entry of a run that has not started."""
     settings = plan.settings
     return Entry(
         name=plan.name, agent=plan.entry, env=settings.env, repeat=settings.repeat, digest=plan.digest
@@ -136,19 +139,19 @@ def waiting(plan: Plan) -> Entry:
 
 
 def used(index: Index) -> tuple[int, float]:
-    """Tokens and dollars of all runs, with their earlier attempts."""
+    """Tokens and US dollars of all runs, including earlier attempts."""
     told = [one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None]
     return sum(map(tokens_in, told)), sum(float(one.get("cost") or 0.0) for one in told)
 
 
 def added(one: dict[str, Any] | None, other: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Tokens of both."""
+    """The sum of two token counts."""
     if one is None or other is None:
         return one or other
     return {name: (one.get(name) or 0) + (other.get(name) or 0) for name in {**one, **other}}
 
 
 def told(index: Index) -> str | None:
-    """What all runs have used, in a line; None for nothing."""
+    """The usage of all runs in one line; None for no tokens."""
     tokens, cost = used(index)
     return f"used in all: {tokens:,} tokens" + (f", {cost:.2f} dollars" if cost else "") if tokens else None

@@ -1,6 +1,6 @@
-"""What an operator sees of a sweep: a live table on a terminal, a line for each thing that happens elsewhere, or JSON events.
+"""The operator's view of a sweep: a live table on a terminal, one line per event elsewhere, or JSON events.
 
-All three are told the same things; a view keeps them by run.
+All three receive the same reports and store them by run.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _SHOWN_ROWS = 24
 _WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30}
 _LEAST_NAME, _LEAST_ACTION, _GAP = 20, 11, 2
 _STYLES = ("bold", "red", "dim", "dim", "")
-"""Of rows by `_order`: running, failed, with another host, waiting, ended."""
+"""Styles of rows by `_order`: running, failed, on another host, waiting, ended."""
 
 
 class SuiteRow(Row):
-    """What is known of one run of a sweep."""
+    """The known state of one run of a sweep."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ def _ignore(_: str, __: AgentDoing) -> None:
 
 
 class SuiteView(View[SuiteRow]):
-    """Of the runs of a sweep: a table with a row for each that goes on and the last that ended."""
+    """The view of a sweep's runs: a table with the running ones and the last ended ones."""
 
     new_row = SuiteRow
     no_news = ("", FREE_SLOT)
@@ -56,10 +56,10 @@ class SuiteView(View[SuiteRow]):
         self.on_doing: Callable[[str, AgentDoing], None] = _ignore
         self._parallel = parallel
 
-    # What the sweep tells.
+    # Reports of the sweep.
 
     def kept(self, name: str, entry: Entry | None) -> None:
-        """It is finished already."""
+        """The run is finished already."""
         self.rows[name].state = "completed" if entry is None else entry.state
         self.rows[name].entry = entry
         self.rows[name].tokens = None if entry is None else entry.tokens
@@ -83,14 +83,14 @@ class SuiteView(View[SuiteRow]):
             self.event("elsewhere", name, host=host)
 
     def waits(self, name: str) -> None:
-        """It was ended here, and may go on."""
+        """The run was ended here and may resume."""
         self.rows[name].state, self.rows[name].action = "waiting", ""
 
     def say(self, text: str) -> None:
-        """Something about the sweep as a whole."""
+        """Reports a text about the sweep as a whole."""
         self.event("note", "", text=text)
 
-    # What a run tells.
+    # Reports of a run.
 
     def held(self, run: str, what: str) -> None:
         self.waits_for(run, what)
@@ -107,7 +107,7 @@ class SuiteView(View[SuiteRow]):
             self._print(self.totals())
 
     def totals(self) -> str:
-        """How far the sweep is, in one line."""
+        """The sweep's progress in one line."""
         rows = self.rows.values()
         done = [row for row in rows if row.state in FINISHED]
         running = [row for row in rows if row.state == "running"]
@@ -126,7 +126,7 @@ class SuiteView(View[SuiteRow]):
         return ", ".join(parts) + ("" if eta is None else f", about {_duration(eta)} left")
 
     def _eta(self) -> float | None:
-        """Seconds that are left, from what finished runs took; None before there is one."""
+        """Estimated seconds left, from the durations of finished runs; None before the first."""
         rows = self.rows.values()
         walls = [
             row.entry.wall_s
@@ -161,10 +161,10 @@ class SuiteView(View[SuiteRow]):
         """The table as it is now."""
         assert self._console is not None
         table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
-        # Of those that ended, the last come first.
+        # The runs that ended last come first among the ended ones.
         newest = sorted(self.rows, key=lambda name: _ended(self.rows[name]), reverse=True)
         names = sorted(newest, key=lambda name: _order(self.rows[name]))
-        # Names and actions share what the other columns leave.
+        # Names and actions share the width that the other columns leave.
         room = self._console.width - sum(_WIDTHS.values()) - _GAP * (len(_WIDTHS) + 1)
         longest = max((len(name) for name in names[:_SHOWN_ROWS]), default=0)
         for_names = max(_LEAST_NAME, min(longest, room - _LEAST_ACTION))
@@ -180,7 +180,7 @@ class SuiteView(View[SuiteRow]):
 
 
 class JsonView(SuiteView):
-    """One JSON object a line on stdout."""
+    """Prints one JSON object per line on stdout."""
 
     def event(self, kind: str, run: str, **more: Any) -> None:
         document = {"event": kind, "at": round(time.time(), 3), **({"run": run} if run else {}), **more}
@@ -188,12 +188,12 @@ class JsonView(SuiteView):
 
 
 def view_of(names: list[str], parallel: int, console: Terminal, *, as_json: bool) -> SuiteView:
-    """The view that fits where the output goes."""
+    """The view for the kind of output."""
     return JsonView(names, parallel) if as_json else SuiteView(names, parallel, console)
 
 
 def results_table(entries: list[Entry]) -> Table:
-    """What the runs came to."""
+    """A table of the runs' results."""
     headings = ("run", "state", "score", "random", "budget used", "tokens")
     made = table(*headings, right=("score", "random", "tokens"))
     for entry in entries:

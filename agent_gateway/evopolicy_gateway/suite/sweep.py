@@ -1,9 +1,8 @@
-"""Plays the runs of a command on this host, as the limits allow: one loop for `run`, `local` and `suite`.
+"""Plays the runs of a command on this host within the limits: one loop for `run`, `local` and `suite`.
 
-Rules:
-- A run that fails does not stop the others.
-- A run takes a place (`parallel`) until its agent is gone: the next one begins while it is scored.
-- Cancelled, it cancels its runs, or leaves them open where they can be gone on with (`stays_open`).
+- A failed run does not stop the others.
+- A run occupies a place (`parallel`) until its agent is gone: the next one starts while it is scored.
+- Cancelled, the sweep cancels its runs, or leaves them open if they can be resumed (`stays_open`).
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ from evopolicy_gateway.suite.suite_index import Entry, Index, directory_of
 
 LOOK_S = 1.0
 MAX_SCORED = 256
-"""Runs without an agent that are followed at once, beside those that have a place: each is a question to the coordinator."""
+"""Limit of agent-less runs followed at once, in addition to those with a place: each polls the coordinator."""
 
 
 class Sweep(ABC):
     """Plays the decisions."""
 
     stays_open: bool
-    """When this is cancelled its runs are left as they are, to be gone on with."""
+    """Whether cancelling this leaves its runs open, to be resumed."""
 
     def __init__(
         self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: Watch
@@ -49,17 +48,17 @@ class Sweep(ABC):
         self._gateway = gateway
         self._watch = watch
         self._decided: dict[str, Decision] = {}
-        """The latest of each run."""
+        """The latest decision for each run."""
         self._todo: list[Decision] = []
         self._active: dict[str, asyncio.Task[None]] = {}
         self._plays: dict[str, RunLifecycle] = {}
         self._scored: set[str] = set()
         """Runs whose agent is gone."""
         self._moved = asyncio.Event()
-        """An agent has gone."""
+        """Set when an agent is gone."""
 
     async def play(self, decisions: Sequence[Decision]) -> None:
-        """All of them to their end, or as far as caps and other hosts' runs allow."""
+        """Plays all runs to their end, or as far as caps and other hosts' runs allow."""
         self._todo = [one for one in decisions if one.kind != "keep"]
         self._decided = {one.run.name: one for one in decisions}
         try:
@@ -83,34 +82,34 @@ class Sweep(ABC):
                 task.cancel()
             await asyncio.gather(*self._active.values(), return_exceptions=True)
 
-    # What a kind of sweep does in its own way.
+    # Overridden by the kinds of sweep.
 
     @abstractmethod
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
-        """Plays a run and tells what it came to."""
+        """Plays a run and returns its resulting entry."""
 
     def _given_up(self) -> bool:
-        """Whether nothing more will be begun."""
+        """Whether no further run will start."""
         return False
 
     def _may_begin(self, run: Plan) -> bool:
-        """Whether a run that the limits let begin may begin now."""
+        """Whether a run may start now, apart from the limits."""
         return True
 
     async def _begin(self, decision: Decision) -> bool:
-        """Starts a run; False when it cannot begin at the moment."""
+        """Starts a run; False when it cannot start now."""
         self._active[decision.run.name] = asyncio.create_task(self._play(decision))
         return True
 
     def _ended(self, name: str, task: asyncio.Task[None]) -> None:
-        """A run has ended here; raises what was not foreseen."""
+        """Handles the end of a run here; raises unexpected errors."""
         task.result()
 
     def _put(self, entry: Entry) -> None:
         self._index.runs[entry.name] = entry
 
     def _begun(self, decision: Decision) -> Entry:
-        """What is told of a run that begins."""
+        """The index entry of a starting run."""
         run = decision.run
         return Entry(
             name=run.name,
@@ -124,25 +123,25 @@ class Sweep(ABC):
         )
 
     def _why(self, run: Plan, error: Exception) -> str:
-        """Why a run failed, in a line."""
+        """Why a run failed, in one line."""
         return why_failed(error, run.folder.harness_log)
 
-    # The loop's own.
+    # Internals of the loop.
 
     async def _wait(self, active: list[asyncio.Task[None]]) -> None:
-        """Until a run has ended, an agent has gone, or it is time to look again."""
+        """Waits until a run has ended, an agent is gone, or `LOOK_S` has passed."""
         moved = asyncio.ensure_future(self._moved.wait())
         await asyncio.wait([*active, moved], timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
         moved.cancel()
         self._moved.clear()
 
     def _startable(self) -> list[Decision]:
-        """Runs that the limits let begin now."""
+        """Runs that the limits allow to start now."""
         under_way = [self._decided[name].run for name in self._active]
         placed = [self._decided[name].run for name in self._active if name not in self._scored]
         if len(self._scored) >= MAX_SCORED:
             return []
-        # What is only finished has no agent, and so needs no place.
+        # A run that is only finished has no agent and needs no place.
         found = [one for one in self._todo if one.kind == "finish" and self._may_begin(one.run)]
         left = [one for one in self._todo if one.kind != "finish" and self._may_begin(one.run)]
         while len(placed) < self._limits.machine:
@@ -157,7 +156,7 @@ class Sweep(ABC):
         return found
 
     def _fits(self, run: Plan, placed: list[Plan]) -> bool:
-        """Whether the limits let a run begin beside those that have a place."""
+        """Whether the limits allow a run beside those that have a place."""
         limits = self._limits
         same_agent = sum(other.entry == run.entry for other in placed)
         same_provider = sum(other.provider == run.provider for other in placed)
@@ -196,7 +195,7 @@ class Sweep(ABC):
 
 
 def why_failed(error: Exception, log: Path) -> str:
-    """Why a run failed, in a line. The other runs of a command go on after a bug, too, whose traceback is in the run's log."""
+    """Why a run failed, in one line; writes a bug's traceback to the run's log. The command's other runs continue."""
     why = foreseen(error)
     if why is None:
         why = f"{type(error).__name__}: {error}; the traceback is in {log}"
