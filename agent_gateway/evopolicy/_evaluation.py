@@ -40,7 +40,9 @@ class Episode:
     rewards: NDArray[np.float64]
     """float64, shape (length,)."""
     infos: list[dict[str, Any]]
+    """The environment's info dict of each step."""
     stdout: str
+    """Printed by the policy; bytes that are not UTF-8 are replaced."""
     stderr: str
 
 

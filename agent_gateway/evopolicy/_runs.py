@@ -40,11 +40,15 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     random_score: float | None
     """Mean return of uniform random actions on the same cases; None when they were not played."""
     best_submit: int | None
+    """Index of the selected submit, from 0; None unless the run completed."""
     budget: int
+    """Train episodes."""
     budget_used: int
     """Used train episodes."""
     closed_reason: str
+    """Why the agent's side ended, such as `budget_spent` or `agent_stopped`."""
     wall_s: float
+    """Wall time from the run's opening to its end, seconds."""
     in_question: bool
     """Whether audits disputed one of its results, or found a forger among the workers that played it."""
 
@@ -56,12 +60,17 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     entry: str
     submit: int
+    """Index, from 0."""
     status: str
+    """`ok`, or why not, such as `import_error`."""
     n_episodes: int
+    """Charged episodes; 0 when `cancelled`."""
     mean_return: float | None
+    """Over its train episodes; None unless it is ok."""
     std_return: float | None
-    """Population standard deviation."""
+    """Population standard deviation of the same returns."""
     remaining_budget: int
+    """Train episodes left after it."""
     validation: float | None
     """Mean return on the hidden validation cases; None when there is none."""
     selected: bool
@@ -74,6 +83,7 @@ class EpisodeRecord(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     entry: str
     split: str
+    """`train` or `heldout`."""
     submit: int | None
     """Index of the submit; for a held-out episode, of the selected submit."""
     episode: int
@@ -81,6 +91,7 @@ class EpisodeRecord(msgspec.Struct, frozen=True, kw_only=True):
     case: int | None
     """Train id; None for held-out episodes, whose cases have no ids."""
     episode_return: float
+    """Sum of rewards."""
     length: int | None
     """Steps; None for held-out episodes."""
     failed: bool | None
@@ -232,7 +243,7 @@ class Runs(Sequence[Run]):
     def __init__(self, runs: Sequence[Run], left_out: Sequence[tuple[Path, str]]) -> None:
         self._runs = tuple(runs)
         self.left_out = tuple(left_out)
-        """Folders that could not be read, with the reasons."""
+        """Pairs of a folder that could not be read and the reason."""
 
     def __getitem__(self, index: Any) -> Any:
         return self._runs[index]
