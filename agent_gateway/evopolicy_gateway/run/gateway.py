@@ -139,7 +139,7 @@ class Gateway:
         return self._place or agent_place(self._folder)
 
     async def _permitted(self, session: CoordinatorClient) -> bool:
-        """True when the permit is granted or the run is to be closed; False when told to leave the run open first."""
+        """True when the permit is granted or the run is to be closed; False when ordered to leave the run open."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
         asked = time.monotonic()
@@ -188,7 +188,7 @@ class Gateway:
         return True
 
     async def _agent_gone(self, pipeline: SubmitPipeline) -> bool:
-        """True once the agent has ended as far as anyone can tell; False when told to leave the run open first."""
+        """True once the agent has ended as far as anyone can tell; False when first ordered to leave the run open."""
         unseen = self._alone or ends_unseen(self._folder)
         while unseen and not (pipeline.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
             self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
@@ -199,7 +199,7 @@ class Gateway:
         return not self._stopped.is_set()
 
     async def _unless_stopped(self, wanted: Any) -> Any:
-        """Returns the result, or None when told to leave the run open first."""
+        """Returns the result, or None when first ordered to leave the run open."""
         task, stopped = asyncio.ensure_future(wanted), asyncio.ensure_future(self._stopped.wait())
         await asyncio.wait([task, stopped], return_when=asyncio.FIRST_COMPLETED)
         stopped.cancel()

@@ -452,7 +452,7 @@ class RunLifecycle:
     async def _tell_gone(self, run: str) -> None:
         """Reports to the coordinator that the agent of an open run is gone; resuming the run needs a new permit."""
         if self._plan.listener is not None:
-            return  # nobody here knows about a remote agent
+            return  # this machine does not know about a remote agent
         with contextlib.suppress(EvopolicyError, TimeoutError):
             async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
                 # Only for this machine: the run may have been resumed elsewhere before this arrives.

@@ -198,9 +198,7 @@ def _exact_sum(values: Sequence[float]) -> float:
 
 
 def _fitting(line: dict[str, Any]) -> bytes:
-    """The line, its traceback and then its message cut to fit 64 KiB. A traceback keeps its end, the most useful
-    part.
-    """
+    """The line, its traceback and then its message cut to fit 64 KiB. A traceback keeps its end, which tells most."""
     for field in ("traceback", "message"):
         text = str(line[field])
         keep = len(text)

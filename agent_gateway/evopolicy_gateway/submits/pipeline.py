@@ -216,9 +216,7 @@ class SubmitPipeline:
             )
 
     async def refresh(self) -> RunState:
-        """Returns the coordinator's state of the run, or the last known state if the coordinator does not answer at
-        once.
-        """
+        """Returns the coordinator's state of the run, or the last known one when it does not answer at once."""
         try:
             state = await self._client.state()
         except RefusedError as error:
@@ -316,9 +314,7 @@ class SubmitPipeline:
         self._on_change()
 
     async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
-        """Returns True when the submit is given up. The first failure ends this gateway instead; the next one
-        retries.
-        """
+        """True when the submit is given up. The first failure ends this gateway instead; the next one retries."""
         key = ticket.request.key
         log.error("submit failed", submit=ticket.submit_id, exc_info=error)
         self._deaths[key, None] += 1
