@@ -77,7 +77,7 @@ class RunClosed(Event, frozen=True, kw_only=True, tag="closed"):
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
-    """The agent has printed a message."""
+    """The agent has sent a message."""
 
     turn: int
     text: str

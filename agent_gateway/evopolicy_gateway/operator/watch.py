@@ -43,7 +43,7 @@ class Watch(Protocol):
         """The train side has progressed."""
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        """The agent has printed a message."""
+        """The agent has sent a message."""
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         """The agent's activity changed, or it used more tokens."""

@@ -63,7 +63,7 @@ DISK_PAUSE_S = 2.0
 MAX_REJECTED_KEPT = 1000
 FETCHES_AT_ONCE = 4
 RUN_CLOSED = "run_closed"
-"""The published protocol's status for a submit after the run was closed."""
+"""The published protocol's status for a submit after the last possible one."""
 MAX_DEATHS = 2
 """Number of gateway deaths over one submit, or over one episode's files, after which that is given up."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
