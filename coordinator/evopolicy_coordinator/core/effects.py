@@ -1,12 +1,12 @@
-"""What is to be done: everything that a core asks of its shell, in the imperative and in order.
+"""Effects: all that a core requests of its shell, as commands in order.
 
 Rules that this module owns:
-- Effects are carried out in the order given, across events too. No effect is carried out before every `Persist` ahead of
-  it is durable: a reply may tell of what it rests on. Several `Persist`s in a row, of one event or many, may share one
-  transaction.
-- A `Persist` that fails did not happen: the shell drops the core and every effect not yet carried out, loads a new core
-  from the store, and lets the askers ask again.
-- A `Reply` to an asker that is gone is dropped silently.
+- Effects are carried out in the order given, across events too. No effect is carried out before every `Persist` ahead
+  of it is durable, since a reply may report what the rows hold. Several consecutive `Persist`s, of one event or many,
+  may share one transaction.
+- A `Persist` that fails did not happen: the shell discards the core and every effect not yet carried out, loads a new
+  core from the store, and lets the clients retry.
+- A `Reply` to a client that has disconnected is dropped silently.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .records import Row
 
 
 class Persist(msgspec.Struct, frozen=True, kw_only=True):
-    """Write the rows, in one transaction, durably (fsync), before anything that follows."""
+    """Write the rows in one transaction, durably (fsync), before carrying out the effects after it."""
 
     rows: tuple[Row, ...]
     stimulus_id: str = ""
@@ -36,7 +36,7 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
     request: RequestId
     message: Message
     waits_for: Reason | None = None
-    """What the message says in words that somebody waits for; None for nothing."""
+    """The wait that the message describes in words; None for none."""
     stimulus_id: str = ""
 
 
@@ -50,12 +50,12 @@ class Refuse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer `request` with a `ResultsPage` made from the store.
+    """Answer `request` with a `ResultsPage` read from the store.
 
-    When the row's status is set by the time it is read, `upto` is the row's `released`, whatever the effect says: the submit
-    may have ended since. The page holds the outcomes of `train_group(run, submit_index)` with `cursor <= seq < upto`, in
-    that order, as many as fit; its cursor is one past the last `seq` it holds. It has `done = submit_done(row)` only when
-    it reaches `upto`.
+    If the row's status is set when it is read, `upto` is the row's `released`, whatever the effect says: the submit may
+    have ended in the meantime. The page holds the outcomes of `train_group(run, submit_index)` with `cursor <= seq <
+    upto`, in that order, as many as fit; its cursor is one past its last `seq`. It has `done = submit_done(row)` only
+    when it reaches `upto`.
     """
 
     request: RequestId
@@ -63,15 +63,15 @@ class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     submit_index: int
     cursor: int
     upto: int | None
-    """None for a run that is finished: then the row's `released`. `Refused("unknown_submit")` when there is no row."""
+    """None for a finished run: then the row's `released`. `Refused("unknown_submit")` when the row is missing."""
     waits_for: Reason | None = None
     held_s: float = 0.0
     stimulus_id: str = ""
 
 
 class ReadEvaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer `request` with an `EvaluationPage` of the outcomes of `evaluation_group(evaluation)` with
-    `cursor <= seq < upto`, as many as fit; `finished` is told only on the page that reaches `upto`."""
+    """Answer `request` with an `EvaluationPage` of the outcomes of `evaluation_group(evaluation)` with `cursor <= seq <
+    upto`, as many as fit. Only the page that reaches `upto` reports `finished`."""
 
     request: RequestId
     evaluation: str
@@ -92,8 +92,8 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):
-    """Store the actions of the recording that outcome `index` of `group` names as a blob of its own, with nothing of what
-    came of them, and raise `AuditPrepared`. In the background: nothing waits for it."""
+    """Store the actions from the recording of outcome `index` of `group` as a separate blob, without observations,
+    rewards or results, and raise `AuditPrepared`. Runs in the background: no request waits for it."""
 
     run: str
     audit: str
@@ -103,21 +103,19 @@ class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CompareAudit(msgspec.Struct, frozen=True, kw_only=True):
-    """Compare the last of the outcomes at index 0 of `replays` with outcome `index` of `group`, and with the replay before
-    it, bit for bit; raise `AuditCompared`. In the background."""
+    """Compare the outcome at index 0 of the last group in `replays` with outcome `index` of `group`, and with the
+    replay before it, bit for bit; raise `AuditCompared`. Runs in the background."""
 
     run: str
     audit: str
     group: str
     index: int
     replays: tuple[str, ...]
-    """Groups of one outcome each, one or two of them."""
+    """One or two groups of one outcome each."""
     stimulus_id: str = ""
 
 
 class Log(msgspec.Struct, frozen=True, kw_only=True):
-    """Write a log line."""
-
     level: Literal["debug", "info", "warning", "error"]
     event: str
     fields: dict[str, Any]
@@ -127,6 +125,6 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 ReadEffect = ReadResults | ReadEvaluation | ReadFinished
 
 AuditEffect = PrepareAudit | CompareAudit
-"""Answered by an event, in time."""
+"""Effects that an event answers later."""
 
 Effect = Persist | Reply | Refuse | ReadEffect | AuditEffect | Log

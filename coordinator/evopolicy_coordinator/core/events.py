@@ -1,12 +1,12 @@
-"""What has happened: everything that a core is told, in the past tense.
+"""Events: all input of a core, in the past tense.
 
 Rules that this module owns:
-- The shell has checked every token before it raises an event: join token, operator's token, a run's capability.
-  Worker sessions are checked by the core, which knows when they end.
-- Randomness comes in through events (`secret`, `capability`, `session`, ids); the core makes none of its own.
-- `request` is the shell's opaque handle of the query that waits for an answer. Every event that has one is answered by
-  exactly one effect with that handle (`Reply`, `ReadResults`, `ReadEvaluation` or `ReadFinished`): at once or, for long
-  polls, later.
+- The shell has checked every token before it raises an event: join token, operator's token, a run's capability. The
+  core checks worker sessions, since it knows when they end.
+- Randomness comes in through events (`secret`, `capability`, `session`, ids); the core generates none.
+- `request` is the shell's opaque handle of the query that waits for a reply. Every event that has one is answered by
+  exactly one effect with that handle (`Reply`, `Refuse`, `ReadResults`, `ReadEvaluation` or `ReadFinished`), at once
+  or, for long polls, later.
 - `stimulus_id` names the event in every effect and log line that follows from it.
 """
 
@@ -26,54 +26,55 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):
-    """Something that happened outside."""
+    """An event outside the core."""
 
     stimulus_id: str = ""
 
 
 class Asked(Event, Generic[M_co], frozen=True, kw_only=True):
-    """Somebody asked something: the message itself, with waits and cursors made finite."""
+    """A request arrived: the message itself, with waits and cursors made finite."""
 
     request: RequestId
     message: M_co
     waited_s: float = 0.0
-    """How long it lay unread: the loop stood still."""
+    """Seconds for which the request lay unread because the loop was blocked."""
 
 
 class RunCreated(Asked[CreateRun], frozen=True, kw_only=True):
-    """An operator asked for a run; a known `key` gives the run it made before."""
+    """An operator requested a run; a known `key` returns the existing run."""
 
     row: RunRow
-    """All but when, in which event, and what of it is audited. The id is fresh, and valid in a Zenoh key (`keys.valid_name`)."""
+    """Complete except for creation time, stimulus id and audit share. The id is fresh, and valid in a Zenoh key
+    (`keys.valid_name`)."""
 
 
 class EvaluationRequested(Asked[Evaluate], frozen=True, kw_only=True):
-    """An operator asked for cases to be played outside any run. A known `key` gives the evaluation it made before."""
+    """An operator requested cases to be played outside any run; a known `key` returns the existing evaluation."""
 
     row: EvaluationRow
-    """All but when and in which event."""
+    """Complete except for creation time and stimulus id."""
 
 
 class DisclosureAsked(Asked[Disclose], frozen=True, kw_only=True):
-    """An operator wants the cases of finished runs declared public."""
+    """An operator requested that the cases of finished runs be declared public."""
 
     epochs: tuple[str, ...]
-    """Of the runs, each once."""
+    """Epochs of the runs, each once."""
 
 
 class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):
     """A worker started, or found its session unknown."""
 
     session: str
-    """A fresh id made by the shell; what the worker's later requests carry."""
+    """A fresh id made by the shell; the worker's later requests carry it."""
     machine: str = ""
-    """Whose credentials it joined with; empty for those that the state folder hands out."""
+    """Machine whose credentials the worker joined with; empty for the state folder's own credentials."""
     refused_environments: dict[str, str] = {}
-    """Why what it announced of them is not listened to; they are not in the message any more."""
+    """Refused environment to the reason. They are already removed from the message."""
 
 
 class LivenessLost(Event, frozen=True, kw_only=True):
-    """A worker's liveliness token went: a hint to look at its leases, no proof."""
+    """A worker's liveliness token disappeared: a hint to check its leases, not a proof."""
 
     worker: str
 
@@ -87,11 +88,11 @@ class AuditPrepared(Event, frozen=True, kw_only=True):
     run: str
     audit: str
     actions: BlobRef | None
-    """By its digest; None when there are none to be had."""
+    """The stored actions; None when they are unavailable."""
     error: str = ""
-    """Why there are none."""
+    """Why the actions are unavailable."""
     at_fault: bool = False
-    """What the player reported is no recording; else the coordinator's own store is to blame."""
+    """True when the player's report is not a valid recording; False when the coordinator's own store is at fault."""
 
 
 class AuditCompared(Event, frozen=True, kw_only=True):
@@ -100,11 +101,11 @@ class AuditCompared(Event, frozen=True, kw_only=True):
     run: str
     audit: str
     replay: int
-    """Which replay was compared, from 1."""
+    """Number of the compared replay, from 1."""
     with_player: str | None
-    """Where it parts from what the player reported; None when they are the same."""
+    """First difference from the player's report; None when they are equal."""
     with_first: str | None = None
-    """Where it parts from the first replay; None when they are the same, or it is the first."""
+    """First difference from the first replay; None when they are equal, or this is the first replay."""
     error: str = ""
     """Why they could not be compared, through no worker's fault."""
 

@@ -1,6 +1,6 @@
-"""Who is related to whom: runs and evaluations that share a hidden case, with `strict` all.
+"""Families: runs and evaluations that share a hidden case are related; with `strict` all are.
 
-Rule: a family is known while a run, an evaluation, a permit or a lease is of it.
+Rule: a family is known while a run, an evaluation, a permit or a lease belongs to it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from .model import CaseKey, Family
 
 
 class Families:
-    """Finds relatives."""
+    """Finds related families."""
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
@@ -22,7 +22,7 @@ class Families:
         self._of_case: dict[CaseKey, dict[Family, None]] = {}
 
     def join(self, env: str, cases: Iterable[Case]) -> Family:
-        """The family with these hidden cases, used once more."""
+        """Returns the family with these hidden cases and adds one to its users."""
         keys: frozenset[CaseKey] = frozenset()
         if not self._strict:
             keys = frozenset(
@@ -42,11 +42,11 @@ class Families:
         return family
 
     def known(self) -> Iterable[Family]:
-        """All that are in use."""
+        """Returns all families in use."""
         return self._known.values()
 
     def leave(self, family: Family | None) -> None:
-        """One use of a family is over."""
+        """Remove one user of a family; the last one removes the family."""
         if family is None:
             return
         family.users -= 1

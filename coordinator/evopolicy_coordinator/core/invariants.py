@@ -1,4 +1,4 @@
-"""What must hold between any two steps of a core. Looks at everything: for tests and the simulation."""
+"""Invariants that hold between any two steps of a core. The checks visit all state: for tests and the simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .structures.trace import InvariantError
 
 
 def check(state: State) -> None:
-    """Raise InvariantError, with the trace of what is concerned, at the first thing that contradicts itself."""
+    """Raises InvariantError, with the trace of the record concerned, at the first violation."""
     _jobs(state)
     _queue(state)
     _workers(state)
@@ -49,14 +49,15 @@ def check(state: State) -> None:
 
 
 def _isolation(state: State) -> None:
-    """Hidden jobs, agents and train jobs of related runs are on different kernels; what is over is forgotten."""
+    """Hidden jobs are on other kernels than agents and train jobs of related runs; a family's users are counted."""
     for kernel in state.kernels.values() if state.isolates else ():
         for occupancy in all_related(kernel.hidden, None):
             if occupancy.lease is None or not occupancy.lease.live:
                 continue
             others = (kernel, state.everywhere)
             beside = [each for there in others for each in all_related(there.train, occupancy.family)]
-            # What a worker may have played besides, before it was heard, it has told when its lease was adopted.
+            # The worker's own lingering train occupancies do not count: when its lease was adopted, its heartbeat named
+            # every job that it plays.
             train = any(each.lease is not None or each.worker != occupancy.worker for each in beside)
             apart = not train and not any(related(there.permits, occupancy.family) for there in others)
             want(state, occupancy.id, apart, "a hidden job is apart from related agents and train jobs")
@@ -84,7 +85,7 @@ def _isolation(state: State) -> None:
 
 
 def _audits(state: State) -> None:
-    """What is open of a run's audits is with the shell, or waits for a worker."""
+    """An open audit is with the shell, or waits for a worker."""
     for run in state.runs.values():
         for row in run.audits.values():
             n = len(row.replayed_by)
@@ -104,7 +105,7 @@ def _audits(state: State) -> None:
 
 
 def want(state: State, key: str, holds: bool, what: str) -> None:
-    """InvariantError with the trace of `key` when something does not hold."""
+    """Raises InvariantError with the trace of `key` when `holds` is false."""
     if not holds:
         lines = "\n".join(
             f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in state.trace.of(key)

@@ -1,9 +1,10 @@
-"""From a snapshot of the store to a core that goes on: nothing accepted is lost, nothing done is played again.
+"""From a snapshot of the store to a core that continues: no accepted submit is lost, no finished episode is played
+again.
 
 Rules that this module owns:
-- Budgets are rebuilt from submits, open groups from submits and outcomes; what was complete but not concluded when the
-  process died is concluded first.
-- Jobs that were open may be running somewhere: they wait for heartbeats that claim them, for a short while.
+- Budgets are rebuilt from submits, open groups from submits and outcomes. Groups that were complete but not concluded
+  when the process died are concluded first.
+- Open jobs may be running on a worker: they wait for a short while for heartbeats that claim them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .step import EpisodesDone, Step
 
 
 def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, Step], None]) -> None:
-    """Fill an empty state; `drain` lets those above hear what a step told of."""
+    """Fill an empty state; `drain` delivers the news of a step."""
     loading = state.loading = Loading()
     state.journal = snapshot.journal
     state.revealed.update(snapshot.revealed)
@@ -102,7 +103,7 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
 
 
 def _spent(run: Run, row: SubmitRow) -> None:
-    """Count what a settled submit took of time, as when it ended."""
+    """Add a settled submit's queue and rollout time to the run's totals, as at its end."""
     if row.completed_at is not None:
         started_at = row.first_leased_at or row.completed_at
         run.queue_s += max(0.0, started_at - row.accepted_at)

@@ -1,8 +1,8 @@
-"""The core itself: takes events and deadlines in, lets the rules act, gives ordered effects back.
+"""The core itself: takes events and deadlines, lets the rules act, returns ordered effects.
 
-A step reads top to bottom: the event's rule (`EVENTS`) or the deadline's (`TIMERS`), then the news that it told of, each with
-all that follows from it (`NEWS`), then the scheduler, which hands out what became available. What this module owns beside
-these tables: that the loop's own lateness expires nobody's lease.
+A step runs from top to bottom: the event's rule (`EVENTS`) or the deadline's (`TIMERS`), then the news of the step,
+each piece with all its consequences (`NEWS`), then the scheduler, which leases the work that became available. Besides
+these tables the module owns one rule: a late call of the loop expires no lease.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from .structures.trace import TraceEntry
 from .workers import membership, results, scheduler
 
 TICK_S = 1.0
-"""While leases are out the core wants to be called at least so often, to notice when it is not."""
+"""While leases are out, the core requests a call at least this often, so that it notices when the loop is blocked."""
 
 
 class Core:
-    """The coordinator's state machine. See the package's docstring for the contract with its shell."""
+    """The coordinator's state machine. The package's docstring has the contract with the shell."""
 
     def __init__(self, settings: CoreSettings, incarnation: int, now: float) -> None:
         """An empty core; use `load`."""
@@ -56,21 +56,21 @@ class Core:
 
     @classmethod
     def load(cls, settings: CoreSettings, snapshot: Snapshot, now: float) -> tuple[Core, list[Effect]]:
-        """A core that goes on where the store left off, and what is to be done first."""
+        """Returns a core that continues from the snapshot, and the first effects to carry out."""
         core = cls(settings, snapshot.incarnation, now)
         first = Step(now, f"load-{snapshot.incarnation}")
         loading.load(core.state, snapshot, first, drain)
         return core, core._end(first)
 
     def handle(self, event: events.AnyEvent, now: float) -> list[Effect]:
-        """Take in what happened; the effects are to be carried out in order."""
+        """Process an event; the shell carries out the returned effects in order."""
         self._watch(now)
         this = Step(now, event.stimulus_id)
         EVENTS[type(event.message if isinstance(event, events.Asked) else event)](self.state, event, this)
         return self._end(this)
 
     def next_deadline(self) -> float | None:
-        """When `handle_deadline` is due; None when nothing waits for time to pass."""
+        """Returns when `handle_deadline` is due, Unix seconds; None when no deadline is set."""
         at = self.state.timers.next()
         if self.state.n_live:
             tick = self._called_at + TICK_S
@@ -78,7 +78,7 @@ class Core:
         return at
 
     def handle_deadline(self, now: float) -> list[Effect]:
-        """Do what is due at `now`."""
+        """Process all deadlines due at `now`."""
         self._watch(now)
         effects: list[Effect] = []
         while (key := self.state.timers.pop_due(now)) is not None:
@@ -89,35 +89,36 @@ class Core:
         return effects
 
     def validate(self) -> None:
-        """Check every invariant; InvariantError with the trace of what breaks one. For tests: looks at everything."""
+        """Check every invariant; raises InvariantError, with a trace, at a violation. Visits all state: for tests."""
         invariants.check(self.state)
 
     # ---- reading ----
 
     def capability(self, run: str) -> str | None:
-        """The token of a run's gateway, finished runs too; None for no run."""
+        """Returns the token of a run's gateway, also of a finished run; None for an unknown run."""
         return self.state.capabilities.get(run)
 
     def over(self, run: str) -> tuple[Refusal, Reason]:
-        """Why nothing more is taken of a run that is not open."""
+        """Returns why a run that is not open refuses further requests."""
         return open_runs.over(self.state, run)
 
     def worker_of(self, session: str) -> str | None:
-        """The worker whose present session is `session` (its right to read and write blobs); None when it is nobody's."""
+        """Returns the worker whose current session is `session` (its right to read and write blobs); None for an
+        unknown session."""
         return self.state.sessions.get(session)
 
     def status(self, now: float, words: Words) -> CoreStatus:
-        """The core's part of a `StatusReply`; `words` puts a reason into words."""
+        """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
         return status.status(self.state, now, words)
 
     def trace(self, key: str) -> list[TraceEntry]:
-        """What happened to a job, lease, worker, group or run, oldest first, as far back as is kept."""
+        """Returns the trace of a job, lease, worker, group or run, oldest entry first, as far back as it is kept."""
         return self.state.trace.of(key)
 
     # ---- a step ----
 
     def _watch(self, now: float) -> None:
-        """Notice when the loop stood still: then heartbeats may be waiting behind this very call."""
+        """Detect that the loop was blocked: then unread heartbeats may be queued behind this call."""
         due, state = self.next_deadline(), self.state
         if due is not None and now - due > state.settings.late_s:
             state.hold_until = now + state.settings.lease_ttl_s
@@ -126,7 +127,7 @@ class Core:
         self._called_at = now
 
     def _end(self, this: Step) -> list[Effect]:
-        """Let those above hear what happened, and hand out what became available."""
+        """Deliver the news of the step and lease the work that became available."""
         if this.news:
             drain(self.state, this)
         if this.last is not None:
@@ -136,7 +137,7 @@ class Core:
 
 
 def drain(state: State, this: Step) -> None:
-    """Tell the news of a step, in order; what follows from a piece of news comes before what was told after it."""
+    """Deliver the news of a step in order. The consequences of a piece of news come before the pieces told after it."""
     pending = this.news
     while pending:
         piece = pending.popleft()
@@ -176,7 +177,7 @@ EVENTS: dict[type, Rule] = {
     events.AuditPrepared: audits.prepared,
     events.AuditCompared: audits.compared,
 }
-"""Who takes an event: by the message that it carries, or by its own type where it carries none."""
+"""The rule for each event: by the message that it carries, or by its own type if it carries none."""
 
 
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
@@ -194,14 +195,14 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.JobRetried, ""): (runs.retried,),
     (step.ResultsDiffered, ""): (runs.differed,),
 }
-"""Who hears a piece of news: by its type and the kind of group or flow that it is of (`kind`)."""
+"""The rules for each piece of news: by its type and the kind of its group or flow (`kind`)."""
 
 
 # ---- timers ----
 
 
 def _poll_ended(state: State, request: events.RequestId, this: Step) -> None:
-    """A long poll's time is up: it is answered with what there is."""
+    """Answer a long poll whose time is up with the current state."""
     poll = state.polls.take(request)
     if poll is not None:
         POLLS[poll.kind](state, poll, this)
@@ -237,4 +238,4 @@ TIMERS: dict[str, Rule] = {
     "ask": permits.ask_ended,
     "cancelled": permits.agent_ended,
 }
-"""Who acts on a deadline: by its kind, with what it is about."""
+"""The rule for each deadline: by its kind; the rule gets the deadline's subject."""

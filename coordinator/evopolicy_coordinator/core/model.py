@@ -1,7 +1,7 @@
-"""Plain records of what is open: jobs and their groups, leases, workers, queues, kernels, runs. They know no rule.
+"""Plain records of open work: jobs and their groups, leases, workers, queues, kernels, runs. They contain no rules.
 
-A method here tells what follows from its own record's fields, or keeps counts in step with each other; it decides nothing.
-All in one module, as they name each other: a lease its job, a job its lease.
+A method here returns what follows from its own record's fields, or keeps counts consistent; it decides nothing. All
+records are in one module because they refer to each other, such as a lease to its job and a job to its lease.
 """
 
 from __future__ import annotations
@@ -38,21 +38,22 @@ T = TypeVar("T")
 
 
 TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION, AUDIT, HIDDEN_AUDIT = range(6)
-"""Priorities. Validation of a closed run and evaluations on hidden cases are `HELDOUT`'s, the random reference and other
-evaluations `REFERENCE`'s, audits of what `HIDDEN` has `HIDDEN_AUDIT`'s."""
+"""Priorities. Validation of a closed run and evaluations on hidden cases have `HELDOUT`, the random reference and other
+evaluations `REFERENCE`, audits of `HIDDEN` jobs `HIDDEN_AUDIT`."""
 N_PRIORITIES = 6
 RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUDIT))
-"""Priorities that get fair shares of what those before them leave."""
+"""Each rank of priorities gets fair shares of what the ranks before it leave."""
 HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,), (AUDIT,))
-"""The same on a kernel that is turned over to hidden jobs (`precedence`)."""
+"""The same on a kernel that is reserved for hidden jobs (`agents.precedence`)."""
 HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
-"""What a policy does, or did, on hidden cases: never on a kernel with an agent who could learn of it (`isolation`)."""
+"""Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn of
+them (`isolation`)."""
 
 GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
 
 class OutcomeDigest(NamedTuple):
-    """What is kept of a finished episode while its group is open; equal for attempts that went the same way."""
+    """The part of a finished episode that is kept while its group is open; equal for attempts with equal results."""
 
     episode_return: float
     length: int
@@ -61,7 +62,6 @@ class OutcomeDigest(NamedTuple):
 
 
 def outcome_digest(outcome: EpisodeOutcome) -> OutcomeDigest:
-    """The mark of an outcome."""
     return OutcomeDigest(
         outcome.episode_return,
         outcome.length,
@@ -72,7 +72,7 @@ def outcome_digest(outcome: EpisodeOutcome) -> OutcomeDigest:
 
 @dataclass(slots=True, frozen=True, kw_only=True)
 class Template:
-    """What all jobs of a group have in common."""
+    """The parameters that all jobs of a group share."""
 
     env: str
     bundle: str | None
@@ -81,13 +81,13 @@ class Template:
     case_ids: tuple[int, ...]
     occurrences: tuple[int, ...]
     secret: bytes | None
-    """What policy seeds are derived from; None for the random reference, whose actions follow from split and case."""
+    """Key of the policy seeds; None for the random reference, whose actions follow from split and case."""
     split: str
     submit_index: int
     modulo: int
     """`episode_index` is the index modulo this."""
     per_job: int
-    """Episodes in a job: 1, or with policy scope `submit` as many as share one Policy."""
+    """Episodes in a job: 1, or with policy scope `submit` the number of episodes that share one Policy."""
     scope: PolicyScope
     env_meta: dict[str, Any]
     observations: ObservationForm
@@ -100,63 +100,63 @@ class Template:
     replays: tuple[BlobRef, ...] = ()
     """Recorded actions for each index, in place of a policy; empty for none."""
     indexes: tuple[int, ...] = ()
-    """For each index the one that it had in the list it was taken from; empty where it is the same."""
+    """For each index, the index in the list that the case was taken from; empty where they are equal."""
 
 
 @dataclass(slots=True, eq=False)
 class JobState:
-    """An open job: where it stands."""
+    """An open job and its place."""
 
     job_id: str
     group: JobGroup
     first: int
     """Index of its first episode."""
     n: int
-    """Episodes in it."""
+    """Number of its episodes."""
     attempts: int
     """Number of the last attempt."""
     priority: int
     ticket: int = 0
-    """Grows whenever it enters or leaves the queue: older queue entries are void."""
+    """Incremented whenever the job enters or leaves the queue; queue entries with an older ticket are void."""
     place: Place = "new"
-    """Where it is; `transitions.JOB` says what may follow."""
+    """`transitions.JOB` lists the allowed successors."""
     lease: Lease | None = None
     failures: int = 0
     """Infrastructure failures so far, in this incarnation."""
     last_failure: str = ""
-    """What the last of them was and where, for an operator."""
+    """The last failure and its worker, for an operator."""
     avoid: str | None = None
-    """The worker that it last failed on: not given to it before `avoid_until`, while there is another."""
+    """The worker that it last failed on: not leased to it before `avoid_until`, if its lane has another one."""
     avoid_until: float = 0.0
     alone: bool = False
-    """It is a suspect: played with nothing beside it."""
+    """It is a suspect: played with no other job beside it."""
     reserved: str | None = None
-    """The worker that is being emptied for it (of a suspect)."""
+    """The worker that is being emptied for it, if it is a suspect."""
     preemptions: int = 0
     since: float = 0.0
-    """When it last began to wait."""
+    """When its present wait began."""
     held_attempts: set[int] = field(default_factory=set)
     """Attempts that this incarnation granted or adopted: none is adopted twice."""
     begun: BlobRef | None = None
-    """What its policy had returned when it was given back, and stands; None: it begins anew."""
+    """Actions that its policy returned before it was given back; the next attempt plays them first. None: starts
+    anew."""
     begun_attempt: int = 0
-    """The attempt that told so."""
+    """The attempt that reported them."""
     parting: Lease | None = None
-    """The lease that was stopped, while it waits for what the worker hands back."""
+    """The stopped lease, until its worker releases it."""
 
     @property
     def queued(self) -> bool:
-        """Whether it waits in the queue."""
         return self.place == "queued"
 
     def move(self, place: Place) -> None:
-        """It is somewhere else now."""
+        """Change its place; raises InvariantError when the transition is not allowed."""
         if place not in JOB[self.place]:
             check(JOB, self.job_id, self.place, place)
         self.place = place
 
     def names_blob(self, digest: str) -> bool:
-        """Whether its worker needs the blob: the bundle, a recording that it plays, or what it goes on from."""
+        """Whether its worker needs the blob: the bundle, a recording to replay, or the actions to resume from."""
         template = self.group.template
         recordings = [self.begun, *template.replays[self.first : self.first + self.n]]
         return digest == template.bundle or any(
@@ -184,26 +184,25 @@ class JobGroup:
     first_leased_at: float | None = None
     n_leased: int = 0
     held_since: float | None = None
-    """Since when none of its episodes runs because hidden ones have its kernels; None while that is not so."""
+    """When hidden jobs began to keep all its episodes from its kernels, so that none runs; None when they do not."""
     held_s: float = 0.0
-    """How long that was before."""
+    """Seconds held before `held_since`."""
     held_counted_s: float = 0.0
-    """How much of it the submit's limit has been put off by."""
+    """Part of the held time by which the submit's limit has been extended."""
     closed: bool = False
     not_on: frozenset[str] = frozenset()
-    """Workers that never get it."""
+    """Workers that are never leased its jobs."""
     not_of: frozenset[str] = frozenset()
-    """Machines whose workers never get it."""
+    """Machines whose workers are never leased its jobs."""
     numerics: str | None = None
-    """What a worker's numbers must depend on (`Worker.numerics`); None for any."""
+    """Required numerics of its workers (`Worker.numerics`); None for any."""
 
     def held(self, now: float) -> float:
-        """Seconds for which none of its episodes ran because hidden ones had its kernels."""
+        """Seconds for which none of its episodes ran because hidden jobs occupied its kernels."""
         return self.held_s + (0.0 if self.held_since is None else max(0.0, now - self.held_since))
 
     @property
     def hidden(self) -> bool:
-        """Whether it is hidden work."""
         return self.priority in HIDDEN
 
     def excludes(self, worker: Worker) -> bool:
@@ -214,12 +213,12 @@ class JobGroup:
 
     @property
     def n(self) -> int:
-        """Episodes in all."""
+        """Number of its episodes."""
         return len(self.template.cases)
 
     @property
     def done(self) -> int:
-        """Episodes that have their outcome."""
+        """Episodes that have an outcome."""
         return len(self.digests)
 
     def returns(self) -> tuple[float, ...]:
@@ -227,11 +226,11 @@ class JobGroup:
         return tuple(self.digests[index].episode_return for index in range(self.n))
 
     def mean_return(self) -> float:
-        """Mean of the returns, summed exactly, so that order of arrival cannot show."""
+        """Mean of the returns, summed exactly, so that the order of arrival has no influence."""
         return math.fsum(self.returns()) / self.n
 
     def failed(self) -> int:
-        """Episodes whose policy failed."""
+        """Episodes in which the policy failed."""
         return sum(digest.failure is not None for digest in self.digests.values())
 
     def first_unfinished(self) -> int:
@@ -249,12 +248,12 @@ class Lease:
     attempt: int
     granted_at: float
     renewed: float
-    """When its holder last named it, or was given it."""
+    """When its holder last named it, or was granted it."""
     named: bool = False
     """Whether its holder ever named it: if not, it may never have arrived."""
     running: bool = False
     started_at: float | None = None
-    """When it was first said to run."""
+    """When a heartbeat first reported it as running."""
     episodes_done: int = 0
     steps: int = 0
     progress_at: float = 0.0
@@ -263,18 +262,18 @@ class Lease:
     orphan_until: float | None = None
     """Its session ended; a heartbeat may claim it until then."""
     doubtful: bool = False
-    """Its holder was silent for long, or this incarnation did not grant it: a verdict about a limit may be the
-    silence's fault, and does not count."""
+    """Its holder was silent for long, or this incarnation did not grant it: a limit verdict may be caused by the
+    silence, and does not count."""
     hidden_in: dict[Lease, None] | None = None
-    """Where it is listed as one that may be preempted."""
+    """The list of preemptible leases that holds it."""
     stopped_for: Lane | None = None
-    """Whose train jobs it was preempted for."""
+    """The lane whose train jobs it was preempted for."""
     occupancy: Occupancy | None = None
-    """Where it is, if it is hidden or train: as long as it is its worker's."""
+    """Its place on a kernel, if it is hidden or train, until its worker releases it."""
 
     @property
     def parting(self) -> bool:
-        """Whether its job waits for what its worker hands back."""
+        """Whether its job waits until the worker releases this lease."""
         return self.job.parting is self
 
 
@@ -290,28 +289,28 @@ ProfileKey = tuple[frozenset[tuple[str, str]], frozenset[Tier]]
 
 @dataclass(slots=True, eq=False)
 class Flow:
-    """A run or an evaluation, as something that gets its share."""
+    """A run or an evaluation as a unit of fair share."""
 
     id: str
     env: str
     tier: Tier
     of: Literal["run", "evaluation"]
     secret: bytes
-    """Of the run or evaluation: its leases are named by it."""
+    """Of the run or evaluation: part of its leases' names."""
     seq: int
     """Order of creation: breaks ties."""
     family: Family | None = None
-    """Those that share its hidden cases; None where it has none."""
+    """Runs and evaluations with the same hidden cases; None if it has none."""
     closed: bool = False
-    """No agent is at work for it: its hidden jobs wait for agents so long and no longer (`precedence`)."""
+    """No agent works for it: its hidden jobs wait for agents for a limited time only (`agents.precedence`)."""
     definition: str = ""
-    """First digits of the digest of the environment's definition that it is played in; empty: any."""
+    """First digits of the digest of the environment definition that it needs; empty: any."""
     pin: str | None = None
-    """Fingerprint class; None until there is a worker for it."""
+    """Fingerprint class; None until a worker offers one."""
     description: EnvironmentDescription | None = None
     lane: Lane | None = None
     served: list[float] = field(default_factory=lambda: [0.0] * N_PRIORITIES)
-    """Virtual time by priority: slot seconds handed out, counted from the clock it started at."""
+    """Virtual time by priority: slot seconds leased, counted from the clock's value when the flow became active."""
     ready: tuple[deque[tuple[int, JobState]], ...] = field(
         default_factory=lambda: tuple(deque() for _ in range(N_PRIORITIES))
     )
@@ -322,11 +321,11 @@ class Flow:
     """Moving average of an episode's wall time; None before the first."""
 
     def cost_s(self, job: JobState) -> float:
-        """What a job is expected to take, seconds of a slot; one second while nothing is known."""
+        """Expected play time of a job, slot seconds; one second an episode while no time is known."""
         return (1.0 if self.episode_s is None else self.episode_s) * job.n
 
     def observe(self, wall_s: float) -> None:
-        """Learn from an episode that took `wall_s` seconds."""
+        """Update the average with an episode that took `wall_s` seconds."""
         self.episode_s = wall_s if self.episode_s is None else 0.8 * self.episode_s + 0.2 * wall_s
 
 
@@ -342,41 +341,41 @@ class Lane:
     waiting: tuple[dict[Family | None, int], ...] = field(
         default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
     )
-    """Jobs that wait, suspects too, by priority and family."""
+    """Waiting jobs, suspects included, by priority and family."""
     backlog: dict[Family, int] = field(default_factory=dict)
-    """Hidden ones of them that are of closed flows."""
+    """The hidden ones of closed flows among them."""
     kept_s: dict[Family, float] = field(default_factory=dict)
-    """How long such jobs were kept from all kernels, since there were last none."""
+    """Seconds for which such jobs were kept from all kernels, since there last were none."""
     done_looks: dict[Family, int] = field(default_factory=dict)
     reversals: dict[Family, Reversal] = field(default_factory=dict)
     looked_at: float = 0.0
     profiles: dict[Profile, None] = field(default_factory=dict)
     stopping: int = 0
-    """Hidden jobs that were stopped for this lane's sake and whose workers have not let go of them yet."""
+    """Hidden jobs that were stopped for this lane and that their workers have not released yet."""
 
     def count(self, priority: int, flow: Flow, n: int) -> None:
-        """So many more jobs of a flow wait."""
+        """Add `n` to the waiting jobs of a flow."""
         add(self.waiting[priority], flow.family, n)
         if flow.closed and priority in HIDDEN and flow.family is not None:
             add(self.backlog, flow.family, n)
 
     def waits_of(self, family: Family | None, *, train_too: bool) -> bool:
-        """Whether hidden jobs wait of the family's relatives, or of any for None, and no train jobs that they leave the
-        kernel to; with `train_too` whether any of both do."""
+        """Whether related hidden jobs wait (of any family for None) and no related train jobs that they leave the
+        kernel to; with `train_too`, whether related jobs of either kind wait."""
         if _of(self.waiting[TRAIN], family):
             return train_too
         return any(_of(self.waiting[priority], family) for priority in HIDDEN)
 
     def slots(self) -> int:
-        """Slots of the workers that may serve it."""
+        """Slots of the active workers that may serve it."""
         return sum(profile.slots for profile in self.profiles)
 
     def workers(self) -> int:
-        """How many active workers may serve it."""
+        """Number of active workers that may serve it."""
         return sum(len(profile.workers) for profile in self.profiles)
 
     def top(self, priority: int) -> Flow | None:
-        """The flow to serve first; None when none waits."""
+        """The flow to serve next; None when no flow waits."""
         heap = self.heaps[priority]
         while heap:
             served, seq, flow = heap[0]
@@ -393,40 +392,40 @@ class Lane:
 
 @dataclass(slots=True, eq=False)
 class Profile:
-    """Workers that can do the same: environments of the same fingerprint classes, and tiers."""
+    """Workers with the same capabilities: environments of the same fingerprint classes, and tiers."""
 
     key: ProfileKey
     fingerprint: Fingerprint
-    """Of the whole workers."""
+    """Of the whole worker."""
     descriptions: dict[str, EnvironmentDescription]
     fingerprints: dict[str, Fingerprint]
     """Of each environment by itself."""
     classes: dict[str, str]
-    """Environment to what runs of it are pinned to; see `Fingerprint.class_name`."""
+    """Environment to the class that its runs are pinned to; see `Fingerprint.class_name`."""
     lanes: dict[LaneKey, Lane] = field(default_factory=dict)
     busy: dict[Lane, None] = field(default_factory=dict)
-    """Its lanes in which something waits."""
+    """Its lanes with waiting jobs."""
     workers: dict[str, None] = field(default_factory=dict)
-    """Those that are active: not lost, not draining."""
+    """Active workers only: not paused, draining, lost or quarantined."""
     slots: int = 0
-    """Of the active ones."""
+    """Of the active workers."""
     parked: dict[str, None] = field(default_factory=dict)
     """Workers whose lease poll waits and could be answered now, oldest first."""
     warm: dict[str, dict[str, None]] = field(default_factory=dict)
-    """Warm environment or bundle digest to those of `parked` that have it."""
+    """Warm environment or bundle digest to the workers in `parked` that have it."""
     hidden: tuple[dict[Lease, None], ...] = field(
         default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
     )
     """Live leases of its workers that may be preempted, by priority, oldest first."""
 
     def offers(self, flow: Flow) -> bool:
-        """Whether these workers have a flow's environment and sandbox tier."""
+        """Whether these workers have a flow's environment, its definition, and its sandbox tier."""
         if flow.env not in self.classes or flow.tier not in self.key[1]:
             return False
         return flow.definition in ("", self.fingerprints[flow.env].definition)
 
     def serves(self, key: LaneKey) -> bool:
-        """Whether these workers may play what waits in a lane of that key."""
+        """Whether these workers may play the jobs of a lane with that key."""
         env, tier, fingerprint_class = key
         return env in self.classes and tier in self.key[1] and fingerprint_class == self.classes[env]
 
@@ -450,7 +449,7 @@ CaseKey = tuple[str, int, str]
 """Environment, seed, options."""
 
 EVERYWHERE = ""
-"""The kernel of whoever does not say: it may be any."""
+"""The kernel of a worker or agent without a known boot id: it may be any."""
 
 
 @dataclass(slots=True, eq=False)
@@ -459,12 +458,12 @@ class Family:
 
     cases: frozenset[CaseKey]
     relatives: dict[Family, None] = field(default_factory=dict)
-    """Those that share a case with it, itself included."""
+    """Families that share a case with it, itself included."""
     users: int = 0
     hidden_on: dict[Kernel, int] = field(default_factory=dict)
-    """Kernels to how many of its hidden jobs are there."""
+    """Kernel to the number of its hidden jobs there."""
     lanes: dict[Lane, None] = field(default_factory=dict)
-    """Where its jobs wait, or have waited."""
+    """Lanes in which its jobs wait, or have waited."""
 
 
 @dataclass(slots=True, eq=False)
@@ -479,15 +478,15 @@ class Occupancy:
     """None: not known, so related to all."""
     hidden: bool
     lease: Lease | None
-    """None once the coordinator has given it up, or never granted it."""
+    """None once the coordinator has given it up, or if it never granted it."""
     serial: int = 0
-    """Number of the poll that it was granted to; 0: it had arrived before its worker was first heard."""
+    """Number of the poll that it was granted to; 0: it had arrived before the worker's first request."""
     until: float | None = None
     """When it has surely ended, once its lease was given up."""
 
     @property
     def key(self) -> str:
-        """One lease may be in the hands of several workers, when it was given up."""
+        """Several workers may hold the same lease id after it was given up, so the key includes the worker."""
         return f"{self.worker} {self.id}"
 
 
@@ -496,7 +495,7 @@ Occupancies = dict[Family | None, dict[str, Occupancy]]
 
 @dataclass(slots=True, eq=False)
 class Ask:
-    """A permit that is asked for."""
+    """A requested permit."""
 
     row: PermitRow
     family: Family
@@ -505,7 +504,7 @@ class Ask:
 
 @dataclass(slots=True, eq=False)
 class Reversal:
-    """Hidden jobs of a family go first on a kernel."""
+    """Hidden jobs of a family have precedence on a kernel."""
 
     kernel: Kernel
     lane: Lane
@@ -514,7 +513,7 @@ class Reversal:
 
 @dataclass(slots=True, eq=False)
 class Kernel:
-    """What is, or may be, on one kernel."""
+    """The confirmed and possible occupants of one kernel."""
 
     boot_id: str
     workers: dict[str, None] = field(default_factory=dict)
@@ -534,15 +533,13 @@ OutOfService = Literal["draining", "paused"]
 
 @dataclass(slots=True, eq=False)
 class LeasePoll:
-    """A worker's long poll for leases."""
-
     request: RequestId
     n: int
     warm: frozenset[str]
     until: float
-    """When it is answered with what there is."""
+    """When it is answered even without leases."""
     serial: int = 0
-    """The worker's own number of it."""
+    """The worker's own number of the poll."""
 
 
 @dataclass(slots=True, eq=False)
@@ -560,36 +557,36 @@ class Worker:
     first_serial: int | None = None
     """Number of the session's first poll."""
     machine: str = ""
-    """Whose credentials it joined with; empty for those that the state folder hands out."""
+    """Machine whose credentials it joined with; empty for the state folder's own credentials."""
     cpu: str = ""
     """Its processor's features."""
     state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
-    """By id, oldest first; given-up ones too, until the worker no longer names them."""
+    """By id, oldest first; also given-up ones until the worker no longer names them."""
     held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
     """Live leases by priority."""
     n_live: int = 0
     """Live leases in all."""
     poll: LeasePoll | None = None
     beat: RequestId | None = None
-    """A heartbeat whose answer is held back."""
+    """A heartbeat whose reply is delayed."""
     doubted_at: float | None = None
-    """When its liveliness token went; None while it is there, or since it was heard from."""
+    """When its liveliness token disappeared; None while it exists, or after a later request."""
     reserved: JobState | None = None
-    """The suspect it is being emptied for."""
+    """The suspect that it is being emptied for."""
     alone: Lease | None = None
-    """The suspect it plays, with nothing beside it."""
+    """The suspect that it plays, with no other job beside it."""
     failures: int = 0
-    """Jobs in a row that failed through its own fault."""
+    """Consecutive jobs that failed through its own fault."""
     benched_until: float = 0.0
 
     def numerics(self, env: str) -> str:
-        """What its numbers of an environment depend on: equal for workers that come to the same bits, the processor's features
-        included."""
+        """Identifies what its numbers in an environment depend on, the processor's features included: equal for workers
+        with bit-identical results."""
         return msgspec.structs.replace(self.profile.fingerprints[env], cpu=self.cpu).class_name(cpu=True)
 
     def running(self) -> list[Lease]:
-        """Leases it plays now: as it said, or the oldest, one a slot, as long as it has not said."""
+        """Leases that it plays now: as its heartbeats reported, or, before a report, the oldest, one per slot."""
         told = [lease for lease in self.leases.values() if lease.running]
         return told or list(self.leases.values())[: self.slots]
 
@@ -611,19 +608,19 @@ class Run:
     open: int | None = None
     """The submit in flight."""
     hidden_failures: dict[str, int] = field(default_factory=dict)
-    """Group id to hidden episodes in which the policy failed, of finished groups."""
+    """Group id to number of hidden episodes in which the policy failed, of finished groups."""
     hidden_returns: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """Held-out and random group id to returns, of finished groups."""
     rollout_s: float = 0.0
     queue_s: float = 0.0
     played: dict[str, int] = field(default_factory=dict)
-    """Worker to the run's episodes that it has played."""
+    """Worker to the number of the run's episodes that it has played."""
     audits: dict[str, AuditRow] = field(default_factory=dict)
-    """All that were drawn, by id."""
+    """All drawn audits, by id."""
     audits_waited_s: float = 0.0
-    """How long the run, done otherwise, has waited for audits that could be played."""
+    """Seconds for which the run, otherwise done, has waited for playable audits."""
     audits_looked_at: float | None = None
-    """When that was last counted; None before."""
+    """When that was last updated; None before."""
 
     @property
     def id(self) -> str:
@@ -631,7 +628,7 @@ class Run:
 
     @property
     def family(self) -> Family:
-        """The runs that share its hidden cases."""
+        """The family of its hidden cases."""
         assert self.flow.family is not None
         return self.flow.family
 
@@ -646,7 +643,7 @@ class Evaluation:
 
 @dataclass(slots=True, frozen=True)
 class Ended:
-    """What stays known of a finished one."""
+    """What stays known of a finished evaluation."""
 
     total: int
-    """Outcomes that are stored."""
+    """Number of stored outcomes."""

@@ -1,4 +1,4 @@
-"""Why something is refused, and what waits for what: codes with what they are about. The words are the shell's (`server.words`)."""
+"""Reasons of refusals and waits: codes with their arguments. The shell puts them into words (`server.reason_texts`)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Code = Literal[
     "forger",
     "quarantined",
     "unknown_class",
-    # What a group, a permit or a run waits for.
+    # Waits of a group, a permit or a run.
     "workers",
     "scoring",
     "being_put_off",
@@ -58,12 +58,11 @@ Code = Literal[
 
 
 class Reason(NamedTuple):
-    """A code, and what it is about by name; a reason may be about another."""
+    """A code and its arguments by name; an argument may be another reason."""
 
     code: Code
     about: dict[str, Any]
 
 
 def because(code: Code, **about: Any) -> Reason:
-    """The reason `code`, about these."""
     return Reason(code, about)

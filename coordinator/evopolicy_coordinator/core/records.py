@@ -1,10 +1,10 @@
-"""What the store keeps: the rows that `Persist` writes, and the snapshot a core is loaded from.
+"""Stored records: the rows that `Persist` writes, and the snapshot that a core is loaded from.
 
 Rules that this module owns:
 - A row is written whole (insert or replace) under its key; a `Persist` is one transaction, all of its rows or none.
-- Nothing about queues, leases, sessions and long polls is here: those are soft, and come back from the workers' own
-  heartbeats and the clients' own retries. Jobs are not stored either: they follow from runs, submits and outcomes.
-- What a finished job came to is in its `OutcomeRow` and nowhere else; a core keeps only heads, of open groups only.
+- Queues, leases, sessions and long polls are not stored: they are soft, and come back from the workers' heartbeats and
+  the clients' retries. Jobs are not stored either: they follow from runs, submits and outcomes.
+- The result of a finished job is in its `OutcomeRow` and nowhere else; a core keeps only heads, of open groups only.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     allowed_imports: tuple[str, ...] = ()
     denied_imports: tuple[str, ...] = ()
     max_steps: int = 0
-    """Steps after which an episode is cut; 0: only its environment ends it."""
+    """Steps after which an episode is truncated; 0: only its environment ends it."""
     audit_share: float = 0.0
-    """Of the run's episodes, played again on another worker."""
+    """Share of the run's episodes that are replayed on another worker, 0 to 1."""
     reference_by_case: bool = False
-    """The random reference's actions follow from split and case; False in rows of earlier versions: from `secret`."""
+    """The random reference's actions follow from split and case; if False (rows of earlier versions), from `secret`."""
     epoch: str = ""
     """Of the cases; empty in rows of earlier versions."""
     salt: bytes = b""
@@ -71,14 +71,14 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
 
 
 class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
-    """What changes of a run. Key: `run`."""
+    """The changing part of a run. Key: `run`."""
 
     run: str
     phase: Phase = "open"
     fingerprint_class: str | None = None
     """The class of workers that the run is pinned to; None until a worker offers its environment."""
     description: EnvironmentDescription | None = None
-    """As told by the worker it was pinned by."""
+    """From the worker that it was first pinned by."""
     fingerprint: Fingerprint | None = None
     """That worker's."""
     overrides: tuple[str, ...] = ()
@@ -89,11 +89,11 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     infrastructure_retries: int = 0
     nondeterministic_results: int = 0
     isolation: HiddenIsolation = "unknown"
-    """What has held so far; `unknown` in rows of older versions."""
+    """Isolation that has held so far; `unknown` in rows of older versions."""
     remaining_budget: int = 0
     """Once finished: train episodes that were not spent."""
     n_submits: int = 0
-    """Once finished: accepted submits."""
+    """Once finished: number of accepted submits."""
 
 
 class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
@@ -122,18 +122,18 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     val_mean: float | None = None
     """Hidden validation mean; None until every validation case is done."""
     ineligible: str | None = None
-    """Why the checkpoint cannot be selected, by the word of an earlier version; None otherwise."""
+    """Why the checkpoint cannot be selected, as stored by an earlier version; None otherwise."""
     held_s: float = 0.0
-    """Seconds for which none of its episodes ran because hidden ones had the machines."""
+    """Seconds for which none of its episodes ran because hidden jobs occupied the machines."""
     refunded: bool = False
-    """The run was cancelled while this submit was open: nothing is charged for it."""
+    """The run was cancelled while this submit was open: it is not charged."""
 
 
 class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
-    """What one episode came to. Key: `group`, `index`."""
+    """The outcome of one episode. Key: `group`, `index`."""
 
     group: str
-    """Which list of cases the episode belongs to; see `groups`."""
+    """The list of cases that the episode belongs to; see `train_group` and its siblings."""
     index: int
     """Position in that list: the request index of a train episode."""
     seq: int
@@ -147,7 +147,8 @@ class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
 
 
 class BegunRow(msgspec.Struct, frozen=True, kw_only=True, tag="begun"):
-    """What the policy of a job returned in an attempt that was given back, and stands. Key: `group`, `first`."""
+    """The actions that the policy of a job returned in an attempt that was given back; the next attempt plays them
+    first. Key: `group`, `first`."""
 
     group: str
     first: int
@@ -166,7 +167,7 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     bundle: str | None
     split: Split
     case_ids: tuple[int, ...]
-    """Ids in the split, as asked for; `cases` in the same order."""
+    """Ids in the split, as requested; `cases` in the same order."""
     cases: tuple[Case, ...]
     secret: bytes
     record: Record
@@ -177,7 +178,7 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     fingerprint_class: str | None = None
     finished: bool = False
     error: str = ""
-    """Why it ended early (the policy brought its slot down too often); empty when it ran through."""
+    """Why it ended early; empty when it ran to its end."""
     replays: tuple[BlobRef, ...] = ()
     as_in: PlayedAs | None = None
     max_steps: int = 0
@@ -192,46 +193,46 @@ class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
 
 
 class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
-    """An operator's word on a worker, or an audit's. Key: `worker`."""
+    """The state of a worker, set by an operator or an audit. Key: `worker`."""
 
     worker: str
     state: Literal["active", "paused", "draining", "quarantined"]
     reason: str = ""
     """Why it is quarantined."""
     machine: str = ""
-    """Whose workers are quarantined with it; empty for its own name alone."""
+    """Machine whose workers are quarantined with it; empty for its own name alone."""
 
 
 class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
-    """An episode that was drawn to be audited. Key: `audit`."""
+    """An episode that was drawn for an audit. Key: `audit`."""
 
     run: str
     audit: str
-    """See `audit.audit_id`; the groups of its replays begin with it."""
+    """See `audits.audit_id`; the groups of its replays begin with it."""
     group: str
     index: int
-    """The audited outcome's key."""
+    """With `group`, the audited outcome's key."""
     kind: Literal["train", "validation", "heldout", "random"]
     """Of the group."""
     submit_index: int
     player: str
     machines: tuple[str, ...] = ()
-    """Those of the player and of who has played it again, where they have credentials of their own."""
+    """Machines of the player and of its auditors, where they have credentials of their own."""
     numerics: str
-    """What the player's numbers depend on; its auditors' must be the same."""
+    """The player's `Worker.numerics`; its auditors' must be equal."""
     state: Literal["open", "agreed", "disputed", "not_audited"] = "open"
     reason: str = ""
     """Of the state, in words."""
     actions: BlobRef | None = None
-    """What is played again, once it is stored and as long as the audit is open."""
+    """The actions to replay, once they are stored and while the audit is open."""
     replayed_by: tuple[str, ...] = ()
-    """Who has played it again, in order; their outcomes are durable."""
+    """Its auditors so far, in order; their outcomes are durable."""
     compared: int = 0
-    """How many of those have been compared."""
+    """Number of replays that have been compared."""
     difference: str = ""
-    """Where the player and the first of them part."""
+    """First difference between the player and the first auditor."""
     forger: str = ""
-    """The player, where it was refuted."""
+    """The player, if it was refuted."""
 
 
 class PermitRow(msgspec.Struct, frozen=True, kw_only=True, tag="permit"):
@@ -239,16 +240,16 @@ class PermitRow(msgspec.Struct, frozen=True, kw_only=True, tag="permit"):
 
     run: str
     boot_id: str
-    """Of the kernel; empty: any may be it."""
+    """Of the kernel; empty: it may be any."""
     machine_id: str = ""
     host: str = ""
-    """Its name, for people."""
+    """Its host name, for people."""
     granted_at: float = 0.0
     ended_at: float | None = None
 
 
 class KernelRow(msgspec.Struct, frozen=True, kw_only=True, tag="kernel"):
-    """Where a worker was when it last registered: after a start it may still play there. Key: `worker`."""
+    """The kernel of a worker when it last registered: after a restart it may still play there. Key: `worker`."""
 
     worker: str
     boot_id: str
@@ -264,11 +265,11 @@ class JournalRow(msgspec.Struct, frozen=True, kw_only=True, tag="journal"):
     """Of the journal up to this entry; see `records.journal`."""
     entry: bytes
     reveals: str = ""
-    """The epoch that is no secret from here on; empty for none."""
+    """The epoch that is no longer secret from here on; empty for none."""
 
 
 class DocumentRow(msgspec.Struct, frozen=True, kw_only=True, tag="document"):
-    """A document whose hash an entry of the journal holds, as it was hashed. Key: `run`, `kind`."""
+    """A document whose hash is in an entry of the journal, as it was hashed. Key: `run`, `kind`."""
 
     run: str
     kind: Literal["opening", "result"]
@@ -304,11 +305,11 @@ class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
     trajectory: str | None = None
     """Digest of the trajectory; None when there is none."""
     worker: str = ""
-    """Who played it; empty in rows of older versions."""
+    """The player; empty in rows of older versions."""
 
 
 def head_of(row: OutcomeRow) -> OutcomeHead:
-    """What the store gives back of `row` in a snapshot."""
+    """The part of `row` that a snapshot holds."""
     outcome = row.outcome
     return OutcomeHead(
         group=row.group,
@@ -323,11 +324,11 @@ def head_of(row: OutcomeRow) -> OutcomeHead:
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """All that a core starts from, read in one transaction.
+    """All that a core is loaded from, read in one transaction.
 
     `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits`,
-    `outcomes` and `begun` are wanted only for runs whose phase is not `finished`, and the last two also for evaluations that
-    are not finished; more does no harm. Order does not matter.
+    `outcomes` and `begun` are needed only for runs whose phase is not `finished`, and the last two also for evaluations
+    that are not finished; more does no harm. Order does not matter.
     """
 
     incarnation: int
@@ -346,11 +347,11 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     journal: JournalRow | None = None
     """The last entry; None for an empty journal."""
     revealed: tuple[str, ...] = ()
-    """Epochs that are no secret any more."""
+    """Epochs that are no longer secret."""
 
 
 def latest_time(snapshot: Snapshot) -> float:
-    """The latest Unix time, seconds, that runs, submits and evaluations of the snapshot tell of; 0.0 for none."""
+    """The latest Unix time, seconds, in the runs, submits and evaluations of the snapshot; 0.0 for none."""
     times: list[float | None] = [row.created_at for row in snapshot.runs]
     times += [row.created_at for row in snapshot.evaluations]
     times += [row.closed_at for row in snapshot.states]
@@ -361,7 +362,7 @@ def latest_time(snapshot: Snapshot) -> float:
 
 
 def submit_done(row: SubmitRow) -> SubmitDone | None:
-    """The end of a submit as its gateway is told; None while it is open."""
+    """The end of a submit as its gateway receives it; None while it is open."""
     if row.status is None or row.completed_at is None:
         return None
     n = len(row.env_instances)
@@ -379,7 +380,7 @@ def submit_done(row: SubmitRow) -> SubmitDone | None:
 
 
 def train_group(run: str, submit_index: int) -> str:
-    """Group id of a submit's train episodes; `OutcomeRow.group` of what `ReadResults` reads."""
+    """Group id of a submit's train episodes; `ReadResults` reads outcomes with this `OutcomeRow.group`."""
     return f"{run}/s{submit_index}/train"
 
 
@@ -399,5 +400,5 @@ def random_group(run: str) -> str:
 
 
 def evaluation_group(evaluation: str) -> str:
-    """Group id of an evaluation's episodes; `OutcomeRow.group` of what `ReadEvaluation` reads."""
+    """Group id of an evaluation's episodes; `ReadEvaluation` reads outcomes with this `OutcomeRow.group`."""
     return f"evaluation/{evaluation}"

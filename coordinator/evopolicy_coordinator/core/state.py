@@ -1,4 +1,5 @@
-"""All that a core holds: tables of what is open, and indices into them. No rules here; `loading` fills it, the rules change it."""
+"""All state of a core: tables of open work and indices into them. `loading` fills it, the rules change it; it has no
+rules."""
 
 from __future__ import annotations
 
@@ -38,26 +39,25 @@ from .structures.trace import Trace
 ATTEMPTS_PER_INCARNATION = 1_000_000
 
 DISPUTES_MAX = 50
-"""So many disputes are kept for the status."""
+"""Disputes that are kept for the status."""
 
 
 @dataclass(slots=True)
 class Loading:
-    """What a core knows only while it is loaded."""
+    """State that exists only while a core is loaded."""
 
     heads: dict[str, list[OutcomeHead]] = field(default_factory=dict)
-    """What is stored of each group."""
+    """Stored outcomes of each group."""
     begun: dict[tuple[str, int], BegunRow] = field(default_factory=dict)
-    """What unfinished jobs go on from, by group and first index."""
+    """Actions that unfinished jobs resume from, by group and first index."""
     reloaded: list[JobGroup] = field(default_factory=list)
     """Groups that may be complete already."""
 
 
 class State:
-    """Everything that the rules share."""
+    """The state that all rules share."""
 
     def __init__(self, settings: CoreSettings, incarnation: int, now: float) -> None:
-        """An empty one."""
         self.settings = settings
         self.incarnation = incarnation
         self.first_attempt = (incarnation - 1) * ATTEMPTS_PER_INCARNATION
@@ -68,9 +68,9 @@ class State:
         self.rate = Rate()
         self.loading: Loading | None = None
         self.hold_until = now + settings.lease_ttl_s
-        """Nothing expires before."""
+        """No lease expires before."""
         self.stalled_at = now
-        """When the loop last came to after standing still for long, or started."""
+        """When the loop last resumed after it was blocked for long, or started."""
 
         # Runs and evaluations.
         self.runs: dict[str, Run] = {}
@@ -79,33 +79,33 @@ class State:
         self.capabilities: dict[str, str] = {}
         """Of all runs, finished ones too."""
         self.finished: dict[str, RunState] = {}
-        """What a gateway is still told of a finished run."""
+        """The state that a gateway of a finished run is still sent."""
         self.evaluations: dict[str, Evaluation] = {}
         self.evaluation_keys: dict[str, str] = {}
         self.ended_evaluations: dict[str, Ended] = {}
         self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
-        """What workers disagree on, in words, the latest last; since the core was loaded."""
+        """Disagreements between workers, in words, the latest last, since the core was loaded."""
 
         # The journal.
         self.journal: JournalRow | None = None
-        """Its last entry; None as long as it has none."""
+        """Its last entry; None while it is empty."""
         self.revealed: set[str] = set()
-        """Epochs that are no secret any more."""
+        """Epochs that are no longer secret."""
 
         # Groups and jobs.
         self.groups: dict[str, JobGroup] = {}
         self.jobs: dict[str, JobState] = {}
         self.adopting: dict[JobState, None] = {}
-        """Jobs that may be running somewhere since before the core was loaded."""
+        """Jobs that may have been running since before the core was loaded."""
         self.held: dict[JobGroup, None] = {}
         """Submits that hidden jobs keep from all workers."""
 
-        # What waits, and for whom.
+        # Queues, and the profiles that serve them.
         self.lanes: dict[LaneKey, Lane] = {}
         self.profiles: dict[ProfileKey, Profile] = {}
         self.unpinned: dict[str, Flow] = {}
         self.n_flows = 0
-        """Made so far."""
+        """Number of flows created so far."""
         self.suspects: dict[JobState, None] = {}
         """Waiting jobs that are to run alone; few."""
         self.clock = [0.0] * len(RANKS)
@@ -114,25 +114,25 @@ class State:
         # Workers and leases.
         self.workers: dict[str, Worker] = {}
         self.sessions: dict[str, str] = {}
-        """Present sessions to the workers whose they are."""
+        """Current session to its worker."""
         self.out_of_service: dict[str, OutOfService] = {}
         """Names that an operator drained or paused; kept over restarts."""
         self.quarantined: dict[str, str] = {}
-        """Names that an audit found to forge, and why; until an operator takes them back."""
+        """Names that an audit found to forge, with the reason, until an operator reinstates them."""
         self.quarantined_machines: dict[str, str] = {}
         """Machines of those names, to the name."""
         self.n_live = 0
         """Live leases in all."""
         self.freed: dict[str, None] = {}
-        """Workers that let go of a lease, or are emptied no more: a waiting poll may be answerable now."""
+        """Workers that released a lease, or are no longer emptied: their waiting poll may be answerable now."""
 
-        # Who is on which kernel.
+        # Occupants of kernels.
         self.isolates = settings.hidden_isolation != "off"
         self.families = Families(strict=settings.hidden_isolation == "strict")
         self.everywhere = Kernel(EVERYWHERE)
         self.kernels: dict[str, Kernel] = {EVERYWHERE: self.everywhere}
         self.lingering: dict[str, dict[str, Occupancy]] = {}
-        """By worker: stays without a lease."""
+        """Worker to its occupancies without a lease."""
         self.permits: dict[str, dict[Kernel, tuple[PermitRow, Family]]] = {}
         """By run."""
         self.asks: dict[tuple[str, str], Ask] = {}
@@ -140,6 +140,6 @@ class State:
         self.known_kernels: dict[str, KernelRow] = {}
         """By worker: as stored."""
         self.boots: dict[str, dict[str, None]] = {}
-        """By machine: the boot ids under which something of it is known."""
+        """By machine: the boot ids under which any of its processes is known."""
         self.grantable = False
-        """A permit that is asked for may have become possible in this step."""
+        """Whether a requested permit may have become possible in this step."""

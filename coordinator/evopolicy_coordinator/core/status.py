@@ -1,6 +1,6 @@
-"""What an operator may see of the whole: workers, runs, and what waits longer than it should, and for what.
+"""The operator's view: workers, runs, and jobs that wait longer than they should, with the reason.
 
-Looks at everything, so it is for a status request only, never for an event.
+It visits all state, so it serves status requests only, never events.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .runs.waits import waits_for
 from .state import State
 
 Words = Callable[[Reason | None], str]
-"""Puts a reason into words; nothing for none."""
+"""Puts a reason into words; returns an empty string for None."""
 
 
 class CoreStatus(NamedTuple):
@@ -29,20 +29,21 @@ class CoreStatus(NamedTuple):
     episodes_done: int
     """Since the core was loaded."""
     episodes_per_s: float
-    """Over the last minute."""
+    """Average over the last minute."""
     workers: tuple[WorkerStatus, ...]
     runs: tuple[RunStatus, ...]
     stalls: tuple[str, ...]
     audit_share: float
     audits: dict[str, int]
-    """Of the unfinished runs, by state."""
+    """Audit state to number of audits, of the unfinished runs."""
     disputes: tuple[str, ...]
     quarantined: dict[str, str]
 
 
 def status(state: State, now: float, words: Words) -> CoreStatus:
-    """The core's part of a `StatusReply`; `words` puts a reason into words."""
-    # By profile and by run once: thousands of workers have few profiles, and hundreds of runs share the groups.
+    """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
+    # Computed once per profile and once per run: thousands of workers have few profiles, and hundreds of runs
+    # share the groups.
     refused = {
         profile: pins.refused_runs(state, profile)
         for profile in {worker.profile: None for worker in state.workers.values()}
@@ -93,7 +94,7 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
 
 
 def _playing(live: list[Lease]) -> dict[str, int]:
-    """Jobs that are played now, by run or evaluation."""
+    """Returns run or evaluation to its number of jobs that are played now."""
     found: dict[str, int] = {}
     for lease in live:
         if lease.running:
@@ -129,11 +130,11 @@ def _run(state: State, run: Run, groups: list[JobGroup], words: Words) -> RunSta
 
 
 def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
-    """What waits longer than `stall_s`, oldest group first."""
+    """Lists jobs that have waited, or made no progress, for longer than `stall_s`, oldest group first."""
     stalls: list[str] = []
     limit_s = state.settings.stall_s
     for group in state.groups.values():
-        if group.kind == "audit":  # which wait as long as there is anything else to do
+        if group.kind == "audit":  # audits wait as long as any other work exists
             continue
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         if waiting:

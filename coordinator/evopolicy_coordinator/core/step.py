@@ -1,11 +1,12 @@
-"""One step of the core: what one event, or one deadline, leads to. Its effects, its news and its marks are values here.
+"""One step of the core: the consequences of one event or one deadline. Its effects, news and marks are values here.
 
 Rules that this module owns:
-- Whatever rows a step makes durable stand in a single `Persist` ahead of all its other effects, so no reply can tell of
-  something that a crash would take back.
-- A rule calls what it builds on, never what builds on it: leases do not know runs. What happened goes upwards as news,
-  for which `machine` has a table. What follows from a piece of news comes before what was told after it.
-- Work that became available is marked (`dirty`, `State.freed`); the scheduler looks at the marks when the step ends.
+- All rows that a step makes durable are in a single `Persist` ahead of all its other effects, so no reply reports a
+  change that a crash would undo.
+- A rule calls rules that it builds on, never rules that build on it: leases do not know runs. Events are passed upwards
+  as news, for which `machine` has a table. The consequences of a piece of news come before the pieces told after it.
+- Work that became available is marked (`dirty`, `State.freed`); the scheduler processes the marks at the end of the
+  step.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from .records import AuditRow, Row, SubmitRow
 
 # ---- news ----
 #
-# `kind` is what the table in `machine` tells apart beside the type; empty where there is but one.
+# The table in `machine` distinguishes news by type and `kind`; `kind` is empty where a type has only one.
 
 
 @dataclass(slots=True, eq=False)
 class ResultsPersisted:
-    """A worker reported what came of one lease."""
+    """A worker reported the result of one lease."""
 
     worker: Worker
     result: JobResult
@@ -48,7 +49,7 @@ class EpisodesDone:
 
     group: JobGroup
     worker: Worker | None
-    """Who played them; None: before the core was loaded."""
+    """The player; None: before the core was loaded."""
     outcomes: tuple[EpisodeOutcome, ...]
 
     @property
@@ -59,7 +60,7 @@ class EpisodesDone:
 
 @dataclass(slots=True, eq=False)
 class JobRetried:
-    """A job is played again for a failure of ours."""
+    """A job is played again after an infrastructure failure."""
 
     job: JobState
 
@@ -77,7 +78,7 @@ class ResultsDiffered:
 
 @dataclass(slots=True, eq=False)
 class FlowPinned:
-    """A run or an evaluation has a class of workers now."""
+    """A run or an evaluation was pinned to a class of workers."""
 
     flow: Flow
     profile: Profile
@@ -90,7 +91,7 @@ class FlowPinned:
 
 @dataclass(slots=True, eq=False)
 class SubmitEnded:
-    """A submit has its verdict."""
+    """A submit got its verdict."""
 
     run: Run
     row: SubmitRow
@@ -100,7 +101,7 @@ class SubmitEnded:
 
 @dataclass(slots=True, eq=False)
 class AuditsMoved:
-    """An audit of a run is over, or goes on: the run may have waited for it."""
+    """An audit of a run ended or advanced: the run may have waited for it."""
 
     run: Run
 
@@ -114,7 +115,7 @@ News = ResultsPersisted | EpisodesDone | JobRetried | ResultsDiffered | FlowPinn
 
 
 class Step:
-    """Collects the effects of one step, its news, and what is to be looked at when it ends."""
+    """Collects the effects of one step, its news, and the marks for the scheduler."""
 
     __slots__ = ("_out", "_rows", "dirty", "last", "news", "now", "stimulus_id", "stops")
 
@@ -124,35 +125,35 @@ class Step:
         self._rows: list[Row] = []
         self._out: list[Effect] = []
         self.news: deque[News] = deque()
-        """What those above are to hear, in order."""
+        """Undelivered news, in order."""
         self.last: Reply | None = None
-        """What is answered once the news was told."""
+        """The reply that is sent after the news was delivered."""
         self.dirty: dict[Lane, None] = {}
-        """Lanes in which something waits that did not before."""
+        """Lanes with newly waiting jobs."""
         self.stops: dict[str, list[str]] = {}
-        """Workers to the leases that they are to stop."""
+        """Worker to the leases that it is to stop."""
 
     def tell(self, news: News) -> None:
-        """Let those above hear of something once the present rule has done its part."""
+        """Queue a piece of news for delivery after the present rule."""
         self.news.append(news)
 
     # ---- effects ----
 
     def persist(self, row: Row) -> None:
-        """Make a row durable before anything else that this step does."""
+        """Make a row durable before all other effects of this step."""
         self._rows.append(row)
 
     def add(self, effect: Effect) -> None:
-        """Let the shell do something once the rows are durable."""
+        """Carry out an effect once the rows are durable."""
         self._out.append(effect)
 
     def reply(self, request: RequestId, message: Message, waits_for: Reason | None = None) -> None:
-        """Answer a request; the shell puts what is waited for into the message's words."""
+        """Answer a request; the shell puts `waits_for` into the message's words."""
         effect = Reply(request=request, message=message, waits_for=waits_for, stimulus_id=self.stimulus_id)
         self._out.append(effect)
 
     def reply_last(self, request: RequestId, message: Message) -> None:
-        """Answer a request after what it led to; one in a step."""
+        """Answer a request after the effects of its news; at most one per step."""
         self.last = Reply(request=request, message=message, stimulus_id=self.stimulus_id)
 
     def refuse(self, request: RequestId, status: Refusal, reason: Reason) -> None:
@@ -161,7 +162,7 @@ class Step:
         self._out.append(effect)
 
     def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
-        """Tell operators."""
+        """Log for operators."""
         self._out.append(Log(level=level, event=event, fields=fields, stimulus_id=self.stimulus_id))
 
     def effects(self) -> list[Effect]:
@@ -174,14 +175,14 @@ class Step:
     # ---- durable changes ----
 
     def change_run(self, run: Run, **fields: object) -> None:
-        """Change what is stored of a run."""
+        """Change a run's stored state; raises InvariantError when the phase may not follow."""
         before, run.state = run.state, msgspec.structs.replace(run.state, **fields)
         if run.state.phase != before.phase:
             transitions.check(transitions.RUN, run.id, before.phase, run.state.phase)
         self.persist(run.state)
 
     def change_submit(self, run: Run, index: int, **fields: object) -> SubmitRow:
-        """Change what is stored of a submit."""
+        """Change a stored submit; raises InvariantError when the status may not follow."""
         before = run.submits[index]
         row = run.submits[index] = msgspec.structs.replace(before, **fields)
         if row.status != before.status:
@@ -191,7 +192,7 @@ class Step:
         return row
 
     def put_audit(self, run: Run, row: AuditRow) -> AuditRow:
-        """Store an audit, anew or as it is now."""
+        """Store a new or changed audit; raises InvariantError when the state may not follow."""
         before = run.audits.get(row.audit)
         if before is not None and row.state != before.state:
             transitions.check(transitions.AUDIT, row.audit, before.state, row.state)

@@ -1,6 +1,6 @@
-"""What may follow what, as data: the phases of a run, the verdicts of a submit, the places of a job, the states of an audit.
+"""Allowed transitions as data: phases of a run, verdicts of a submit, places of a job, states of an audit.
 
-Whoever changes one of these goes through `check`; `invariants` reads the same tables.
+Every change of one of these goes through `check`; `invariants` reads the same tables.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from evopolicy_common.messages.gateway import SubmitStatus
 from .structures.trace import InvariantError
 
 Table = Mapping[str, Collection[str]]
-"""State to those that may follow it; nothing follows a state with none."""
+"""State to its allowed successors; a final state has none."""
 
 RUN: Table = {
-    "open": ("closed",),  # by its gateway, or an operator who cancels it
+    "open": ("closed",),  # by its gateway, or by an operator's cancellation
     "closed": ("finished",),
     "finished": (),
 }
 
 SUBMIT: Table = {"open": get_args(SubmitStatus), **dict.fromkeys(get_args(SubmitStatus), ())}
-"""Any verdict may follow, once; `open` is a status of None."""
+"""An open submit gets any verdict, once; `open` is a status of None."""
 
 AUDIT: Table = {
     "open": ("agreed", "disputed", "not_audited"),
@@ -34,14 +34,14 @@ AUDIT: Table = {
 Place = Literal["new", "queued", "leased", "parting", "backing_off", "adopting", "closed"]
 
 JOB: Table = {
-    "new": ("queued", "adopting"),  # adopting: it may be running somewhere since before the core was loaded
-    "queued": ("queued", "leased", "closed"),  # queued again: at another priority
+    "new": ("queued", "adopting"),  # adopting: it may have been running since before the core was loaded
+    "queued": ("queued", "leased", "closed"),  # queued: at another priority
     "leased": ("queued", "parting", "backing_off", "closed"),
     "parting": (
         "queued",
         "leased",
         "closed",
-    ),  # its lease was stopped; it waits for what its worker hands back
+    ),  # its lease was stopped; it waits until its worker releases it
     "backing_off": ("queued", "leased", "closed"),  # leased: adopted from its worker's heartbeat
     "adopting": ("queued", "leased", "closed"),
     "closed": (),
@@ -49,11 +49,11 @@ JOB: Table = {
 
 
 def goes_on(table: Table, state: str) -> bool:
-    """Whether anything may follow `state`."""
+    """Whether `state` has a successor."""
     return bool(table[state])
 
 
 def check(table: Table, key: str, before: str, after: str) -> None:
-    """InvariantError when `after` may not follow `before`. `key` names what changes."""
+    """Raises InvariantError when `after` may not follow `before`. `key` names the changed record in the error."""
     if after not in table[before]:
         raise InvariantError(f"{key}: {after} cannot follow {before}")

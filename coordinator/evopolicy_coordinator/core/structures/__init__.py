@@ -1,1 +1,2 @@
-"""Structures that keep their own invariants and know nothing of runs, workers and jobs: deadlines, stories, ledgers, long polls."""
+"""Structures with invariants of their own that know nothing of runs, workers and jobs: deadlines, traces, ledgers,
+polls."""

@@ -2,8 +2,9 @@
 
 Rules that this module owns:
 - `available + reserved + settled == granted`, always.
-- A reservation is named by its submit; naming one twice, or settling what is not reserved, is a bug and raises.
-- What the protocol refuses is refused before anything is reserved.
+- A reservation is named by its submit. A second reservation of the same submit, or settling an unreserved one, is a bug
+  and raises InvariantError.
+- A submit that the protocol refuses is refused before anything is reserved.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from .trace import InvariantError
 
 
 class Ledger:
-    """Counts train episodes; knows nothing of what they are spent on."""
+    """Counts train episodes; knows nothing of their use."""
 
     def __init__(self, granted: int) -> None:
         self.granted = granted
@@ -25,27 +26,28 @@ class Ledger:
 
     @property
     def reserved(self) -> int:
-        """Episodes of submits that have no verdict yet."""
+        """Episodes of submits without a verdict."""
         return sum(self._reservations.values())
 
     @property
     def spent(self) -> int:
-        """Episodes that no later submit can have: reserved or settled."""
+        """Episodes that no later submit can use: reserved or settled."""
         return self.granted - self.available
 
     def reserve(self, submit_index: int, n: int) -> None:
-        """Set episodes aside for a submit; InvariantError when there are not so many, or it has some already."""
+        """Set `n` episodes aside for a submit. Raises InvariantError when `n` is not 1 … `available`, or the submit has
+        a reservation."""
         if n < 1 or n > self.available or submit_index in self._reservations:
             raise InvariantError(f"cannot reserve {n} for submit {submit_index}: {self}")
         self.available -= n
         self._reservations[submit_index] = n
 
     def settle(self, submit_index: int) -> None:
-        """Charge what was reserved for the submit."""
+        """Charge a submit's reservation. Raises InvariantError when it has none."""
         self.settled += self._take(submit_index)
 
     def refund(self, submit_index: int) -> None:
-        """Give back what was reserved for the submit."""
+        """Give a submit's reservation back. Raises InvariantError when it has none."""
         self.available += self._take(submit_index)
 
     def _take(self, submit_index: int) -> int:
@@ -55,7 +57,7 @@ class Ledger:
         return n
 
     def validate(self) -> None:
-        """InvariantError when an episode was lost or made."""
+        """Raises InvariantError when the sum is not `granted` or a part is negative."""
         total = self.available + self.reserved + self.settled
         if total != self.granted or min(self.available, self.settled, self.reserved) < 0:
             raise InvariantError(f"budget is not conserved: {self}")
@@ -70,7 +72,7 @@ class Ledger:
 def refusal(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
 ) -> tuple[Refusal, Reason] | None:
-    """Why these train cases cannot be played, or None. Checked in the order that the protocol names."""
+    """Returns why these train cases cannot be played, or None. Checks in the order that the protocol prescribes."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:

@@ -1,6 +1,6 @@
-"""Long polls for outcomes and for the end of a run: who waits, for what, until when.
+"""Long polls for outcomes, permits and the end of a run, with their targets and deadlines.
 
-Rules that this module owns: a poll is answered once; at its deadline it is answered with what there is.
+Rules that this module owns: a poll is answered once; at its deadline it is answered with the current state.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ PollKind = Literal["results", "evaluation", "run", "permit"]
 
 @dataclass(slots=True, frozen=True)
 class Poll:
-    """Someone who waits."""
+    """A waiting request."""
 
     request: RequestId
     kind: PollKind
     target: str
-    """Group id, run, or `isolation.poll_target`."""
+    """Group id, run, or `permits.poll_target`."""
     cursor: int = 0
 
 
 class Polls:
-    """Waiting polls, by request and by what they wait for."""
+    """Waiting polls, by request and by target."""
 
     def __init__(self, timers: Timers, max_wait_s: float) -> None:
         self._timers = timers
@@ -36,7 +36,7 @@ class Polls:
         self._of: dict[str, dict[RequestId, None]] = {}
 
     def wait(self, poll: Poll, wait_s: float, now: float) -> bool:
-        """Let a poll wait; False when it does not want to."""
+        """Let a poll wait up to `wait_s` seconds, at most `max_wait_s`. Returns False when `wait_s` is not positive."""
         wait_s = min(wait_s, self._max_wait_s)
         if not wait_s > 0.0:
             return False
@@ -46,7 +46,7 @@ class Polls:
         return True
 
     def take(self, request: RequestId) -> Poll | None:
-        """End one poll's waiting; None when it waits no more."""
+        """Remove a poll; None when it no longer waits."""
         poll = self._polls.pop(request, None)
         if poll is not None:
             self._timers.disarm(("poll", request))
@@ -57,7 +57,7 @@ class Polls:
         return poll
 
     def take_all(self, target: str) -> list[Poll]:
-        """End the waiting of all who wait for `target`, in the order they came."""
+        """Remove all polls for `target`, in order of arrival."""
         polls = [self.take(request) for request in list(self._of.get(target, ()))]
         return [poll for poll in polls if poll is not None]
 

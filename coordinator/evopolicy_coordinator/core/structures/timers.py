@@ -1,4 +1,4 @@
-"""Deadlines: a heap with lazy deletion, so that arming, disarming and firing cost O(log n) whatever waits.
+"""Deadlines: a heap with lazy deletion, so that arming, disarming and firing cost O(log n).
 
 Rules: a key has at most one deadline; a deadline that was moved or disarmed never fires; ties fire in order of arming.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 
 TimerKey = tuple[str, object]
-"""Kind of timer, and what it is about."""
+"""Kind of timer, and its subject."""
 
 
 class Timers:
@@ -26,7 +26,7 @@ class Timers:
         return key in self._armed
 
     def arm(self, key: TimerKey, at: float) -> None:
-        """Set the deadline of `key`, in place of any other."""
+        """Set the deadline of `key`, replacing any other."""
         self._count += 1
         self._armed[key] = (at, self._count)
         heapq.heappush(self._heap, (at, self._count, key))
@@ -40,11 +40,11 @@ class Timers:
             self.arm(key, at)
 
     def disarm(self, key: TimerKey) -> None:
-        """Forget the deadline of `key`, if it has one."""
+        """Remove the deadline of `key`, if it has one."""
         self._armed.pop(key, None)
 
     def next(self) -> float | None:
-        """The earliest deadline; None when nothing waits."""
+        """The earliest deadline; None when none is set."""
         heap = self._heap
         while heap:
             at, count, key = heap[0]
@@ -54,7 +54,7 @@ class Timers:
         return None
 
     def pop_due(self, now: float) -> TimerKey | None:
-        """Take the earliest key whose deadline is at or before `now`; None when there is none."""
+        """Remove and return the earliest key whose deadline is at or before `now`; None when no key is due."""
         at = self.next()
         if at is None or at > now:
             return None

@@ -1,6 +1,6 @@
-"""What happened to a job, lease, worker or run, as far back as is kept: for `trace(key)` and for errors.
+"""Recent events by job, lease, worker or run, for `trace(key)` and for errors.
 
-A ring of fixed size: memory does not grow with what happens.
+A ring buffer of fixed size, so that memory does not grow.
 """
 
 from __future__ import annotations
@@ -12,31 +12,31 @@ TRACE_ENTRIES = 20_000
 
 
 class InvariantError(AssertionError):
-    """The core contradicts itself: a bug. Carries the trace of what is concerned."""
+    """The core's state is inconsistent: a bug. Carries the trace of the record concerned."""
 
 
 class TraceEntry(NamedTuple):
-    """One thing that happened, Unix seconds."""
+    """One event; time in Unix seconds."""
 
     at: float
     stimulus_id: str
     key: str
-    """What it happened to: a job id, lease id, worker, run or group."""
+    """Its subject: a job id, lease id, worker, run or group."""
     what: str
 
 
 class Trace:
-    """The last things that happened, oldest first."""
+    """The last events, oldest first."""
 
     def __init__(self, lines: int = TRACE_ENTRIES) -> None:
         self._lines: deque[TraceEntry] = deque(maxlen=lines)
 
     def add(self, at: float, stimulus_id: str, key: str, what: str) -> None:
-        """Keep a line; the oldest goes when there is no more room."""
+        """Append an entry; when the buffer is full, the oldest entry is dropped."""
         self._lines.append(TraceEntry(at, stimulus_id, key, what))
 
     def of(self, key: str) -> list[TraceEntry]:
-        """Lines about `key`, what is below it (`run` → `run/…`), its attempts (`job#…`) and whatever names it."""
+        """Entries about `key`, its children (`run` → `run/…`), its attempts (`job#…`), and entries that mention it."""
         return [
             line
             for line in self._lines
