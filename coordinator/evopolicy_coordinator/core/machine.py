@@ -103,8 +103,8 @@ class Core:
         return open_runs.over(self.state, run)
 
     def worker_of(self, session: str) -> str | None:
-        """Returns the worker whose current session is `session` (its right to read and write blobs); None for an
-        unknown session."""
+        """Returns the worker whose current session is `session` (its right to read and write blobs); None
+        for an unknown session."""
         return self.state.sessions.get(session)
 
     def status(self, now: float, words: Words) -> CoreStatus:

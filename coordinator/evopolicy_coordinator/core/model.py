@@ -46,8 +46,8 @@ RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUD
 HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,), (AUDIT,))
 """The same on a kernel that is reserved for hidden jobs (`agents.precedence`)."""
 HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
-"""Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn of
-them (`isolation`)."""
+"""Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn
+of them (`isolation`)."""
 
 GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
@@ -138,8 +138,8 @@ class JobState:
     held_attempts: set[int] = field(default_factory=set)
     """Attempts that this incarnation granted or adopted: none is adopted twice."""
     begun: BlobRef | None = None
-    """Actions that its policy returned before it was given back; the next attempt plays them first. None: starts
-    anew."""
+    """Actions that its policy returned before it was given back; the next attempt plays them
+    first. None: starts anew."""
     begun_attempt: int = 0
     """The attempt that reported them."""
     parting: Lease | None = None

@@ -31,8 +31,8 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """First back-off after an infrastructure failure; it doubles with each further one."""
     retry_max_s: float = 60.0
     avoid_s: float = 5.0
-    """A retried job is kept from the worker that it failed on for so long after its back-off, so that another may take
-    it."""
+    """A retried job is kept from the worker that it failed on for so long after its back-off, so that
+    another may take it."""
     batch_s: float = 0.1
     """Leases are granted in batches of about so much play time per slot."""
     batch_max: int = 32

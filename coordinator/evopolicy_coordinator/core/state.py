@@ -1,5 +1,5 @@
-"""All state of a core: tables of open work and indices into them. `loading` fills it, the rules change it; it has no
-rules."""
+"""All state of a core: tables of open work and indices into them. `loading` fills it, the rules change
+it; it has no rules."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Agents and hidden jobs keep each other from the same kernels: permits, how gateways ask for them, and who goes first."""
+"""Agents and hidden jobs exclude each other on a kernel: permits, the gateways' requests for them, and precedence."""

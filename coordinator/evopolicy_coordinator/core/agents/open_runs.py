@@ -1,4 +1,4 @@
-"""Which runs are there, and why nothing more is taken of those that are not open."""
+"""Finds unfinished runs, and the reason why other runs refuse requests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evopolicy_coordinator.core.step import Step
 
 
 def live(state: State, request: RequestId, name: str, step: Step) -> Run | None:
-    """The unfinished run of that name; None, and the request is refused, when there is none."""
+    """Returns the unfinished run of that name; otherwise refuses the request and returns None."""
     run = state.runs.get(name)
     if run is None:
         step.refuse(request, *over(state, name))
@@ -19,7 +19,7 @@ def live(state: State, request: RequestId, name: str, step: Step) -> Run | None:
 
 
 def over(state: State, name: str) -> tuple[Refusal, Reason]:
-    """Why nothing more is taken of a run that is not open."""
+    """Returns why a run that is not open refuses requests."""
     last = state.finished.get(name)
     if last is not None and last.cancelled:
         return Refusal.RUN_CANCELLED, because("cancelled_by_operator", run=name)

@@ -1,10 +1,10 @@
 """Permits: an agent's right to be alive on a kernel.
 
 Rules that this module owns:
-- A permit ends with its run's closing, `CANCELLED_S` after its cancelling, by an operator's word, or with another boot id of
-  its machine; never by silence.
-- A permit that is asked for stops related hidden jobs, which are not blamed, unless the kernel is turned over to them
-  (`precedence`). It is granted once their workers have let go of them.
+- A permit ends when its run is closed, `CANCELLED_S` after its run is cancelled, by an operator's command, or with a
+  new boot id of its machine; never by silence.
+- A requested permit stops related hidden jobs, without blame, unless the kernel is reserved for them (`precedence`). It
+  is granted once their workers have released them.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 CANCELLED_S = 30.0
-"""After a run was cancelled its agent has so long to be ended."""
+"""An agent has so long to end after its run was cancelled."""
 
 
 def place(run: Run, boot_id: str) -> str | None:
-    """The kernel that a run's agent is on when its gateway says `boot_id`; None: on none of the cluster."""
+    """Boot id of the kernel of a run's agent when its gateway reports `boot_id`; None: on no kernel of the cluster."""
     said = run.row.settings.agent_host
     return None if said == ELSEWHERE else (said or boot_id)
 
@@ -40,11 +40,11 @@ def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
     return [(kernel, row) for kernel, (row, _) in state.permits.get(run, {}).items()]
 
 
-# ---- asking ----
+# ---- requests ----
 
 
 def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
-    """Ask for a permit, again or for the first time; gives what it waits for, None when it is granted."""
+    """Request a permit, again or for the first time. Returns the reason that it waits for; None when it is granted."""
     kernel, family = kernels.kernel(state, row.boot_id), run.family
     if run.id in kernel.permits.get(family, ()):
         return None
@@ -57,7 +57,7 @@ def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
 
 
 def _preempt(state: State, family: Family, kernel: Kernel, step: Step) -> None:
-    """Stop related hidden jobs for a permit, unless it is their turn."""
+    """Stop related hidden jobs for a permit, unless they have precedence."""
     if not state.isolates:
         return
     there = list(state.kernels.values()) if kernel is state.everywhere else [kernel]
@@ -85,7 +85,7 @@ def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -
 
 
 def restore(state: State, row: PermitRow, family: Family) -> None:
-    """A permit is there."""
+    """Enter a permit."""
     family.users += 1
     kernel = kernels.kernel(state, row.boot_id)
     put(kernel.permits, family, row.run, row)
@@ -93,7 +93,7 @@ def restore(state: State, row: PermitRow, family: Family) -> None:
 
 
 def _withdraw(state: State, run: str, kernel: Kernel, family: Family) -> Ask | None:
-    """A permit is asked for no more."""
+    """Remove a permit request."""
     ask = take(kernel.asks, family, run)
     state.asks.pop((run, kernel.boot_id), None)
     if ask is not None:
@@ -103,7 +103,7 @@ def _withdraw(state: State, run: str, kernel: Kernel, family: Family) -> Ask | N
 
 
 def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
-    """A permit was not asked for again."""
+    """Remove a permit request that was not repeated, and free what it barred."""
     ask = state.asks.get((run, boot_id))
     if ask is not None:
         kernels.freed(state, ask.family, step, train_too=False)
@@ -112,12 +112,12 @@ def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
 
 
 def ask_ended(state: State, key: tuple[str, str], step: Step) -> None:
-    """A permit was not asked for again."""
+    """A permit request's deadline: it was not repeated in time."""
     forget_ask(state, *key, step)
 
 
 def settle(state: State, step: Step) -> None:
-    """At the end of a step: grant what has become possible."""
+    """At the end of a step: grant requested permits that have become possible."""
     state.grantable = False
     for ask in list(state.asks.values()):
         _preempt(state, ask.family, ask.kernel, step)
@@ -125,7 +125,7 @@ def settle(state: State, step: Step) -> None:
 
 
 def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: Step) -> None:
-    """Nothing more is granted to a run."""
+    """Remove a run's permit requests and refuse its waiting polls."""
     for name, boot_id in [key for key in state.asks if key[0] == run]:
         forget_ask(state, name, boot_id, step)
         for poll in state.polls.take_all(poll_target(name, boot_id)):
@@ -136,7 +136,8 @@ def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: St
 
 
 def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> None:
-    """A run's agent is gone, from one kernel or from wherever it was. Its permit for any kernel ends in both cases."""
+    """End the permits of a run whose agent is gone, from one kernel or (`boot_id` empty) from all. Its permit for an
+    unknown kernel ends in both cases."""
     for kernel, row in held(state, run):
         if boot_id in ("", kernel.boot_id) or kernel is state.everywhere:
             _end(state, kernel, row, step, why)
@@ -158,12 +159,12 @@ def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> 
 
 
 def agent_ended(state: State, run: str, step: Step) -> None:
-    """The agent of a cancelled run has had its time to be ended."""
+    """A cancelled run's deadline: its agent has had its time to end."""
     end(state, run, step, "its run was cancelled")
 
 
 def booted(state: State, machine_id: str, boot_id: str, step: Step) -> None:
-    """A machine has this boot id now: whatever was on it under another one has ended."""
+    """Record a machine's present boot id: all processes under another one have ended."""
     if not machine_id or not boot_id:
         return
     before, state.boots[machine_id] = state.boots.get(machine_id, {}), {boot_id: None}
@@ -180,7 +181,7 @@ def booted(state: State, machine_id: str, boot_id: str, step: Step) -> None:
 
 
 def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:
-    """A run was cancelled: its agent is being ended."""
+    """Set the deadline after which the permits of a cancelled run end; its agent is being ended."""
     if held(state, run):
         state.timers.arm(("cancelled", run), (step.now if at is None else at) + CANCELLED_S)
 
@@ -192,7 +193,7 @@ def load(
     states: dict[str, RunStateRow],
     step: Step,
 ) -> None:
-    """Take in the permits that are stored, before anything is played."""
+    """Restore the stored permits, before any job is played."""
     for row in rows:
         run = runs.get(row.run)
         if run is None or row.ended_at is not None:
@@ -207,7 +208,7 @@ def load(
             state.timers.arm_once(("cancelled", row.run), at + CANCELLED_S)
 
 
-# ---- what is told ----
+# ---- in words ----
 
 
 def agents(state: State, run: str) -> str:
@@ -221,5 +222,5 @@ def place_of(row: PermitRow) -> str:
 
 
 def poll_target(run: str, boot_id: str) -> str:
-    """What who waits for a permit waits for."""
+    """Target of the polls that wait for a permit."""
     return f"permit {run} {boot_id}"

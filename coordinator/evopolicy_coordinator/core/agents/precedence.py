@@ -1,11 +1,13 @@
-"""Who goes first when hidden jobs and agents keep each other from the same kernels.
+"""Precedence between hidden jobs and agents that keep each other from the same kernels.
 
 Rules that this module owns:
-- Agents do, at first. When hidden jobs of closed runs, or an operator's, were kept from all kernels that could play them for
-  `CoreSettings.hidden_wait_s` in all, one kernel is turned over to them until none of them is left: that with the fewest
-  related agents, then train jobs. Hidden jobs of open runs never bring that about.
-- There no related permit is granted; once none is left, no related train job is leased, and hidden jobs go before others.
-- A submit none of whose episodes runs because hidden jobs have all its kernels is held. That time counts against no limit.
+- Agents have precedence at first. When hidden jobs of closed runs, or of an operator, were kept from all kernels that
+  could play them for `CoreSettings.hidden_wait_s` in total, one kernel is reserved for them until none of them is left:
+  the one with the fewest related agents, then train jobs. Hidden jobs of open runs never cause this.
+- A reserved kernel grants no related permit. Once no related permit is left, no related train job is leased there, and
+  hidden jobs go before others.
+- A submit is held while none of its episodes runs because hidden jobs occupy all its kernels. That time counts against
+  no limit.
 """
 
 from __future__ import annotations
@@ -28,27 +30,28 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 LOOK_S = 1.0
-"""How often waiting hidden jobs, and train jobs that hidden ones may keep waiting, are looked at."""
+"""Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""
 
 DONE_LOOKS = 3
-"""Nothing hidden was left for so many looks: then it is done. What follows from the last job may take a moment to queue."""
+"""After so many checks without hidden jobs they count as done: jobs that follow from the last one may
+take a moment to queue."""
 
 
 def watch(state: State, lane: Lane, step: Step) -> None:
-    """Look at the lane in a while, if it has anything to look at."""
+    """Schedule the lane's next check, if it has anything to check."""
     if state.isolates and (lane.backlog or lane.kept_s or lane.reversals or lane.waiting[TRAIN]):
         state.timers.arm_once(("hidden", lane.key), step.now + LOOK_S)
 
 
 def look_at(state: State, key: LaneKey, step: Step) -> None:
-    """A lane's deadline."""
+    """A lane's deadline: check it."""
     lane = state.lanes.get(key)
     if lane is not None:
         look(state, lane, step)
 
 
 def look(state: State, lane: Lane, step: Step) -> None:
-    """Turn a kernel over to hidden jobs that have waited for long, and back; see which submits are held."""
+    """Reserve a kernel for hidden jobs that have waited for long, or release it; update which submits are held."""
     passed_s = min(step.now - lane.looked_at, 2 * LOOK_S)
     lane.looked_at = step.now
     there = kernels.serving(state, lane)
@@ -86,7 +89,7 @@ def _hidden(
 
 
 def _played(state: State, lane: Lane, family: Family) -> bool:
-    """Whether hidden jobs of the lane's closed runs are leased, or are being handed back."""
+    """Whether hidden jobs of the lane's closed runs are leased, or wait for their worker's release."""
     return any(
         occupancy.lease is not None
         and (occupancy.lease.live or occupancy.lease.parting)
@@ -114,7 +117,7 @@ def _turn_over(state: State, lane: Lane, family: Family, known: list[Kernel], st
 
 
 def turn_back(state: State, reversal: Reversal, step: Step, why: str) -> None:
-    """Agents go first again on a kernel."""
+    """Release a reserved kernel: agents have precedence again."""
     kernel, family = reversal.kernel, reversal.family
     del reversal.lane.reversals[family]
     there = kernel.reversals[family]
@@ -128,7 +131,7 @@ def turn_back(state: State, reversal: Reversal, step: Step, why: str) -> None:
 
 
 def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> None:
-    """Begin or end to count the time for which submits are held."""
+    """Start or stop counting the time for which submits are held."""
     barred = {
         family
         for family in lane.waiting[TRAIN]

@@ -1,4 +1,4 @@
-"""How gateways ask for permits, and what an operator says of them."""
+"""Gateways' requests for permits, and an operator's statement that an agent is gone."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from evopolicy_coordinator.core.structures.polls import Poll
 from . import permits
 
 ASK_AGAIN_S = 10.0
-"""A request for a permit that was answered with none is kept for so long, until it is sent again."""
+"""A declined permit request is kept for so long, until the gateway repeats it."""
 
 
 def requested(state: State, event: events.Asked[gateway.RequestPermit], step: Step) -> None:
-    """A gateway asks that its agent may be alive on a kernel."""
+    """A gateway requests that its agent may be alive on a kernel."""
     message = event.message
     run = state.runs.get(message.run)
     if run is None or run.state.phase != "open":
@@ -51,14 +51,15 @@ def requested(state: State, event: events.Asked[gateway.RequestPermit], step: St
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
-    """A gateway has waited for a permit in vain."""
+    """A gateway's wait for a permit has timed out."""
     _, run, boot_id = poll.target.split(" ", 2)
     waits_for = conflicts.permit_conflict(state, state.runs[run].family, kernels.kernel(state, boot_id))
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
 def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
-    """Refuse, for now, what an agent asks that may be on any machine, until it may."""
+    """Refuse a request for now (UNAVAILABLE) while its run's agent, which may be on any machine, lacks a permit.
+    Returns whether it was refused."""
     waits_for = _implied(state, run, step) if run.state.phase == "open" else None
     if waits_for is not None:
         step.refuse(request, Refusal.UNAVAILABLE, because("may_not_start", waits_for=waits_for))
@@ -66,8 +67,8 @@ def without_permit(state: State, request: events.RequestId, run: Run, step: Step
 
 
 def _implied(state: State, run: Run, step: Step) -> Reason | None:
-    """The permit of an agent whose gateway asks for none, so it may be anywhere; gives what it waits for, None when the
-    run has one."""
+    """Request the permit for any kernel for a run whose gateway requests none. Returns the reason that it waits for;
+    None when the run has a permit or needs none."""
     kernel = permits.place(run, EVERYWHERE)
     if kernel is None or permits.held(state, run.id):
         return None
@@ -78,7 +79,7 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
 
 
 def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step) -> None:
-    """An operator vouches that a run's agent is not alive any more."""
+    """An operator confirms that a run's agent is no longer alive."""
     message = event.message
     if message.run not in state.capabilities:
         step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
@@ -88,18 +89,18 @@ def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step
 
 
 def stamp(state: State, row: RunRow) -> HiddenIsolation:
-    """What a new run is stamped with."""
+    """The isolation that a new run is stored with."""
     if not state.isolates:
         return "shared"
     return "waived" if row.settings.agent_host == ELSEWHERE else "exclusive"
 
 
 def resume(state: State, run: Run, step: Step) -> None:
-    """An unfinished run, in a core that was just loaded."""
+    """Restore the isolation and permits of an unfinished run in a core that was just loaded."""
     before = run.state.isolation
     if before == "unknown":
         if run.state.phase == "open" and not permits.held(state, run.id):
-            # Played so far by a gateway that asked for no permit.
+            # Its gateway so far requested no permit.
             kernel = permits.place(run, EVERYWHERE)
             if kernel is not None:
                 row = PermitRow(run=run.id, boot_id=kernel, granted_at=step.now)

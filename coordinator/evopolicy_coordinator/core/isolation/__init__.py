@@ -1,5 +1,5 @@
-"""Keeps hidden episodes and agents on different kernels, as a kernel's counters tell one what the other does.
+"""Keeps hidden episodes and agents on different kernels, since a kernel's counters reveal one's activity to the other.
 
-`kernels` says what is on a kernel, `occupancies` how long a lease is on one, `conflicts` what keeps
-what away. What agents have to do with it, their permits and who goes first, is in `agents`.
+`kernels` lists the occupants of a kernel, `occupancies` how long a lease occupies one, `conflicts` which occupants
+exclude each other. The folder `agents` has the permits of agents and the order of precedence.
 """

@@ -1,11 +1,11 @@
-"""What keeps hidden jobs, train jobs and agents from a kernel.
+"""Conflicts that keep hidden jobs, train jobs and agents from a kernel.
 
 Rules that this module owns:
-- A hidden job is leased on a known kernel only, and only while no related run has a permit there or asks for one, and no
-  related train job is leased there; neither is granted while a related hidden job is there.
-- A kernel that is turned over to hidden jobs is closed to related permits that are asked for, and once no related permit
-  is left there to related train jobs. Whoever has a permit there goes on, as it must be able to end.
-- Nothing here is told to a gateway but that it waits for hidden cases.
+- A hidden job is leased on a known kernel only, and only while no related run has or requests a permit there and no
+  related train job is leased there. Neither a permit nor a train job is granted while a related hidden job is there.
+- A kernel that is reserved for hidden jobs grants no related permits and, once no related permit is left there, no
+  related train jobs. A run that holds a permit there continues, so that it can end.
+- A gateway learns nothing of this except that it waits for hidden cases.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NO_BOOT_ID = (
 
 
 def concerns(state: State, priority: int, worker: Worker) -> bool:
-    """Whether `bar` may hold for any family."""
+    """Whether `conflict` may hold for any family."""
     if priority == TRAIN:
         kernel = worker.kernel
         there = kernel.hidden or kernel.reversals or state.everywhere.hidden
@@ -57,7 +57,7 @@ def conflict(state: State, priority: int, family: Family | None, worker: Worker)
 
 
 def _train_waits(state: State, priority: int, family: Family | None, worker: Worker) -> bool:
-    """Whether related train jobs wait for workers like this one: hidden jobs do not get in their way."""
+    """Whether related train jobs wait for workers like this one: hidden jobs must not delay them."""
     assert family is not None
     if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):
         return False
@@ -80,17 +80,18 @@ def train_conflict(state: State, family: Family | None, kernel: Kernel) -> bool:
 
 
 def reversed_there(state: State, kernel: Kernel, family: Family | None) -> bool:
-    """Whether the order is reversed there and train jobs of a family are held back for it."""
+    """Whether the kernel is reserved for related hidden jobs and train jobs of the family are held back for it."""
     return related(kernel.reversals, family) is not None and not permits_there(state, kernel, family)
 
 
 def permits_there(state: State, kernel: Kernel, family: Family | None) -> dict[str, PermitRow] | None:
-    """Permits of the family's relatives that may be on a kernel."""
+    """Permits of the family's relatives that may be on a kernel; None for none."""
     return related(kernel.permits, family) or related(state.everywhere.permits, family)
 
 
 def hidden_conflict(state: State, family: Family | None, kernel: Kernel) -> str | None:
-    """Why hidden jobs of a family must not be leased on a kernel: `kernel`, `agent`, `asked`, `train`; None: they may."""
+    """Why hidden jobs of a family must not be leased on a kernel: `kernel`, `agent`, `asked` or
+    `train`; None: they may."""
     if kernel is state.everywhere:
         return "kernel"
     if permits_there(state, kernel, family):
@@ -104,7 +105,7 @@ def hidden_conflict(state: State, family: Family | None, kernel: Kernel) -> str 
 
 
 def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | None:
-    """What a permit waits for; None when it may be granted."""
+    """The reason why a permit must wait; None when it may be granted."""
     if not state.isolates:
         return None
     there = state.kernels.values() if kernel is state.everywhere else (kernel, state.everywhere)
@@ -119,7 +120,7 @@ def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | No
 
 
 def adoptable(state: State, job: JobState, worker: Worker) -> bool:
-    """Whether what a worker says to hold since before the core was loaded may go on."""
+    """Whether a job that a worker has played since before the core was loaded may continue there."""
     family, here = job.group.flow.family, (worker.kernel, state.everywhere)
     if not state.isolates or not (job.group.hidden or job.priority == TRAIN):
         return True
@@ -129,12 +130,12 @@ def adoptable(state: State, job: JobState, worker: Worker) -> bool:
         return False
     else:
         there = [occupancy for each in here for occupancy in all_related(each.train, family)]
-    # What this very worker may have played besides it tells now.
+    # This worker's own lingering occupancies do not count: its heartbeat names every lease that it holds.
     return all(occupancy.lease is None and occupancy.worker == worker.name for occupancy in there)
 
 
 def goes_first(lease: Lease) -> bool:
-    """Whether a hidden lease is on a kernel that is turned over to it."""
+    """Whether a hidden lease is on a kernel that is reserved for it."""
     occupancy = lease.occupancy
     return (
         occupancy is not None
@@ -144,8 +145,8 @@ def goes_first(lease: Lease) -> bool:
 
 
 def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lease]]]:
-    """The kernels that related hidden jobs keep a family's train jobs from, with what is to be stopped there; those
-    with least to stop first. Nothing is to be stopped where it was already, but for what has not been let go of."""
+    """The kernels where related hidden jobs bar a family's train jobs, each with the live leases to stop there; those
+    with the fewest first. The list of leases is empty where all were stopped but not all are released yet."""
     found = []
     kernels: dict[Kernel, None] = {}
     if state.isolates and family is not None:
@@ -166,7 +167,7 @@ def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lea
     return sorted(found, key=lambda each: len(each[1]))
 
 
-# ---- what is told ----
+# ---- reasons ----
 
 
 def conflict_of_worker(state: State, worker: Worker) -> str:
@@ -186,9 +187,10 @@ def conflict_of_worker(state: State, worker: Worker) -> str:
 
 
 def obstacle(state: State, group: JobGroup) -> Reason | None:
-    """What keeps an open group from all workers that could play it, None when nothing of this does.
+    """The reason that keeps an open group from all workers that could play it; None when it has none of this kind.
 
-    Of a train group only that hidden cases do."""
+    For a train group the only such reason is hidden jobs.
+    """
     lane, family = group.flow.lane, group.flow.family
     if lane is None or not state.isolates or not (group.hidden or group.kind == "train"):
         return None

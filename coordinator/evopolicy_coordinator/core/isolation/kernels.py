@@ -1,8 +1,8 @@
-"""What is on which kernel, and where nothing is any more.
+"""The occupants of each kernel, and the consequences when one leaves.
 
 Rules that this module owns:
-- A kernel is a boot id; an unknown one counts as every kernel.
-- What came free somewhere is looked at for whoever may have waited for it.
+- A kernel is identified by its boot id; an unknown kernel counts as every kernel.
+- When a kernel is freed, lanes and permit requests that may have waited for it are marked for the scheduler.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def kernel(state: State, boot_id: str) -> Kernel:
-    """What is known of a kernel."""
+    """Returns the kernel with that boot id; creates it if it is new."""
     found = state.kernels.get(boot_id)
     if found is None:
         found = state.kernels[boot_id] = Kernel(boot_id)
@@ -26,7 +26,7 @@ def kernel(state: State, boot_id: str) -> Kernel:
 
 
 def tidy(state: State, kernel: Kernel) -> None:
-    """Forget a kernel on which nothing is."""
+    """Forget a kernel without occupants."""
     parts = (
         kernel.workers,
         kernel.permits,
@@ -46,7 +46,8 @@ def serving(state: State, lane: Lane) -> dict[Kernel, None]:
 
 
 def freed(state: State, family: Family | None, step: Step, *, train_too: bool = True) -> None:
-    """Something of a family is barred no more, somewhere: hidden jobs, or train jobs and permits too."""
+    """Mark the lanes of a family's waiting jobs after a bar was lifted on some kernel: for hidden jobs, and with
+    `train_too` also for train jobs and permits."""
     state.grantable = state.grantable or train_too
     lanes: Iterable[Lane] = state.lanes.values()
     if family is not None:
@@ -56,11 +57,11 @@ def freed(state: State, family: Family | None, step: Step, *, train_too: bool = 
             step.dirty[lane] = None
 
 
-# ---- what is on a kernel, by family ----
+# ---- occupants of a kernel, by family ----
 
 
 def related(index: dict[Family | None, dict[str, T]], family: Family | None) -> dict[str, T] | None:
-    """What `index` holds of one of the family's relatives; None for nothing."""
+    """The entries in `index` of one of the family's relatives; None when it has none."""
     if not index:
         return None
     if family is None:
@@ -73,7 +74,7 @@ def related(index: dict[Family | None, dict[str, T]], family: Family | None) -> 
 
 
 def all_related(index: dict[Family | None, dict[str, T]], family: Family | None) -> list[T]:
-    """All that `index` holds of the family's relatives."""
+    """All entries in `index` of the family's relatives."""
     if not index:
         return []
     families = index if family is None else (*family.relatives, None)
@@ -86,7 +87,7 @@ def put(index: dict[Family | None, dict[str, T]], family: Family | None, name: s
 
 
 def take(index: dict[Family | None, dict[str, T]], family: Family | None, name: str) -> T | None:
-    """Take out what stands under a family and a name; None when nothing does."""
+    """Remove and return the entry under a family and name; None when it is missing."""
     there = index.get(family)
     taken = None if there is None else there.pop(name, None)
     if there is not None and not there:

@@ -1,10 +1,10 @@
-"""How long a lease is on the kernel of its worker.
+"""How long a lease occupies the kernel of its worker.
 
 Rules that this module owns:
-- A lease is on its kernel until its worker has let go of it: told so by a heartbeat that was sent after the lease had
-  arrived or was lost, or by reporting. One whose worker fell silent stays for `CoreSettings.silent_bar_s`, within which
-  the worker has stopped it by itself.
-- After a start each worker that was known counts as playing anything.
+- A lease occupies its kernel until its worker has released it: by reporting a result, or by a heartbeat that does not
+  name it and was sent after the lease had arrived or was lost. If the worker fell silent, the occupancy stays for
+  `CoreSettings.silent_bar_s`; within that time the worker has stopped the lease by itself.
+- After a start each known worker counts as playing anything.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .kernels import put, related, take
 
 
 def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) -> None:
-    """A worker was given a lease, or goes on with one."""
+    """Enter the occupancy of a lease that a worker was granted or continues."""
     before = state.lingering.get(worker.name, {}).get(lease.id)
     if before is not None:
         forget(state, before, step)
@@ -58,7 +58,7 @@ def _enter(state: State, occupancy: Occupancy) -> None:
 
 
 def left(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) -> None:
-    """A lease is a worker's no more: surely, or by our word alone."""
+    """A worker no longer holds a lease: surely, or only by the coordinator's decision."""
     occupancy, lease.occupancy = lease.occupancy, None
     if occupancy is None:
         return
@@ -72,7 +72,7 @@ def left(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) 
 
 
 def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
-    """A stay has ended: what it barred may go on."""
+    """Remove an ended occupancy, and mark the work that it barred."""
     index = occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train
     family = occupancy.family
     take(index, family, occupancy.key)
@@ -89,7 +89,7 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
 
 
 def forget(state: State, occupancy: Occupancy, step: Step) -> None:
-    """What a worker had let go of, as far as was known, has surely ended."""
+    """Remove a lingering occupancy that has surely ended."""
     there = state.lingering[occupancy.worker]
     del there[occupancy.id]
     if not there:
@@ -98,7 +98,7 @@ def forget(state: State, occupancy: Occupancy, step: Step) -> None:
 
 
 def heard(state: State, worker: Worker, named: set[str], settled: int, step: Step) -> None:
-    """A heartbeat: of what was given up, a worker has let go of what it does not name."""
+    """Process a heartbeat: the worker has released those given-up leases that it does not name."""
     for occupancy in list(state.lingering.get(worker.name, {}).values()):
         if occupancy.id in named:
             occupancy.until = step.now + state.settings.silent_bar_s
@@ -107,18 +107,20 @@ def heard(state: State, worker: Worker, named: set[str], settled: int, step: Ste
 
 
 def surely(worker: Worker, occupancy: Occupancy | None, settled: int) -> bool:
-    """Whether a heartbeat that does not name a lease shows that its worker does not hold it and never will."""
+    """Whether a heartbeat that does not name a lease proves that its worker does not hold it and never will. All polls
+    of the worker up to number `settled` are finished; 0: it does not number its polls."""
     if occupancy is None or settled == 0:
         return True
     serial = occupancy.serial
     if serial == 0:
-        # Whatever it held before it was first heard arrived before its first poll of this session was sent.
+        # Leases that it held before its first request arrived before it sent the first poll of this session.
         return worker.first_serial is not None and settled >= worker.first_serial - 1
     return settled >= serial
 
 
 def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
-    """A worker holds a lease that is not its any more: it may play it until it has stopped."""
+    """Enter an occupancy for a lease of an earlier incarnation that a worker names but that does not count: the worker
+    may play it until it has stopped."""
     known = item.attempt > state.first_attempt or item.lease_id in state.lingering.get(worker.name, {})
     if known or not state.isolates:
         return
@@ -147,7 +149,7 @@ def _linger(state: State, occupancy: Occupancy, step: Step) -> None:
 
 
 def expire(state: State, name: str, step: Step) -> None:
-    """A worker's deadline for what it has not told of."""
+    """A worker's deadline: remove the given-up occupancies whose time is up."""
     for occupancy in list(state.lingering.get(name, {}).values()):
         assert occupancy.until is not None
         if step.now >= occupancy.until:
@@ -161,7 +163,7 @@ def expire(state: State, name: str, step: Step) -> None:
 
 
 def joined(state: State, worker: Worker, step: Step) -> None:
-    """A worker registered on its kernel."""
+    """Enter a newly registered worker on its kernel."""
     worker.kernel.workers[worker.name] = None
     row = KernelRow(worker=worker.name, boot_id=worker.kernel.boot_id, machine_id=worker.machine_id)
     if state.known_kernels.get(worker.name) != row:
@@ -170,21 +172,23 @@ def joined(state: State, worker: Worker, step: Step) -> None:
 
 
 def replaced(state: State, worker: Worker, step: Step) -> None:
-    """The same process, or one in its place: what an earlier one played on another kernel has ended with it."""
+    """Remove the occupancies of a worker's predecessor on an earlier kernel of the same machine: they
+    ended with that process."""
     for occupancy in list(state.lingering.get(worker.name, {}).values()):
         if occupancy.kernel is not worker.kernel and occupancy.machine_id == worker.machine_id != "":
             forget(state, occupancy, step)
 
 
 def forgotten(state: State, worker: Worker) -> None:
-    """A worker is not on its kernel any more."""
+    """Remove a worker from its kernel."""
     if state.workers.get(worker.name) is not worker:
         worker.kernel.workers.pop(worker.name, None)
         kernels.tidy(state, worker.kernel)
 
 
 def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
-    """Take in where workers were when they last registered, before anything is played: they may still play there."""
+    """Restore the kernels of workers at their last registration, before any job is played: they
+    may still play there."""
     for known in known_kernels:
         state.known_kernels[known.worker] = known
         kernel = kernels.kernel(state, known.boot_id)

@@ -1,1 +1,1 @@
-"""How a job gets from the queue to a worker and back: queue, fleet, leases, their expiry and retries, groups of jobs, pins."""
+"""From the queue to a worker and back: queue, fleet, leases, their expiry and retries, groups of jobs, pins."""

@@ -1,8 +1,9 @@
-"""When a lease expires: its worker fell silent, does not name it, holds it for too long, or is trusted no more.
+"""Expiry of leases: the worker fell silent, does not name the lease, holds it for too long, or is quarantined.
 
 Rules that this module owns:
-- One that no heartbeat names for a time to live is given up. While the loop's own lateness is in doubt nothing expires.
-- A worker that was not heard for a time to live is lost, with all that it holds.
+- A lease that no heartbeat names for a time to live is given up. No lease expires while the loop itself may have been
+  late.
+- A worker that sent no request for a time to live is lost, with all its leases.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ FORGET_S = 3600.0
 
 
 def look_at(state: State, name: str, step: Step) -> None:
-    """A worker's deadline."""
+    """A worker's deadline: check it."""
     worker = state.workers.get(name)
     if worker is not None:
         look(state, worker, step)
 
 
 def look(state: State, worker: Worker, step: Step) -> None:
-    """A worker's deadline: give up what expired, declare it lost when it was silent, and set the next deadline."""
+    """Give up a worker's expired leases, declare it lost if it was silent, and set its next deadline."""
     settings, now = state.settings, step.now
     if now < state.hold_until:
         state.timers.arm(("worker", worker.name), state.hold_until)
@@ -60,14 +61,15 @@ def look(state: State, worker: Worker, step: Step) -> None:
 
 
 def _longest_s(state: State, job: JobState) -> float:
-    """Longest that a job may be held, seconds: our own bound over the policy's limits, with its wait in a batch."""
+    """Longest time that a job may be held, seconds: for each episode the policy's limits plus `job_deadline_s`, the
+    coordinator's own bound, which also covers the wait in a batch."""
     limits = job.group.template.limits
     each = limits.episode_wall_s + limits.init_wall_s + state.settings.job_deadline_s
     return job.n * each
 
 
 def lose(state: State, worker: Worker, step: Step) -> None:
-    """A worker went silent: all it holds goes back, what it was playing under suspicion."""
+    """Declare a silent worker lost: all its jobs go back, and those that it was playing become suspects."""
     running = {lease.id for lease in worker.running()}
     fleet.count_out(worker)
     step.log("warning", "worker_lost", worker=worker.name, held=len(worker.leases), running=len(running))
@@ -83,7 +85,7 @@ def lose(state: State, worker: Worker, step: Step) -> None:
 
 
 def take_away(state: State, name: str, step: Step) -> None:
-    """A worker is trusted no more: all it holds goes back, under no suspicion, and its polls end."""
+    """Take all jobs back from a quarantined worker, without suspicion, and end its polls."""
     worker = state.workers.get(name)
     if worker is None:
         return

@@ -1,12 +1,13 @@
-"""The fleet: who registered, what each can do, whether it is there.
+"""The fleet: registered workers, their capabilities, and their availability.
 
 Rules that this module owns:
-- A worker is named; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of the
-  new one may claim them for a short while, then they are lost like a lost worker's.
-- Workers of one profile (environments with their fingerprint classes, tiers) are interchangeable but for what they have warm.
-- A worker that is paused, draining, lost, quarantined, benched or taken by a suspect gets no more work. One that is
-  draining is told to end once what it plays is done; one that is paused stays, and is as before when it is taken back.
-- A worker whose jobs keep failing through its own fault is benched for a growing time.
+- A worker has a name; its session ends when it registers again. Leases of an ended session are orphans: a heartbeat of
+  the new session may claim them for a short while, then they are lost like a lost worker's.
+- Workers of one profile (environments with their fingerprint classes, tiers) are interchangeable except for their warm
+  environments and bundles.
+- A worker that is paused, draining, lost, quarantined, benched or reserved for a suspect gets no more work. A draining
+  worker is told to end after its present jobs; a paused one stays, and works as before once it is set active.
+- A worker whose jobs keep failing through its own fault is benched: it gets no leases for a growing time.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from evopolicy_coordinator.core.step import Step
 from . import queue
 
 BENCH_AFTER = 3
-"""Failures in a row, with nothing played in between, after which a worker is benched."""
+"""Consecutive failures after which a worker is benched."""
 
 
 def of_session(state: State, name: str, session: str, now: float) -> Worker | None:
-    """The worker if the session is its present one; it has been heard from then."""
+    """Returns the worker if `session` is its current one, and records the contact; None otherwise."""
     worker = state.workers.get(name)
     if worker is None or worker.session != session:
         return None
@@ -39,7 +40,7 @@ def of_session(state: State, name: str, session: str, now: float) -> Worker | No
 
 
 def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) -> Worker:
-    """Take a worker in, or take it in again under a new session."""
+    """Add a worker, or replace it under a new session."""
     message = event.message
     profile = _profile(state, event)
     old = state.workers.get(message.worker)
@@ -88,7 +89,7 @@ def _profile(state: State, event: WorkerRegistered) -> Profile:
 
 
 def count_in(state: State, worker: Worker) -> None:
-    """It may have work again, unless an operator said otherwise."""
+    """Make a worker active, unless an operator drained or paused it."""
     worker.state = state.out_of_service.get(worker.name, "active")
     if worker.state == "active":
         worker.profile.workers[worker.name] = None
@@ -96,7 +97,7 @@ def count_in(state: State, worker: Worker) -> None:
 
 
 def count_out(worker: Worker, state: Literal[OutOfService, "lost", "quarantined"] = "lost") -> None:
-    """No more work for it."""
+    """Take a worker out of service: it gets no more work."""
     if worker.state == "active":
         del worker.profile.workers[worker.name]
         worker.profile.slots -= worker.slots
@@ -114,7 +115,7 @@ def set_state(
     reason: str = "",
     machine: str = "",
 ) -> None:
-    """An operator's word, or an audit's; holds for a worker that is not there yet, too."""
+    """Apply a state set by an operator or an audit; also for a worker that is not connected."""
     state.out_of_service.pop(name, None)
     if state.quarantined.pop(name, None) is not None:
         machines = state.quarantined_machines
@@ -135,13 +136,13 @@ def set_state(
 
 
 def forget(state: State, worker: Worker) -> None:
-    """A worker that was lost long ago is known no more."""
+    """Remove a worker that was lost long ago."""
     del state.workers[worker.name]
     state.sessions.pop(worker.session, None)
 
 
 def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:
-    """Answer the heartbeat that a worker has waiting."""
+    """Answer a worker's delayed heartbeat."""
     request, worker.beat = worker.beat, None
     state.timers.disarm(("beat", worker.name))
     assert request is not None
@@ -167,14 +168,14 @@ def answer_poll(
 
 
 def poll_ended(state: State, name: str, step: Step) -> None:
-    """A lease poll's time is up."""
+    """A lease poll has timed out."""
     worker = state.workers.get(name)
     if worker is not None:
         drop_poll(state, worker, step)
 
 
 def beat_ended(state: State, name: str, step: Step) -> None:
-    """A heartbeat's answer has been held back for long enough."""
+    """A heartbeat's delay is over."""
     worker = state.workers.get(name)
     if worker is not None and worker.beat is not None:
         answer_beat(state, worker, (), step)
@@ -184,12 +185,12 @@ def beat_ended(state: State, name: str, step: Step) -> None:
 
 
 def available(worker: Worker, now: float) -> bool:
-    """Whether it may be given more."""
+    """Whether a worker may be granted more leases."""
     return worker.state == "active" and worker.alone is None and worker.benched_until <= now
 
 
 def park(worker: Worker) -> None:
-    """Its poll waits and could be answered now."""
+    """List a worker whose poll waits and could be answered now."""
     profile = worker.profile
     if worker.poll is None or worker.name in profile.parked:
         return
@@ -199,7 +200,7 @@ def park(worker: Worker) -> None:
 
 
 def unpark(worker: Worker) -> None:
-    """Its poll waits no more, or cannot be answered now."""
+    """Unlist a worker whose poll no longer waits or cannot be answered now."""
     profile = worker.profile
     if worker.name not in profile.parked:
         return
@@ -213,7 +214,7 @@ def unpark(worker: Worker) -> None:
 
 
 def failed(state: State, worker: Worker, step: Step) -> None:
-    """One more job failed through its own fault."""
+    """Count one more failure through the worker's own fault; bench it after `BENCH_AFTER` in a row."""
     worker.failures += 1
     if worker.failures >= BENCH_AFTER:
         settings = state.settings
@@ -225,7 +226,7 @@ def failed(state: State, worker: Worker, step: Step) -> None:
 
 
 def unreserve(state: State, job: JobState) -> None:
-    """No worker is emptied for a suspect any more; the one that was may get other work."""
+    """Stop emptying a worker for a suspect; the worker may get other work."""
     if job.reserved is not None:
         worker = state.workers[job.reserved]
         worker.reserved = job.reserved = None
@@ -236,7 +237,8 @@ def unreserve(state: State, job: JobState) -> None:
 
 
 def offer(state: State, flow: Flow) -> Profile | None:
-    """Of the profiles that can serve an unpinned flow the one with most slots; None when there is none."""
+    """Among the profiles that can serve an unpinned flow, one of the class with the most slots; None
+    when no profile can."""
     able = [profile for profile in state.profiles.values() if profile.workers and profile.offers(flow)]
     slots: dict[str, int] = {}
     for profile in able:

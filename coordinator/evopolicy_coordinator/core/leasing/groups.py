@@ -2,8 +2,8 @@
 
 Rules that this module owns:
 - A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.
-- What of a group is not done is queued when it opens; nothing of it is played once it is closed.
-- Of a finished episode only its mark is kept, and only while the group is open.
+- The unfinished jobs of a group are queued when it opens; none of them is played after it is closed.
+- Of a finished episode only its digest is kept, and only while the group is open.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from . import fleet, leases, queue
 
 
 def open_group(state: State, group: JobGroup, step: Step) -> None:
-    """Queue what is not done of a group. While loading, jobs wait to be adopted first."""
+    """Queue the unfinished jobs of a group. While the core is loaded, jobs first wait to be adopted."""
     state.groups[group.id] = group
     loading, heads = state.loading, []
     if loading is not None:
@@ -37,7 +37,7 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
 
 
 def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
-    """Fill in `group.marks` from the stored heads and `group.jobs` with what is left to play, in order.
+    """Fill `group.digests` from the stored heads and `group.jobs` with the unfinished jobs, in order.
 
     A job of several episodes is stored whole or not at all.
     """
@@ -62,7 +62,7 @@ def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -
 
 
 def close_group(state: State, group: JobGroup, step: Step, why: str) -> None:
-    """Nothing more is played of a group; what is leased is stopped."""
+    """Close a group: its leased jobs are stopped, and no more of its jobs are played."""
     for job in list(group.jobs.values()):
         close_job(state, job, step, why)
     group.closed = True
@@ -73,7 +73,7 @@ def close_group(state: State, group: JobGroup, step: Step, why: str) -> None:
 
 
 def close_job(state: State, job: JobState, step: Step, why: str) -> None:
-    """A job is open no more."""
+    """Stop and remove an open job."""
     if job.lease is not None:
         leases.stop(state, job.lease, step, why)
     job.parting = None

@@ -1,7 +1,7 @@
-"""A job as its worker gets it.
+"""A job as its worker receives it.
 
-Rule that this module owns: a job's content follows from its group and its position, so it need not be stored, and every
-attempt of it is the same job, but for what the policy returned in an earlier one (`BegunRow`).
+Rule that this module owns: a job's content follows from its group and its position, so it is not stored, and every
+attempt is the same job, except for the actions that the policy returned in an earlier one (`BegunRow`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ def _seed(template: Template, index: int) -> bytes:
 
 
 def build(job: JobState, description: EnvironmentDescription) -> Job:
-    """The job as a worker gets it."""
     template = job.group.template
     video = template.video == "all" or (template.video == "first" and job.first == 0)
     episodes = tuple(

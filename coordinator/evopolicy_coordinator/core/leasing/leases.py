@@ -1,14 +1,15 @@
-"""Leases: who plays which job, and what becomes of a job whose lease ends. When a lease expires is `expiry`'s.
+"""Leases: the right of a worker to play a job, and what happens to the job when it ends. `expiry` decides when a lease
+expires.
 
 Rules that this module owns:
-- A job has at most one lease that counts. Every lease has the job's next attempt number; attempts that were given up are
-  fenced off: what goes wrong in them is nothing to the job any more, and their holders are told to stop. (An outcome is
-  taken from any attempt, as `handin` says: it is the same whoever plays it.)
-- A lease lives by heartbeats that name it. One that its worker never came to know of is given up.
-- A lease that this incarnation has not heard of is adopted from its holder's heartbeat when its job waits.
+- A job has at most one live lease. Every lease has the job's next attempt number; given-up attempts are fenced off:
+  their failures do not affect the job, and their holders are told to stop. (An outcome is accepted from any attempt,
+  see `workers.results`: it is the same whoever plays it.)
+- Heartbeats that name a lease keep it alive. A lease that never arrived at its worker is given up.
+- A lease that this incarnation did not grant is adopted from its holder's heartbeat if its job waits.
 - Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
-- A policy's job that is stopped through nobody's fault waits again only when its worker has let go of it: what its policy has
-  returned comes back with it, and the next attempt goes on from there.
+- A policy's job that is stopped through nobody's fault returns to the queue only after its worker has released it: the
+  worker returns the policy's actions so far, and the next attempt plays them first.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from .jobs import build
 from .retry import JobFailure, decide
 
 MISSING_BEATS = 3
-"""A lease that its worker has not named for so many heartbeats since it was granted never arrived."""
+"""A lease that its worker has not named for so many heartbeat intervals since the grant has never arrived."""
 
 
 def lease_id(secret: bytes, job_id: str, attempt: int, worker: str) -> str:
-    """Names a lease by what it is of: equal in every incarnation.
+    """A lease's name, made from its job, attempt and worker: equal in every incarnation.
 
-    Only who knows the run's secret can make it: it proves to a later incarnation, which has no list of what earlier ones
-    granted, that this worker was given this attempt.
+    Only a holder of the run's secret can make it. It proves to a later incarnation, which has no list of earlier
+    leases, that this worker was granted this attempt.
     """
     proof = hmac.digest(secret, f"lease|{job_id}|{attempt}|{worker}".encode(), hashlib.sha256)
     return f"{job_id}#{attempt}#{proof[:12].hex()}"
@@ -51,7 +52,7 @@ def granted(state: State, name: str, job_id: str, attempt: int, worker: Worker) 
     )
 
 
-# ---- getting ----
+# ---- granting ----
 
 
 def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
@@ -109,35 +110,36 @@ def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
 
 
 def _look_again(state: State, worker: Worker, step: Step) -> None:
-    """A worker has a hidden job: train jobs that wait already (they avoided it, or the hidden job was adopted from
-    its heartbeat) may stop it with nothing else happening."""
+    """Check the worker's lanes again soon: train jobs that wait already (they avoided it, or the hidden job was adopted
+    from its heartbeat) may stop its hidden job without any further event."""
     for lane in worker.profile.busy:
         if lane.n_ready[TRAIN]:
             state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
 
 
 def _started(state: State, group: JobGroup, step: Step) -> None:
-    """The first lease of a group was granted."""
+    """Start the submit's time limit when the first lease of its group was granted."""
     limit_s = group.template.limits.submit_wall_s
     if group.kind == "train" and limit_s is not None:
         state.timers.arm(("submit", group.id), step.now + limit_s)
 
 
 def let_go(state: State, group: JobGroup, now: float) -> None:
-    """A submit is held no more."""
+    """Stop counting the time for which a submit is held."""
     if group.held_since is not None:
         group.held_s = group.held(now)
         group.held_since = None
         del state.held[group]
 
 
-# ---- hearing ----
+# ---- heartbeats ----
 
 
 def hear(
     state: State, worker: Worker, held: Iterable[wire.HeldLease], step: Step, *, settled: int
 ) -> tuple[str, ...]:
-    """A heartbeat: renew what it names, adopt what is unknown and waits; gives what the worker is to stop."""
+    """Process a heartbeat: renew the named leases, adopt unknown ones whose job waits. Returns the leases that the
+    worker is to stop. All polls of the worker up to number `settled` are finished."""
     now = step.now
     stop: list[str] = []
     named: set[str] = set()
@@ -174,7 +176,7 @@ def hear(
 
 
 def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Lease | None:
-    """The lease of an earlier incarnation that a worker still holds; None when it is not to go on."""
+    """Adopt a lease of an earlier incarnation that a worker still holds; None when it must not continue."""
     job = state.jobs.get(item.job_id)
     if (
         job is None
@@ -200,7 +202,7 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
 
 
 def end(state: State, lease: Lease, step: Step, why: str) -> None:
-    """The lease counts no more; its worker is told to stop at its next heartbeat, or at once if one waits."""
+    """The lease no longer counts. Its worker learns of it from its next heartbeat, or at once if one waits."""
     if not lease.live:
         return
     lease.live = False
@@ -218,13 +220,15 @@ def end(state: State, lease: Lease, step: Step, why: str) -> None:
 
 
 def stop(state: State, lease: Lease, step: Step, why: str) -> None:
-    """End a lease that its worker holds on to; it is told at the end of this step if it waits for any answer."""
+    """End a lease that its worker still holds; a waiting poll or heartbeat is answered with it at
+    the end of this step."""
     end(state, lease, step, why)
     step.stops.setdefault(lease.worker, []).append(lease.id)
 
 
 def release(state: State, worker: Worker, lease: Lease, step: Step, why: str, *, sure: bool = False) -> None:
-    """End a lease that its worker has let go of: surely, as it said, or as far as we know."""
+    """End a lease that its worker has released. `sure`: the worker reported so; otherwise it is the
+    coordinator's assumption."""
     end(state, lease, step, why)
     _leave(state, worker, lease, step, sure=sure)
 
@@ -242,7 +246,7 @@ def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool
 
 
 def parted(state: State, lease: Lease, worker: Worker, step: Step) -> None:
-    """A job that waited for what its worker hands back waits for it no more."""
+    """Put a job back that waited for its worker's release."""
     if lease.parting:
         lease.job.parting = None
         give_back(state, lease.job, "returned", worker, step, ran=False)
@@ -288,7 +292,8 @@ def give_back(
 
 
 def put_off(state: State, lease: Lease, why: str, step: Step) -> None:
-    """Stop a hidden job, through nobody's fault; it goes back into the queue, where a policy plays when its worker has let go."""
+    """Stop a hidden job through nobody's fault. It returns to the queue, but a policy's job only after its
+    worker has released it."""
     job = lease.job
     stop(state, lease, step, why)
     if job.group.template.bundle is None:

@@ -1,8 +1,8 @@
-"""Which class of workers plays a run or an evaluation, from its first episode to its last.
+"""Pins: the class of workers that plays a run or an evaluation, from its first episode to its last.
 
 Rules that this module owns:
-- A flow is pinned to the fingerprint class that serves it best when it begins, or once there is one.
-- Whoever the flow is of hears of it (`FlowPinned`) and stores the class.
+- A flow is pinned to the fingerprint class that serves it best when it is created, or as soon as one exists.
+- The flow's run or evaluation receives the news (`FlowPinned`) and stores the class.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def add_flow(
     closed: bool,
     definition: str = "",
 ) -> Flow:
-    """A new flow for a run or an evaluation, not pinned to workers yet; `closed`: no agent is at work for it."""
+    """Create a flow for a run or an evaluation, not pinned to workers yet. `closed`: no agent works for it."""
     state.n_flows += 1
     flow = Flow(name, env, tier, of, secret, state.n_flows, family, closed=closed, definition=definition)
     state.unpinned[name] = flow
@@ -40,7 +40,7 @@ def add_flow(
 
 
 def drop_flow(state: State, flow: Flow) -> None:
-    """A run or evaluation is over: nothing of it waits any more."""
+    """Remove the flow of a finished run or evaluation, which has no waiting jobs."""
     state.unpinned.pop(flow.id, None)
     flow.lane = None
     state.families.leave(flow.family)
@@ -57,13 +57,13 @@ def pin(state: State, flow: Flow, step: Step) -> None:
 
 
 def place(state: State, flow: Flow, fingerprint_class: str, step: Step) -> None:
-    """Pin a flow to a class of workers: what of it waits, waits for them."""
+    """Pin a flow to a class of workers; its waiting jobs then wait for them."""
     state.unpinned.pop(flow.id, None)
     step.dirty[queue.place(state, flow, fingerprint_class)] = None
 
 
 def pin_waiting(state: State, worker: Worker, step: Step) -> None:
-    """A worker may have work again: runs that nobody could serve when they were opened are pinned now."""
+    """When a worker becomes available, pin the flows that no worker could serve before."""
     for flow in list(state.unpinned.values()):
         if worker.profile.offers(flow):
             pin(state, flow, step)
@@ -73,7 +73,7 @@ def pin_waiting(state: State, worker: Worker, step: Step) -> None:
 
 
 def refused_runs(state: State, profile: Profile) -> dict[str, str]:
-    """Runs of their environments that the workers of a profile get no work of, and why."""
+    """Unfinished runs in the profile's environments that its workers get no jobs of, with the reason."""
     refused = {
         run.id: _mismatch(run, profile)
         for run in state.runs.values()
@@ -104,11 +104,12 @@ def _mismatch(run: Run, profile: Profile) -> str:
 
 
 _NO_PART = ("evopolicy-worker",)
-"""Not a part of the class of a single environment."""
+"""Not part of the class of a single environment."""
 
 
 def differences(there: EnvironmentDescription, here: EnvironmentDescription) -> list[str]:
-    """What two definitions of one environment do not agree in, a part a line, values cut to a few words."""
+    """Differences between two definitions of one environment, one entry per field, values cut to
+    `_SHOWN` characters."""
     ours, theirs = msgspec.to_builtins(here), msgspec.to_builtins(there)
     return [
         f"{name} {_short(theirs[name])} there, {_short(ours[name])} here"
@@ -123,4 +124,4 @@ def _short(value: object) -> str:
 
 
 _SHOWN = 60
-"""Characters of a value that is named."""
+"""Characters of a value that are shown."""

@@ -1,15 +1,16 @@
-"""Jobs that wait: in lanes by what a worker must be able to do, by priority, and by fair share between runs.
+"""Waiting jobs: in lanes by required capabilities, by priority, and by fair share between runs.
 
 Rules that this module owns:
 - A lane is (environment, sandbox tier, fingerprint class); a flow (a run, or an evaluation) is in one lane, or in none
   until it is pinned to a class.
-- A lower priority number goes first, whatever the shares say.
-- Between flows of one priority the one that got the least play time goes first (start-time fair queueing: each priority
-  has a virtual clock; a flow that was idle starts at the clock, so idleness earns nothing). A worker that has the
-  environment or the bundle warm may bend this by a bounded amount.
-- Within a flow jobs go in order; what goes back after a failure goes to the front.
-- A job is not given to a worker it avoids, as long as its lane has another; never to one that its group bars.
-- No operation looks at all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
+- A lower priority rank goes first, whatever the shares are.
+- Between flows of one rank the one with the least play time goes first (start-time fair queueing: each rank has a
+  virtual clock; an idle flow starts at the clock, so that idleness earns nothing). A worker that has the environment or
+  the bundle warm may deviate from this by a bounded amount.
+- Within a flow jobs go in order; jobs that return after a failure go to the front.
+- A job is not leased to a worker that it avoids while its lane has another one, and never to a worker that its group
+  excludes.
+- No operation visits all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
 """
 
 from __future__ import annotations
@@ -35,22 +36,22 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 LOOK_AGAIN_S = 1.0
-"""What waits although someone waits for it (they avoid each other) is looked at again after so long."""
+"""A lane is checked again after so long when jobs wait although workers wait too (they avoid each other)."""
 
 SKIPS_MAX = 16
-"""So many jobs of a flow that avoid the asking worker are looked past; more, and it waits."""
+"""Most jobs of a flow that are skipped because they avoid the polling worker; after that the flow is passed over."""
 
 PASSES_MAX = 4
-"""So many flows with nothing but such jobs are looked past."""
+"""Most flows that are passed over because all their jobs were skipped."""
 
 BARRED_MAX = 64
-"""So many flows, or families of a lane, that the asking worker's kernel is barred to are looked past."""
+"""Most flows, or families of a lane, that are passed over because they conflict with the polling worker's kernel."""
 
 
 _RANK = tuple(next(n for n, rank in enumerate(RANKS) if each in rank) for each in range(N_PRIORITIES))
 
 
-# ---- shape ----
+# ---- lanes and profiles ----
 
 
 def add_profile(state: State, profile: Profile) -> None:
@@ -61,7 +62,7 @@ def add_profile(state: State, profile: Profile) -> None:
 
 
 def place(state: State, flow: Flow, pin: str) -> Lane:
-    """Put a flow into the lane of class `pin`, with whatever of it waits."""
+    """Move a flow with its waiting jobs into the lane of class `pin`."""
     old = flow.lane
     suspects = [job.priority for job in state.suspects if job.group.flow is flow]
     if old is not None:
@@ -89,7 +90,7 @@ def place(state: State, flow: Flow, pin: str) -> Lane:
 
 
 def close(state: State, flow: Flow) -> None:
-    """A flow's agent is gone."""
+    """Mark a flow as closed: its agent is gone."""
     waiting = {
         priority: flow.n_ready[priority]
         + sum(job.group.flow is flow and job.priority == priority for job in state.suspects)
@@ -115,7 +116,7 @@ def _enter(flow: Flow, lane: Lane, priority: int) -> None:
 
 
 def _settle(lane: Lane) -> None:
-    """Let the profiles know whether anything waits in the lane."""
+    """Update in the lane's profiles whether it has waiting jobs."""
     if any(lane.n_ready):
         for profile in lane.profiles:
             profile.busy[lane] = None
@@ -128,7 +129,7 @@ def _settle(lane: Lane) -> None:
 
 
 def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None:
-    """Let a job wait, and see at the end of the step whether someone waits for it."""
+    """Queue a job, and mark its lane for the scheduler."""
     flow, priority, lane = job.group.flow, job.priority, job.group.flow.lane
     job.move("queued")
     job.ticket += 1
@@ -141,6 +142,7 @@ def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None
     ready = flow.ready[priority]
     (ready.appendleft if front else ready.append)((job.ticket, job))
     if flow.n_ready[priority] == 0:
+        # An idle flow starts at the clock, so that idleness earns nothing.
         flow.served[priority] = max(flow.served[priority], state.clock[_RANK[priority]])
     flow.n_ready[priority] += 1
     if lane is not None:
@@ -151,7 +153,7 @@ def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None
 
 
 def withdraw(state: State, job: JobState) -> None:
-    """Take a waiting job out, wherever it stands, to be leased or closed at once."""
+    """Remove a waiting job from the queue; the caller leases, closes or queues it at once."""
     if job.place != "queued":
         return
     flow, priority = job.group.flow, job.priority
@@ -172,7 +174,7 @@ def withdraw(state: State, job: JobState) -> None:
 
 
 def take(state: State, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
-    """The job that `worker` gets next, taken out of the queue; None when nothing here is for it."""
+    """Remove and return the next job for `worker`; None when no waiting job is for it."""
     for rank in _ranks(worker):
         passed: list[tuple[Flow, int]] = []
         barred = 0
@@ -201,7 +203,7 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
 
 
 def leading(state: State, worker: Worker) -> tuple[Flow, int] | None:
-    """The flow that goes first of what the worker may be leased, and at which priority; None when nothing waits."""
+    """The flow that goes first among those that the worker may be leased, and its priority; None when none waits."""
     for rank in _ranks(worker):
         found = _best(state, worker, rank, ())
         if found is not None:
@@ -210,7 +212,7 @@ def leading(state: State, worker: Worker) -> tuple[Flow, int] | None:
 
 
 def may_serve(state: State, lane: Lane, worker: Worker) -> bool:
-    """Whether anything that waits in the lane may be leased on the worker's kernel."""
+    """Whether any job that waits in the lane may be leased on the worker's kernel."""
     return any(
         lane.n_ready[priority] and _open(state, lane, priority, worker) for priority in range(N_PRIORITIES)
     )
@@ -222,7 +224,7 @@ def may_train(state: State, lane: Lane, worker: Worker) -> bool:
 
 
 def _open(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
-    """Whether some family that waits in the lane may be leased on the worker's kernel."""
+    """Whether jobs of some family that waits in the lane may be leased on the worker's kernel."""
     there = lane.waiting[priority]
     if not there:
         return False
@@ -266,7 +268,7 @@ def _best(
 
 
 def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool) -> JobState | None:
-    """The flow's first job that may go to `worker` and does not avoid it; void entries on the way are dropped."""
+    """The flow's first job that may go to `worker` and does not avoid it; drops void entries on the way."""
     ready = flow.ready[priority]
     skipped: list[tuple[int, JobState]] = []
     found: JobState | None = None
@@ -284,7 +286,7 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
 
 
 def head(lane: Lane, priority: int) -> JobState | None:
-    """What goes first in the lane at one priority, whoever asks; None when nothing waits."""
+    """The lane's first job at one priority, for any worker; None when none waits."""
     flow = lane.top(priority) if lane.n_ready[priority] else None
     if flow is None:
         return None
@@ -292,13 +294,13 @@ def head(lane: Lane, priority: int) -> JobState | None:
 
 
 def avoided(lane: Lane, priority: int, now: float) -> str | None:
-    """The worker that the lane's next job is kept from."""
+    """The worker that the lane's next job avoids; None for none."""
     job = head(lane, priority)
     return job.avoid if job is not None and now < job.avoid_until and lane.workers() > 1 else None
 
 
 def next_bundle(lane: Lane) -> tuple[str | None, str] | None:
-    """Bundle and environment of what goes next in the lane; None when nothing waits."""
+    """Bundle and environment of the lane's next job; None when none waits."""
     for priority in range(N_PRIORITIES):
         job = head(lane, priority)
         if job is not None:
@@ -311,25 +313,25 @@ def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
 
 
 def _next(flow: Flow, priority: int) -> JobState:
-    """The first of a flow's ready jobs; there must be one. Void entries ahead of it are dropped."""
+    """The first of a flow's ready jobs, which must exist. Drops void entries ahead of it."""
     ready = flow.ready[priority]
     while ready[0][1].ticket != ready[0][0]:
         ready.popleft()
     return ready[0][1]
 
 
-# ---- jobs that come back ----
+# ---- jobs that return ----
 
 
 def backed_off(state: State, job_id: str, step: Step) -> None:
-    """A job that failed through our own fault has waited long enough."""
+    """A job's back-off after an infrastructure failure is over."""
     job = state.jobs.get(job_id)
     if job is not None and job.place == "backing_off":
         put(state, job, step, front=True)
 
 
 def give_up_adopting(state: State, _what: str, step: Step) -> None:
-    """No heartbeat has claimed these jobs since the core was loaded: they are played again."""
+    """No heartbeat has claimed these jobs since the core was loaded: play them again."""
     for job in list(state.adopting):
         del state.adopting[job]
         put(state, job, step)

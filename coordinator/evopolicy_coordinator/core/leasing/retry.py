@@ -1,9 +1,10 @@
-"""What to do about a job that was not finished: a decision as a value, made in one place.
+"""How an unfinished job is retried: a decision as a value, made in one place.
 
 Rules that this module owns:
-- Only what is our own fault is retried, without limit. A policy's failure is a result, and never comes here.
-- Being given back (drained, preempted, cancelled) is nobody's fault: no delay, no blame.
-- A lost worker makes suspects of the jobs that ran on it: they rerun alone. Those that waited behind them just go back.
+- Only infrastructure failures are retried, without limit. A policy's failure is a result and never handled here.
+- A job that is given back (drained, preempted, cancelled) is nobody's fault: no delay, no blame.
+- The jobs that ran on a lost worker become suspects and rerun alone. The jobs that waited there behind them just return
+  to the queue.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from typing import Literal, NamedTuple
 from evopolicy_coordinator.core.settings import CoreSettings
 
 JobFailure = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
-"""returned: given back unplayed. unlisted: its worker lives but does not know of it, the lease never arrived. failed: the
-worker's own trouble. worker_lost: its worker went silent. overdue: it was played for longer than any episode may take."""
+"""returned: given back unfinished, through nobody's fault. unlisted: its worker is alive but does not know the lease,
+which never arrived. failed: the worker's own fault. worker_lost: its worker went silent. overdue: played for longer
+than any episode may take."""
 
 
 class Retry(NamedTuple):
@@ -24,18 +26,20 @@ class Retry(NamedTuple):
     avoid: bool
     """Keep it from the same worker for a while."""
     alone: bool
-    """It is suspected of taking down workers: it reruns with nothing beside it."""
+    """It is suspected of crashing workers: it reruns with no other job beside it."""
     counted: bool
-    """It counts as an infrastructure failure: in the back-off, and in what an operator sees."""
+    """It counts as an infrastructure failure: in the back-off, and in the operator's figures."""
 
 
 def backoff_s(settings: CoreSettings, failures: int) -> float:
-    """Seconds to wait after the `failures`-th infrastructure failure (from 1): doubles, up to a bound."""
+    """Returns the back-off in seconds after the `failures`-th infrastructure failure (from 1): doubles,
+    up to `retry_max_s`."""
     return min(settings.retry_max_s, settings.retry_base_s * 2.0 ** min(failures - 1, 30))
 
 
 def decide(settings: CoreSettings, failure: JobFailure, *, failures: int, ran: bool) -> Retry:
-    """The retry of a job after `failure`; `failures` counts this one, `ran` tells whether it was being played."""
+    """Returns the retry of a job after `failure`. `failures` includes this one; `ran`: whether the
+    job was being played."""
     if failure == "returned":
         return Retry(0.0, avoid=False, alone=False, counted=False)
     if failure == "unlisted" or (failure == "worker_lost" and not ran):

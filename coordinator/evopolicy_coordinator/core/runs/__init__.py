@@ -1,1 +1,1 @@
-"""What runs and evaluations are, from their creation to their result: submits, results, validation, selection, audits."""
+"""Runs and evaluations, from their creation to their result: submits, results, validation, selection, audits."""

@@ -1,4 +1,4 @@
-"""The end of a run's audits: how long the run waits for them, who could still play them, what its record tells of them."""
+"""The end of a run's audits: how long the run waits for them, who could still play them, and their record."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .audits import dispute, settle, words
 from .templates import HIDDEN_SPLITS
 
 LOOK_AGAIN_S = 5.0
-"""A run that waits for its audits sees so often whether anyone can still play them."""
+"""Interval at which a run that waits for its audits checks whether a worker can still play them."""
 
 FINDINGS_MAX = 100
 """Findings that a run's record keeps."""
@@ -31,7 +31,7 @@ FORGING_AUDITOR = "only a forger had played it again"
 
 
 def holds_up(state: State, run: Run, step: Step) -> bool:
-    """Whether a run that is done otherwise still waits for audits; gives up those that are waited for no more."""
+    """Whether a run that is otherwise done still waits for audits; gives up the open ones when it no longer waits."""
     waiting = [row for row in run.audits.values() if row.state == "open"]
     if not waiting:
         state.timers.disarm(("audits", run.id))
@@ -40,7 +40,7 @@ def holds_up(state: State, run: Run, step: Step) -> bool:
         run.audits_waited_s += step.now - run.audits_looked_at
     run.audits_looked_at = step.now
     left_s = state.settings.audit_wait_s - run.audits_waited_s
-    # After a start or a standstill workers may not have come back yet.
+    # After a start, or after the loop was blocked, workers may not have returned yet.
     in_vain = step.now >= state.hold_until and all(_obstacle(state, run, row) for row in waiting)
     if left_s > 0.0 and not in_vain:
         state.timers.arm(("audits", run.id), step.now + min(left_s, LOOK_AGAIN_S))
@@ -62,7 +62,8 @@ def _give_up(state: State, run: Run, row: AuditRow, reason: str, step: Step) -> 
 
 
 def _obstacle(state: State, run: Run, row: AuditRow) -> str:
-    """Why no worker that is known can play the audit's next replay; empty when one can, or the shell is at it."""
+    """Why no known worker can play the audit's next replay; empty when one can, or while the
+    shell stores or compares."""
     if row.actions is None or len(row.replayed_by) > row.compared:
         return ""
     reason = ONE_WORKER
@@ -74,7 +75,8 @@ def _obstacle(state: State, run: Run, row: AuditRow) -> str:
 
 
 def _playable(state: State, run: Run, row: AuditRow) -> bool:
-    """Whether some worker may play the audit's next replay now, or nobody can, or the shell is at it: waiting counts."""
+    """Whether waiting for the audit counts: a worker may play its next replay now, or none ever can, or the
+    shell stores or compares."""
     if row.actions is None or len(row.replayed_by) > row.compared or row.kind not in HIDDEN_SPLITS:
         return True
     able = [worker for worker, why in _auditors(state, run, row) if not why]
@@ -86,7 +88,7 @@ def _playable(state: State, run: Run, row: AuditRow) -> bool:
 
 
 def _auditors(state: State, run: Run, row: AuditRow) -> Iterator[tuple[Worker, str]]:
-    """Workers that have not had to do with the episode, each with why it cannot play it again; empty when it can."""
+    """Workers that have not played the episode, each with the reason why it cannot replay it; empty when it can."""
     for worker in state.workers.values():
         had = worker.name == row.player or worker.name in row.replayed_by
         shut_out = worker.name in state.quarantined or worker.machine in state.quarantined_machines
@@ -103,20 +105,20 @@ def _auditors(state: State, run: Run, row: AuditRow) -> Iterator[tuple[Worker, s
 
 
 def cancel(state: State, run: Run, step: Step) -> None:
-    """The run is cancelled: what is open of its audits is played no more."""
+    """Give up the open audits of a run that ends."""
     for row in list(run.audits.values()):
         if row.state == "open":
             _give_up(state, run, row, CANCELLED, step)
 
 
 def waits_for(run: Run) -> Reason | None:
-    """What a run that is otherwise done waits for."""
+    """The audits that a run, otherwise done, waits for; None for none."""
     n = sum(row.state == "open" for row in run.audits.values())
     return because("audits", n=n) if n else None
 
 
 def record(state: State, run: Run) -> AuditRecord | None:
-    """What a finished run's audits came to; None where nothing was to be audited and no forger played in it."""
+    """The record of a finished run's audits; None if no episode was to be audited and no forger played in it."""
     rows = list(run.audits.values())
     named = {row.replayed_by[0] if row.state == "agreed" else row.forger for row in rows if _told(row)} - {""}
     named |= {name for name in run.played if name in state.quarantined}

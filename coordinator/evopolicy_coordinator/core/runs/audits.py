@@ -1,18 +1,18 @@
-"""Audits: of a sampled share of the episodes that workers report, the recorded actions are played again elsewhere.
+"""Audits: the recorded actions of a sampled share of the reported episodes are replayed on other workers.
 
 Rules that this module owns:
-- Which episodes are drawn follows from the run's secret, so no worker can tell which of its own they will be.
+- The run's secret determines the sample, so no worker can predict which of its episodes are drawn.
 - An episode is never audited by its player, and only by workers of the same versions and processor features: others may
-  honestly come to other bits. Environments that do not repeat themselves are not audited.
-- Recorded actions are played, no policy: what a policy reads from a clock changes nothing. Who plays them again is told
-  the actions alone, so it cannot echo what it should confirm.
-- Where machines have credentials of their own, player and auditors are of as many machines, and a forger's machine goes
-  with it: whoever brings several workers has one voice.
-- Two workers that disagree are in dispute; a third opinion decides. Who stands alone against two is named and gets no
-  more leases. What is settled stays, once and for all; the run says that it is in question.
-- Audits come last in the queue and are stopped for any train job. A run that is otherwise done waits for them
-  `CoreSettings.audit_wait_s` at most, and not at all for what no other worker can play. Time in which a hidden one is kept
-  from all workers that could play it (`isolation`) does not count.
+  honestly get other bits. Nondeterministic environments are not audited.
+- An audit replays recorded actions without the policy: a policy that reads a clock changes nothing. The auditor
+  receives the actions only, so it cannot echo the results that it should confirm.
+- Where machines have credentials of their own, player and auditors are on different machines, and a forger's machine is
+  quarantined with it: the owner of several workers has one vote.
+- Two workers that disagree are in dispute; a third one decides. The worker that stands alone against two is named and
+  gets no more leases. A settled verdict is final; the run's record shows the dispute.
+- Audits are last in the queue and are stopped for any train job. A run that is otherwise done waits for them
+  `CoreSettings.audit_wait_s` at most, and not at all for audits that no other worker can play. Time during which a
+  hidden audit is kept from all workers that could play it (`isolation`) does not count.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ NO_STEPS = "no step was played"
 
 
 def drawn(secret: bytes, group: str, index: int, share: float) -> bool:
-    """Whether the episode at `index` of a group is among the sampled `share`."""
+    """Whether the episode at `index` of a group is in the sampled `share` (0 to 1)."""
     digest = hmac.digest(secret, f"audit|{group}|{index}".encode(), hashlib.sha256)
     return int.from_bytes(digest[:8], "big") < share * 2.0**64
 
 
 def audit_id(group: str, index: int) -> str:
-    """What an audit is called; the group of its k-th replay (from 1) is `id.k`."""
+    """Id of an audit; the group of its k-th replay (from 1) is `id.k`."""
     return f"{group}/audit-{index}"
 
 
-# ---- how an audit goes ----
+# ---- course of an audit ----
 
 
 def sample(state: State, news: EpisodesDone, step: Step) -> None:
-    """Draw from the episodes that a worker has reported."""
+    """Draw audits from the episodes that a worker has reported."""
     group, worker = news.group, news.worker
     run, kind = state.runs.get(group.run), group.kind
     if run is None or worker is None or kind == "evaluation" or kind == "audit":
@@ -94,7 +94,7 @@ def _prepare(row: AuditRow, step: Step) -> PrepareAudit:
 
 
 def prepared(state: State, event: events.AuditPrepared, step: Step) -> None:
-    """The actions of an audited episode are stored by themselves, or could not be read."""
+    """The actions of an audited episode are stored as a blob, or could not be read."""
     run, row = _open(state, event.run, event.audit)
     if run is None or row is None or row.actions is not None:
         return
@@ -110,10 +110,10 @@ def prepared(state: State, event: events.AuditPrepared, step: Step) -> None:
 
 
 def replayed(state: State, news: EpisodesDone, step: Step) -> None:
-    """A worker has played an audited episode again."""
+    """A worker has replayed an audited episode."""
     group, worker = news.group, news.worker
     if worker is None:
-        return  # it was stored with its audit's row
+        return  # loaded from the store, where its audit's row names the auditor
     run, row = _open(state, group.run, group.id.rpartition(".")[0])
     groups.close_group(state, group, step, "played again")
     if run is not None and row is not None:
@@ -134,7 +134,7 @@ def _compare(row: AuditRow, step: Step) -> CompareAudit:
 
 
 def compared(state: State, event: events.AuditCompared, step: Step) -> None:
-    """The last replay was compared with what its player had reported, and with the replay before it."""
+    """The last replay was compared with the player's report, and with the replay before it."""
     run, row = _open(state, event.run, event.audit)
     if run is None or row is None or event.replay != len(row.replayed_by) or row.compared >= event.replay:
         return
@@ -167,14 +167,14 @@ def _refuted(state: State, run: Run, row: AuditRow, step: Step) -> None:
 
 
 def _open(state: State, run_id: str, audit: str) -> tuple[Run | None, AuditRow | None]:
-    """The run and its audit, as long as that is open."""
+    """Returns the run and its audit; None for an audit that is not open."""
     run = state.runs.get(run_id)
     row = None if run is None else run.audits.get(audit)
     return run, row if row is not None and row.state == "open" else None
 
 
 def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, **fields: Any) -> None:
-    """The audit is over; nothing more is played for it."""
+    """Settle an audit with its verdict, and close its groups."""
     for n in range(1, len(row.replayed_by) + 2):
         group = state.groups.get(f"{row.audit}.{n}")
         if group is not None:
@@ -184,12 +184,12 @@ def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, *
 
 
 def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:
-    """Queue the next replay of an audit, for a worker that has not had to do with the episode."""
+    """Queue the next replay of an audit, for a worker that has not played the episode."""
     groups.open_group(state, templates.build("audit", run, row, step.now, step.stimulus_id), step)
 
 
 def resume(state: State, run: Run, step: Step) -> None:
-    """Go on, in a core that was just loaded, with what is open of a run's audits."""
+    """Resume a run's open audits in a core that was just loaded."""
     for row in list(run.audits.values()):
         if row.state != "open":
             continue
@@ -205,7 +205,7 @@ def resume(state: State, run: Run, step: Step) -> None:
 
 
 def words(row: AuditRow) -> str:
-    """Who disagrees about what."""
+    """The dispute in words: who disagrees about which episode."""
     others = " and ".join(row.replayed_by)
     return f"{row.player} and {others} disagree about {row.group}, episode {row.index}: {row.difference}"
 
@@ -217,13 +217,13 @@ def undecided(state: State) -> list[str]:
 
 
 def dispute(state: State, text: str, step: Step) -> None:
-    """Tell operators of a dispute."""
+    """Report a dispute to operators."""
     state.disputes.append(text)
     step.log("error", "audit_disputed", what=text)
 
 
 def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
-    """A worker was found to have reported what two others refute: it gets no more leases."""
+    """Quarantine a worker, with its machine, whose report two others refute."""
     said = "reported" if name == row.player else "played again"
     text = f"forged results: what it {said} as {row.group}, episode {row.index}, two other workers refute ({row.difference})"
     if name in state.quarantined:

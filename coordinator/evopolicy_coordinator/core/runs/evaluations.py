@@ -1,7 +1,7 @@
-"""Evaluations: cases that an operator has played outside any run (`try`, `random`), or again (`verify`).
+"""Evaluations: cases that an operator requests outside any run (`try`, `random`), or replays (`verify`).
 
-Rules that this module owns: no budget is concerned; the same key gives the same evaluation; a bundle that brings its slots
-down too often ends its evaluation with that word.
+Rules that this module owns: no budget is charged; the same key returns the same evaluation; a cancelled evaluation ends
+with the reason in its row.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
 
 
 def enter(state: State, row: EvaluationRow) -> Evaluation:
-    """Take an evaluation into the core, with nothing of it queued yet."""
+    """Add an evaluation to the core, with none of its jobs queued yet."""
     family = state.families.join(row.env, row.cases) if templates.hidden_evaluation(row) else None
     name = row.evaluation
     flow = pins.add_flow(
@@ -68,7 +68,7 @@ def play(state: State, evaluation: Evaluation, step: Step) -> None:
 
 
 def pinned(state: State, news: FlowPinned, step: Step) -> None:
-    """Keep the class of workers that an evaluation is played by."""
+    """Store the class of workers that an evaluation is pinned to."""
     evaluation = state.evaluations[news.flow.id]
     evaluation.row = msgspec.structs.replace(
         evaluation.row, fingerprint_class=news.profile.classes[news.flow.env]
@@ -77,7 +77,7 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
 
 
 def progressed(state: State, news: EpisodesDone, step: Step) -> None:
-    """Episodes of an evaluation are done: tell those who wait, and end it with its last."""
+    """Episodes of an evaluation are done: answer waiting polls, and end it after the last one."""
     group = news.group
     if group.done == group.n:
         end(state, group, "", step)
@@ -86,7 +86,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def cancel(state: State, name: str, step: Step) -> bool:
-    """End an evaluation that runs; False when there is none."""
+    """End a running evaluation; returns False when it is unknown."""
     if name not in state.evaluations:
         return name in state.ended_evaluations
     end(state, state.groups[evaluation_group(name)], "cancelled by the operator", step)
@@ -94,7 +94,7 @@ def cancel(state: State, name: str, step: Step) -> bool:
 
 
 def end(state: State, group: JobGroup, error: str, step: Step) -> None:
-    """Nothing more of an evaluation is played; `error` says why it ended early."""
+    """End an evaluation: close its group and answer waiting polls. `error` says why it ended early."""
     evaluation = state.evaluations.pop(group.run)
     step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
     state.ended_evaluations[group.run] = Ended(group.done)
@@ -109,7 +109,7 @@ def _answer_polls(state: State, group: JobGroup, step: Step, *, finished: bool) 
 
 
 def polled(state: State, event: events.Asked[operator.EvaluationPoll], step: Step) -> None:
-    """An operator asks for outcomes: answered at once, or when there are more than it has."""
+    """An operator polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)
     ended = state.ended_evaluations.get(message.evaluation)
@@ -138,7 +138,7 @@ def polled(state: State, event: events.Asked[operator.EvaluationPoll], step: Ste
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
-    """Answer a poll whose time is up."""
+    """Answer a poll that has timed out."""
     step.add(_page(state, poll, state.groups[poll.target], step, finished=False))
 
 

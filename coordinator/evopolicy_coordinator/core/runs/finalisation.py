@@ -1,14 +1,15 @@
-"""What follows once a run takes no more submits: validation, selection, held-out, the random reference.
+"""The stages of a run that takes no more submits: validation, selection, held-out, the random reference.
 
 Rules that this module owns:
-- Every ok checkpoint is validated on all hidden validation cases. That begins as soon as it is ok, in idle slots, and is
-  never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle, env_meta, case, scope and
-  policy seed, in a run that is pinned to one fingerprint class.
-- Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later submit.
-- A checkpoint that an earlier version found ineligible stays so, and only the finished run says it.
+- Every ok checkpoint is validated on all hidden validation cases. Validation starts as soon as the checkpoint is ok, in
+  idle slots, and is never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle,
+  env_meta, case, scope and policy seed, in a run that is pinned to one fingerprint class.
+- Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later
+  submit.
+- A checkpoint that an earlier version found ineligible stays so; only the finished run's result reports it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
-  split and case (`seeds.reference_seed`), except in a run that was created when they followed from its secret.
-- Each stage is found again from the store: `advance` may be called any number of times.
+  split and case (`seeds.reference_seed`), except in runs of earlier versions, where they follow from the run's secret.
+- The stage follows from stored rows: `advance` may be called any number of times.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from . import audit_end, evaluations, finished, journal, result_polls, runs, tem
 
 
 def validate(state: State, run: Run, row: SubmitRow, step: Step) -> None:
-    """Queue the validation of an ok checkpoint; in idle slots only as long as the run is open."""
+    """Queue the validation of an ok checkpoint; in idle slots only while the run is open."""
     if validation_group(run.id, row.submit_index) not in state.groups:
         _open(state, templates.build("validation", run, row, step.now, step.stimulus_id), step)
 
@@ -63,19 +64,19 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
-    """A submit has its verdict: its hidden validation may begin, and a closed run may go on."""
+    """A submit got its verdict: its hidden validation may start, and a closed run may advance."""
     if news.row.status == "ok":
         validate(state, news.run, news.row, step)
     advance(state, news.run, step)
 
 
 def audits_moved(state: State, news: AuditsMoved, step: Step) -> None:
-    """An audit of a run is over: the run may have waited for it."""
+    """An audit of a run ended or advanced: the run may have waited for it."""
     advance(state, news.run, step)
 
 
 def look_at_audits(state: State, name: str, step: Step) -> None:
-    """A run that waits for its audits sees whether anyone can still play them."""
+    """The deadline of a run that waits for its audits: check whether a worker can still play them."""
     run = state.runs.get(name)
     if run is not None:
         advance(state, run, step)
@@ -85,7 +86,8 @@ def look_at_audits(state: State, name: str, step: Step) -> None:
 
 
 def close(state: State, event: events.Asked[gateway.CloseRun], step: Step) -> None:
-    """The agent is gone: no more submits, and the hidden cases are played. Closing twice is closing once."""
+    """The agent is gone: the run takes no more submits, and its hidden cases are played. A second
+    close changes nothing."""
     message = event.message
     run = state.runs.get(message.run)
     if run is None and message.run not in state.capabilities:
@@ -104,7 +106,7 @@ def close(state: State, event: events.Asked[gateway.CloseRun], step: Step) -> No
 
 
 def advance(state: State, run: Run, step: Step) -> None:
-    """Take a closed run as far as it can go now."""
+    """Take a closed run through all stages that are possible now."""
     if run.state.phase != "closed" or run.open is not None:
         return
     if finished.unspent(run):
@@ -130,7 +132,7 @@ def advance(state: State, run: Run, step: Step) -> None:
 
 
 def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) -> None:
-    """An operator ends a run here and now: nothing of it is scored."""
+    """End a run at once on an operator's command; it is not scored. Also ends an evaluation of that name."""
     message = event.message
     run = state.runs.get(message.run)
     if run is None:
@@ -163,7 +165,8 @@ def _finish(
     cancelled: bool = False,
     unplayed: bool = False,
 ) -> None:
-    """The run is over: its result becomes durable, and all that the core holds of it goes. `unplayed`: as far as it got."""
+    """End a run: its result becomes durable, and the core drops its state. `unplayed`: close its
+    open groups unfinished."""
     audit_end.cancel(state, run, step)
     state.timers.disarm(("audits", run.id))
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:

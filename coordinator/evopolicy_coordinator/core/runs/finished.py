@@ -1,4 +1,4 @@
-"""What a run came to, and where an unfinished one stands: for its operator and for `run.json`."""
+"""The result of a finished run, and the progress of an unfinished one: for its operator and for `run.json`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from . import audit_end, result_polls, waits
 
 
 def unspent(run: Run) -> int:
-    """Episodes of its budget that the agent of a run which must spend it has left; what no submit can have does not count."""
+    """Unspent episodes of a run that must spend its budget; 0 for other runs, or if fewer are left
+    than a submit's minimum."""
     left = run.ledger.available
     return left if run.row.settings.finish == "budget" and left >= run.row.min_episodes_per_submit else 0
 
@@ -36,7 +37,7 @@ def ok_submits(run: Run) -> list[SubmitRow]:
 
 
 def select(run: Run) -> SubmitRow | None:
-    """The eligible checkpoint with the highest validation mean, the later of equals; None when there is none."""
+    """The eligible checkpoint with the highest validation mean, the later one on a tie; None when none is eligible."""
     best: SubmitRow | None = None
     best_mean = 0.0
     for row in ok_submits(run):
@@ -52,7 +53,7 @@ def select(run: Run) -> SubmitRow | None:
 def result(
     state: State, run: Run, best: SubmitRow | None, now: float, *, cancelled: bool
 ) -> operator.RunFinished:
-    """All that is recorded of a run that is over; `best` is its selected submit."""
+    """Builds the record of a run that is over; `best` is its selected submit. `now` is Unix time in seconds."""
     row, stored, ok = run.row, run.state, ok_submits(run)
     status: operator.RunEnd = "completed"
     error = None
@@ -159,12 +160,12 @@ def waited(state: State, event: events.Asked[operator.WaitRun], step: Step) -> N
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
-    """An operator has waited in vain for the end of a run."""
+    """An operator's wait for the end of a run has timed out."""
     step.reply(poll.request, *progress(state, state.runs[poll.target]))
 
 
 def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | None]:
-    """Where an unfinished run stands, for its operator, and what it waits for."""
+    """Returns the progress of an unfinished run for its operator, and the reason that it waits for."""
     if run.state.phase == "open" or run.open is not None:
         group = None if run.open is None else state.groups[train_group(run.id, run.open)]
         done = run.ledger.settled + (0 if group is None else group.done)

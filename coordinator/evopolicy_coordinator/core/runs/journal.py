@@ -1,10 +1,10 @@
-"""What the coordinator writes into its journal, and what follows from it (`evopolicy_common.records.journal`).
+"""The coordinator's journal entries and their consequences (`evopolicy_common.records.journal`).
 
 Rules that this module owns:
-- Every run has an entry from its opening on, whatever becomes of it, and another when it is over.
-- What an entry commits to is stored with it, as the bytes that were hashed.
-- An epoch is revealed when one of its runs is published, and not while any run of it is unfinished. A revealed epoch's secret
-  cases are given to no new run; cases that are public anyway may be played on.
+- Every run has an entry from its opening on, whatever happens to it, and another when it is over.
+- The content that an entry commits to is stored with it, as the bytes that were hashed.
+- An epoch is revealed when one of its runs is published, and not while any run of it is unfinished. No new run gets a
+  revealed epoch's secret cases; public cases may still be played.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from evopolicy_coordinator.core.step import Step
 
 
 def fault(state: State, row: RunRow) -> Reason | None:
-    """Why no run may be opened on these cases; None when it may."""
+    """Why no run may be opened on these cases; None when one may."""
     if row.split_secret and row.epoch in state.revealed:
         return because("epoch_revealed", epoch=row.epoch)
     return None
 
 
 def opened(state: State, row: RunRow, step: Step) -> RunRow:
-    """Commit to a run that is about to be made; the row says where."""
+    """Commit to a run that is about to be created. Returns its row with the commitment's place in the journal."""
     settings = row.settings
     document = journal.document(
         journal.Opening(
             run=row.run,
             epoch=row.epoch,
-            # Published as it is: the operator's labels and machines are nobody else's.
+            # This document is published unchanged, so it leaves out the operator's private labels and machine.
             settings=msgspec.structs.replace(settings, notes={}, agent_host=""),
             budget=row.budget,
             min_episodes_per_submit=row.min_episodes_per_submit,
@@ -77,7 +77,8 @@ def opened(state: State, row: RunRow, step: Step) -> RunRow:
 
 
 def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
-    """Fix what a run came to. Of a run without a commitment nothing is written: its entry would say nothing of its start."""
+    """Commit to a run's result. A run without an opening commitment gets no entry, since the entry could
+    not refer to its start."""
     if finished.committed is None:
         return finished
     document = journal.document(journal.result_of(finished))
@@ -91,7 +92,8 @@ def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
 
 
 def disclose(state: State, event: events.DisclosureAsked, step: Step) -> None:
-    """Reveal the epochs of runs that are to be published; those that are revealed stay so."""
+    """Reveal the epochs of runs that are to be published. Refuses (BUSY) while a run of them is unfinished.
+    Revealed epochs stay so."""
     for run in state.runs.values():
         if run.row.epoch in event.epochs:
             step.refuse(event.request, Refusal.BUSY, because("epoch_in_use", run=run.id))

@@ -1,4 +1,4 @@
-"""How a gateway reads the outcomes of a submit: long polls, answered when there is more than it has."""
+"""Gateways read the outcomes of a submit by long polls, answered when there are more than they have."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .runs import held_s
 
 
 def results(state: State, event: events.Asked[gateway.ResultsRequest], step: Step) -> None:
-    """A gateway asks for outcomes: answered at once, or when there are more than it has."""
+    """A gateway polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     run = state.runs.get(message.run)
     if run is None:
@@ -43,19 +43,19 @@ def results(state: State, event: events.Asked[gateway.ResultsRequest], step: Ste
 
 
 def _released(state: State, target: str) -> int:
-    """Episodes of an open submit that its gateway may see."""
+    """Number of episodes of an open submit that its gateway may see."""
     group = state.groups[target]
     return group.done if 0 in group.digests else 0
 
 
 def answer_polls(state: State, group: JobGroup, step: Step) -> None:
-    """There is something new for those who wait for a submit's results."""
+    """Answer the polls that wait for a submit's new results."""
     for poll in state.polls.take_all(group.id):
         answer(state, poll, step)
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
-    """Answer a poll with what there is."""
+    """Answer a poll with the present results."""
     run = state.runs[poll.target.split("/")[0]]
     index = int(poll.target.split("/")[1][1:])
     row = run.submits[index]
@@ -88,5 +88,5 @@ def _page(
 
 
 def finished_effect(request: RequestId, run: str, step: Step) -> ReadFinished:
-    """Have the shell answer with the finished run."""
+    """Let the shell answer with the finished run."""
     return ReadFinished(request=request, run=run, stimulus_id=step.stimulus_id)

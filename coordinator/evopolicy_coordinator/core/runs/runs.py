@@ -1,8 +1,8 @@
-"""Runs: how they are created, what their gateways are told of them, what is kept of them when they are finished.
+"""Runs: their creation, the replies to their gateways, and what is kept of finished ones.
 
 Rules that this module owns:
 - One run per key, with its whole budget available.
-- Nothing that a gateway is answered with depends on hidden work.
+- No reply to a gateway depends on hidden results.
 - A run is durable together with the journal's entry that commits to it.
 """
 
@@ -28,7 +28,7 @@ from . import journal, waits
 
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:
-    """Make a run, once for each key."""
+    """Create a run, once for each key."""
     row = event.row
     known = state.run_keys.get(row.key)
     if known is not None:
@@ -58,7 +58,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
 
 
 def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
-    """Take a run into the core, with its whole budget available."""
+    """Add a run to the core, with its whole budget available."""
     env, tier = row.settings.env, row.settings.sandbox_tier
     family = state.families.join(env, (*row.validation, *row.heldout))
     closed = stored.phase != "open"
@@ -74,7 +74,7 @@ def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
 
 
 def forget(state: State, run: Run) -> None:
-    """A run is finished: of it only the last state that its gateway may ask for stays."""
+    """Remove a finished run; only the last state that its gateway may request is kept."""
     del state.runs[run.id]
     state.finished[run.id] = last_state(run.state)
     pins.drop_flow(state, run.flow)
@@ -94,11 +94,11 @@ def _fault(row: RunRow) -> Reason | None:
     return None
 
 
-# ---- what a gateway asks ----
+# ---- requests of gateways ----
 
 
 def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> None:
-    """Tell a gateway all that is fixed of its run; refused until some worker has offered the environment."""
+    """Send a gateway the fixed parameters of its run; refused until a worker has offered the environment."""
     run = live(state, event.request, event.message.run, step)
     if run is None:
         return
@@ -138,7 +138,7 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
 
 
 def state_requested(state: State, event: events.Asked[gateway.StateRequest], step: Step) -> None:
-    """Tell a gateway how its run stands, also after it is finished."""
+    """Send a gateway the state of its run, also after it is finished."""
     last = state.finished.get(event.message.run)
     if last is not None:
         step.reply(event.request, gateway.StateReply(state=last))
@@ -150,7 +150,7 @@ def state_requested(state: State, event: events.Asked[gateway.StateRequest], ste
 
 
 def last_state(row: RunStateRow) -> gateway.RunState:
-    """What the gateway of a finished run is told of it."""
+    """The state that the gateway of a finished run is sent."""
     return gateway.RunState(
         remaining_budget=row.remaining_budget,
         n_submits=row.n_submits,
@@ -166,7 +166,7 @@ def held_s(state: State, run: Run, now: float) -> float:
 
 
 def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Reason | None]:
-    """What the gateway of an unfinished run is told of it, and what its open submit waits for."""
+    """The state that the gateway of an unfinished run is sent, and the reason that its open submit waits for."""
     in_flight, waits_for = None, None
     if run.open is not None:
         group = state.groups[train_group(run.id, run.open)]
@@ -184,11 +184,11 @@ def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Rea
     return told, waits_for
 
 
-# ---- what those below have to tell ----
+# ---- news ----
 
 
 def pinned(state: State, news: FlowPinned, step: Step) -> None:
-    """Keep the class of workers that a run is played by."""
+    """Store the class of workers that a run is pinned to."""
     run, profile = state.runs[news.flow.id], news.profile
     step.change_run(
         run,
@@ -200,14 +200,14 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
 
 
 def retried(state: State, news: JobRetried, step: Step) -> None:
-    """A job is played again for our own failure; `run.json` tells how often."""
+    """Count an infrastructure retry; `run.json` has the total."""
     run = state.runs.get(news.job.group.run)
     if run is not None:
         step.change_run(run, infrastructure_retries=run.state.infrastructure_retries + 1)
 
 
 def differed(state: State, news: ResultsDiffered, step: Step) -> None:
-    """Two results of one episode differed; `run.json` tells how often."""
+    """Count two differing results of one episode; `run.json` has the total."""
     run = state.runs.get(news.group.run)
     if run is not None:
         step.change_run(run, nondeterministic_results=run.state.nondeterministic_results + 1)

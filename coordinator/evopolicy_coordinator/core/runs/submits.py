@@ -1,10 +1,12 @@
-"""A run's submits: taken or refused, played, ended and charged.
+"""A run's submits: accepted or refused, played, ended and charged.
 
 Rules that this module owns:
-- A submit is reserved, durable, then answered; one submit per key; one open submit per run; refused ones change nothing.
-- The episode at index 0 gates: until its outcome shows that the bundle yields a Policy no episode is released, and when it
-  shows the contrary that is the whole submit's verdict.
-- A submit's end settles its reservation, once, whatever the verdict (`end`). Only a cancelled run's open submit is refunded.
+- A submit is reserved, made durable, then answered; one submit per key; one open submit per run; a refused submit
+  changes nothing.
+- The episode at index 0 is a gate: no episode is released until its outcome shows that the bundle yields a Policy. If
+  the outcome shows that it does not, that is the whole submit's verdict.
+- A submit's end settles its reservation once, whatever the verdict (`end`). Only a cancelled run's open submit is
+  refunded.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from . import result_polls, templates
 
 
 def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> None:
-    """Take a submit, or refuse it for the first cause in the protocol's order; a known key is answered as before."""
+    """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
+    gets the earlier answer."""
     message = event.message
     run = live(state, event.request, message.run, step)
     if run is None:
@@ -64,7 +67,7 @@ def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> Non
 
 
 def _again(event: events.Asked[gateway.Submit], row: SubmitRow, step: Step) -> None:
-    """The answer to a key that is known: the same as the first time, if the request is."""
+    """Answer a known key as the first time if the request is the same; otherwise refuse it (KEY_CONFLICT)."""
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
         reason = because("key_used", key=message.key, submit=row.submit_index)
@@ -115,11 +118,11 @@ def _accept(state: State, run: Run, event: events.Asked[gateway.Submit], step: S
 
 
 def play(state: State, run: Run, row: SubmitRow, step: Step) -> None:
-    """Queue what is left of an open submit."""
+    """Queue the unfinished jobs of an open submit."""
     groups.open_group(state, templates.build("train", run, row, step.now, step.stimulus_id), step)
 
 
-# ---- how a submit goes on and ends ----
+# ---- progress and end of a submit ----
 
 
 def progressed(state: State, news: EpisodesDone, step: Step) -> None:
@@ -138,7 +141,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def limit_passed(state: State, name: str, step: Step) -> None:
-    """The operator's limit on a submit's wall time has passed, if the time that it was held does not count."""
+    """The deadline of the operator's limit on a submit's wall time; extended by the time for which it was held."""
     group = state.groups.get(name)
     if group is None:
         return
@@ -153,7 +156,7 @@ def limit_passed(state: State, name: str, step: Step) -> None:
 
 
 def _timed_out(state: State, group: JobGroup, step: Step) -> None:
-    """The operator's limit on a whole submit's wall time has passed."""
+    """End a submit that exceeded the operator's limit on its wall time."""
     run = state.runs[group.run]
     limit_s = run.row.settings.limits.submit_wall_s
     text = (

@@ -1,11 +1,11 @@
-"""One builder of job groups, and a table of what differs between their kinds (`KINDS`).
+"""One builder of job groups, and a table of the differences between their kinds (`KINDS`).
 
     kind        cases                    plays                record    video              priority
     train       those of the submit      its bundle           full      the run's          TRAIN
     validation  all of the split         the submit's bundle  actions   off                EARLY_VALIDATION, closed HELDOUT
     heldout     all of the split         the submit's bundle  actions   recorded_heldout   HELDOUT
     random      held-out                 random actions       actions   off                REFERENCE
-    evaluation  as asked for             as asked for         as asked  off                REFERENCE, hidden HELDOUT
+    evaluation  as requested             as requested         requested off                REFERENCE, hidden HELDOUT
     audit       the audited episode      its actions          as above  off                AUDIT, hidden HIDDEN_AUDIT
 
 Rule that this module owns: a group follows from stored rows alone, so it is the same after a restart.
@@ -52,7 +52,7 @@ HIDDEN_SPLITS = ("validation", "heldout")
 
 
 class _Parts(NamedTuple):
-    """What a kind of group has of its own."""
+    """The fields that differ between kinds of groups."""
 
     id: str
     submit_index: int
@@ -62,15 +62,15 @@ class _Parts(NamedTuple):
     env_meta: dict[str, Any]
     bundle: str | None = None
     split: str = ""
-    """What policy seeds name; the kind where it is empty."""
+    """Split in the policy seeds; the kind if it is empty."""
     keyed: bool = True
-    """Seeds are derived from the run's or evaluation's secret."""
+    """Whether seeds are derived from the run's or evaluation's secret."""
     case_ids: tuple[int, ...] | None = None
-    """None: as many as there are cases, in order."""
+    """None: 0 … number of cases − 1."""
     occurrences: tuple[int, ...] | None = None
     """None: each case for the first time."""
     modulo: int | None = None
-    """None: as many as there are cases."""
+    """None: the number of cases."""
     scope: PolicyScope = "episode"
     record: Record = "actions"
     video: VideoOption = "off"
@@ -84,7 +84,7 @@ class _Parts(NamedTuple):
 
 
 class _Common(NamedTuple):
-    """What all groups of a run or an evaluation have in common."""
+    """The fields that all groups of a run or an evaluation share."""
 
     env: str
     secret: bytes
@@ -95,7 +95,7 @@ class _Common(NamedTuple):
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
-    """What a submit's policies are told, in every split; the worker adds the spaces."""
+    """Metadata that a submit's policies receive, in every split; the worker adds the spaces."""
     return {
         "env": run.row.settings.env,
         "submit_index": row.submit_index,
@@ -105,7 +105,8 @@ def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
 
 
 def hidden_evaluation(row: EvaluationRow) -> bool:
-    """Whether an evaluation is hidden work: what a policy does, or did, on hidden cases. Random actions tell nothing."""
+    """Whether an evaluation is hidden work: a policy's present or recorded actions on hidden cases. Random
+    actions reveal nothing."""
     return row.split in HIDDEN_SPLITS and (row.bundle is not None or bool(row.replays))
 
 
@@ -167,7 +168,7 @@ def _random(run: Run, _row: None, _stimulus_id: str) -> _Parts:
 
 
 def _evaluation(evaluation: Evaluation, row: EvaluationRow, _stimulus_id: str) -> _Parts:
-    # What is played again stands where it stood in its run; anything else is a list of its own.
+    # A replayed list keeps its position in its run; any other is a list of its own.
     place = row.as_in or _alone(row)
     counts = occurrences(place.env_instances)
     return _Parts(
@@ -238,7 +239,7 @@ KINDS: Mapping[GroupKind, Callable[[Any, Any, str], _Parts]] = {
     "evaluation": _evaluation,
     "audit": _audit,
 }
-"""What each kind has of its own, from whose it is (a run or an evaluation) and the row that it plays."""
+"""Builds the fields of each kind, from their owner (a run or an evaluation) and the row to play."""
 
 
 # ---- the builder ----
@@ -251,7 +252,7 @@ def build(
     now: float,
     stimulus_id: str,
 ) -> JobGroup:
-    """The group of that kind for `row` (None for the random reference), with no jobs yet."""
+    """The group of that kind for `row` (None for the random reference), without jobs yet."""
     parts, common = KINDS[kind](owner, row, stimulus_id), _common(owner)
     n = len(parts.cases)
     modulo = n if parts.modulo is None else parts.modulo

@@ -1,4 +1,4 @@
-"""What an open group waits for while nothing of it is leased."""
+"""The reason why an open group waits while none of its jobs is leased."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from evopolicy_coordinator.core.state import State
 
 
 def waits_for(state: State, group: JobGroup) -> Reason | None:
-    """What an open group waits for when nothing of it is leased; else None."""
+    """Returns the reason why an open group waits; None when one of its jobs is leased."""
     if group.n_leased or group.closed or not group.jobs:
         return None
     flow = group.flow
@@ -29,7 +29,7 @@ def waits_for(state: State, group: JobGroup) -> Reason | None:
 
 
 def waits_for_workers(state: State, flow: Flow) -> Reason | None:
-    """The workers that a run or an evaluation waits for; None when some are at work."""
+    """Returns the workers that a run or an evaluation waits for; None when its lane has active ones."""
     if flow.lane is not None and flow.lane.slots():
         return None
     able = [worker for worker in state.workers.values() if worker.profile.offers(flow)]

@@ -1,2 +1,2 @@
-"""Structures with invariants of their own that know nothing of runs, workers and jobs: deadlines, traces, ledgers,
-polls."""
+"""Structures with invariants of their own that know nothing of runs, workers and jobs: deadlines,
+traces, ledgers, polls."""

@@ -35,8 +35,8 @@ class Ledger:
         return self.granted - self.available
 
     def reserve(self, submit_index: int, n: int) -> None:
-        """Set `n` episodes aside for a submit. Raises InvariantError when `n` is not 1 … `available`, or the submit has
-        a reservation."""
+        """Set `n` episodes aside for a submit. Raises InvariantError when `n` is not 1 … `available`, or the
+        submit has a reservation."""
         if n < 1 or n > self.available or submit_index in self._reservations:
             raise InvariantError(f"cannot reserve {n} for submit {submit_index}: {self}")
         self.available -= n

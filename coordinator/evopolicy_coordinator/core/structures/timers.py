@@ -30,6 +30,7 @@ class Timers:
         self._count += 1
         self._armed[key] = (at, self._count)
         heapq.heappush(self._heap, (at, self._count, key))
+        # Void entries are dropped once they outnumber the armed ones.
         if len(self._heap) > 2 * len(self._armed) + 64:
             self._heap = [(when, count, name) for name, (when, count) in self._armed.items()]
             heapq.heapify(self._heap)

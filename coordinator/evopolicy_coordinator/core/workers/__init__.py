@@ -1,1 +1,1 @@
-"""What workers ask and report: membership, polls for leases and who gets them, result reports."""
+"""Requests of workers: membership, polls and the leases granted to them, result reports."""

@@ -1,13 +1,14 @@
-"""What workers say, and what operators say of them: who is there, who may have work, and under which class.
+"""Membership: workers' requests and operators' commands decide who is connected, who gets work, and under which class.
 
 Rules that this module owns:
-- A request under a session that is not the worker's present one is refused, upon which the worker registers again.
-- A heartbeat's answer may be held back; it comes at once when there is a lease to stop.
-- A liveliness token that went is a hint: it brings the worker's deadline forward, nothing else.
-- A name is its machine's as long as the worker is there.
-- Whatever a quarantined worker asks is refused with the reason; what it holds is played by others, and what it reports
-  from then on is not taken. An operator may take it back.
-- Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
+- A request under a session that is not the worker's current one is refused; the worker then registers again.
+- The reply to a heartbeat may be delayed; it is sent at once when there is a lease to stop.
+- A lost liveliness token is a hint: it only brings the worker's deadline forward.
+- A worker name stays bound to its machine while the worker is connected.
+- Every request of a quarantined worker is refused with the reason; other workers play its jobs, and its later reports
+  are not accepted. An operator may reinstate it.
+- Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in
+  the run.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
         return
     old = state.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
-        # Else one machine could play under another's name, and have it blamed.
+        # Otherwise one machine could play under another's name, and the other would be blamed.
         step.refuse(event.request, Refusal.NAME_TAKEN, because("name_taken", worker=message.worker))
         return
     if old is not None:
@@ -75,7 +76,8 @@ def _refused_as_forger(state: State, name: str, machine: str, request: events.Re
 def worker_of(
     state: State, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
 ) -> Worker | None:
-    """Who speaks; None, and the request is refused, when its session is unknown or it is quarantined."""
+    """Returns the worker that sent the request; None, and the request is refused, when its session is unknown
+    or it is quarantined."""
     message = event.message
     known = state.workers.get(message.worker)
     if _refused_as_forger(state, message.worker, known.machine if known else "", event.request, step):
@@ -92,14 +94,14 @@ def worker_of(
 
 
 def lease_requested(state: State, event: events.Asked[wire.LeaseRequest], step: Step) -> None:
-    """A worker asks for work."""
+    """A worker polls for leases."""
     worker = worker_of(state, event, step)
     if worker is not None:
         scheduler.poll(state, worker, event, step)
 
 
 def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> None:
-    """Renew the leases that a worker lists, and tell it which to stop."""
+    """Renew the leases that a worker names, and tell it which to stop."""
     message = event.message
     worker = worker_of(state, event, step)
     if worker is None:
@@ -125,7 +127,7 @@ def results_reported(state: State, event: events.Asked[wire.ReportResults], step
 
 
 def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
-    """A hint only: the worker's leases are looked at sooner than they would be."""
+    """Check the worker's leases sooner than otherwise; a hint only."""
     worker = state.workers.get(event.worker)
     if worker is not None and worker.state != "lost" and worker.doubted_at is None:
         worker.doubted_at = step.now
@@ -133,7 +135,7 @@ def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
 
 
 def worker_state(state: State, event: events.Asked[operator.SetWorker], step: Step) -> None:
-    """Drain or pause a worker, or take it back; durable, also for one that is not connected."""
+    """Drain, pause or reactivate a worker; durable, also for one that is not connected."""
     message = event.message
     if message.state != "active" and message.worker in state.quarantined:
         reason = because("quarantined", worker=message.worker, why=state.quarantined[message.worker])
@@ -155,11 +157,11 @@ def worker_state(state: State, event: events.Asked[operator.SetWorker], step: St
 
 
 def repinned(state: State, event: events.Asked[operator.RepinRun], step: Step) -> None:
-    """Pin an unfinished run to another class of workers, as an operator says."""
+    """Pin an unfinished run to another class of workers on an operator's command."""
     message = event.message
     run = state.runs.get(message.run)
     able = [each for each in state.profiles.values() if run is not None and each.offers(run.flow)]
-    # By the environment's class, and by the whole worker's, as the list of workers shows it.
+    # Accepts the environment's class, and the whole worker's class, which the list of workers shows.
     offered = {_class_of_worker(state, each): each for each in able}
     offered |= {each.classes[run.flow.env]: each for each in able if run is not None}
     if run is None:
@@ -189,7 +191,7 @@ def _class_of_worker(state: State, profile: Profile) -> str:
 
 
 def forget(state: State, name: str, _step: Step) -> None:
-    """A worker was lost long ago."""
+    """The deadline of a worker that was lost long ago."""
     worker = state.workers.get(name)
     if worker is not None and worker.state == "lost":
         fleet.forget(state, worker)

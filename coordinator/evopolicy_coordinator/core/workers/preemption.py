@@ -1,8 +1,8 @@
 """Stops hidden jobs for train jobs that wait.
 
-Rule that this module owns: a waiting train job stops hidden jobs, a suspect those of the worker that is emptied for it:
-audits and early validation as often as it takes, others a bounded number of times. The hidden job goes back into the queue;
-its worker lets go of it and polls again.
+Rule that this module owns: a waiting train job stops hidden jobs; a suspect stops those of the worker that is emptied
+for it. Audits and early validation are stopped without limit, others a bounded number of times. The hidden job goes
+back into the queue; its worker releases it and polls again.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 VICTIMS_MAX = 256
-"""Hidden leases looked at for a lane in one step."""
+"""Most hidden leases checked for a lane in one step."""
 
 FAMILIES_MAX = 8
-"""Families of waiting train jobs that hidden jobs are stopped for in one step."""
+"""Most families of waiting train jobs that hidden jobs are stopped for in one step."""
 
 
 def preempt(state: State, lane: Lane, step: Step) -> None:
     """Stop hidden jobs for the train jobs that wait in the lane.
 
-    The last that were leased go first: they have come least far, and of a batch they wait behind the others.
+    The last leased are stopped first: they have progressed least, and in a batch they wait behind the others.
     """
     if any(any(profile.hidden) for profile in lane.profiles):
-        # What is spared now may be stopped later with nothing else happening: a worker is avoided no longer, or one
-        # that was to let go of a hidden job is lost.
+        # Hidden jobs that are spared now may have to be stopped later without any further event: a worker is no longer
+        # avoided, or one that was to release a hidden job is lost.
         state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
     wanted = lane.n_ready[TRAIN] - lane.stopping
     avoided = queue.avoided(lane, TRAIN, step.now)
@@ -63,7 +63,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                     continue
                 stop_hidden(state, lease, f"preempted for {lane.key[0]}", step)
                 if worker.n_live < worker.slots:
-                    # Only now a slot comes free by it: what was stopped before had still to wait for one.
+                    # Only this stop frees a slot: the leases stopped before it were still waiting for one.
                     wanted -= 1
                     lane.stopping += 1
                     lease.stopped_for = lane
@@ -71,7 +71,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
 
 def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, step: Step) -> int:
     """Stop the related hidden jobs that keep a family's train jobs from kernels, on as many kernels as have slots for
-    them: one that stays bars its whole kernel. Gives the slots that come free."""
+    them: a single hidden job bars its whole kernel. Returns the number of freed slots."""
     slots = 0
     wanted = lane.waiting[TRAIN].get(family, 0)
     for kernel, playing in conflicts.to_clear(state, family):
@@ -81,7 +81,7 @@ def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, 
         room = sum(worker.slots for worker in there if worker.profile in lane.profiles)
         if not room:
             continue
-        # What may be stopped no more plays to its end; nothing hidden begins there meanwhile.
+        # A job that may not be stopped again plays to its end; no hidden job starts there in the meantime.
         lasting = any(not may_stop(state, lease.job) for lease in playing)
         for lease in playing:
             if not lasting or lease.job.priority != HELDOUT:
@@ -98,6 +98,6 @@ def may_stop(state: State, job: JobState) -> bool:
 
 
 def stop_hidden(state: State, lease: Lease, why: str, step: Step) -> None:
-    """Stop a hidden job for the sake of train jobs; it goes back into the queue."""
+    """Stop a hidden job for train jobs; it goes back into the queue."""
     lease.job.preemptions += 1
     leases.put_off(state, lease, why, step)

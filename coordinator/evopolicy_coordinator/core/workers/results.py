@@ -1,17 +1,18 @@
-"""Results that workers report: committed once, whatever is sent twice, late, or by whom it should not be.
+"""Results that workers report: committed once, even if they are sent twice, late, or by the wrong worker.
 
 Rules that this module owns:
-- A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A verdict about a limit
-  counts only from the attempt that is live, whose worker was never silent for long, and during which this process never
-  stood still: else a frozen worker would blame the policy for it. Such an attempt is played again.
+- A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A limit verdict counts
+  only from the live attempt, or from a stopped one that its worker has not released yet, and only if its worker was
+  never silent for long and this process was never blocked during it; otherwise a frozen worker would blame the policy.
+  An attempt whose verdict does not count is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
-- What the policy of an attempt that was given back had returned stands: no attempt after it throws the policy's dice again.
-  A worker that was silent for long is not believed that a limit ended it.
-- An attempt that another worker was given, or that was never given, is ignored and logged, also after a restart: a lease's
-  name proves its grant. So is one of a worker that the job's group bars.
-- An outcome that is not what was asked for (wrong episodes, a return that is not finite) is the worker's failure.
-- What a policy can do to its slot is an outcome, and what it cannot is played again without a limit: `failed`, or `slot_died` in
-  the words of workers of earlier versions.
+- The actions that the policy of a given-back attempt had returned stand: no later attempt gives the policy a second
+  try. If a worker that was silent for long reports that a limit ended the attempt, its actions do not stand.
+- An attempt that was granted to another worker, or never granted, is ignored and logged, also after a restart: a
+  lease's name proves its grant. So is an attempt of a worker that the job's group excludes.
+- An outcome that does not fit the job (wrong episodes, a number that is not finite) is the worker's failure.
+- A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
+  `failed`, or `slot_died` from workers of earlier versions.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from evopolicy_coordinator.core.step import EpisodesDone, ResultsDiffered, Resul
 
 
 def take(state: State, news: ResultsPersisted, step: Step) -> None:
-    """Take in one result of a result report."""
+    """Process one result of a result report."""
     worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
@@ -57,7 +58,7 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
 
 
 def _goes_on(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
-    """What the policy of an unfinished attempt has returned stands for the next one, unless that plays already."""
+    """Keep the actions of an unfinished attempt's policy for the next attempt, unless that plays already."""
     told = result.begun is not None and not (silent and result.limit_verdict)
     if told and job.lease in (None, lease) and result.attempt > job.begun_attempt:
         job.begun, job.begun_attempt = result.begun, result.attempt
@@ -68,7 +69,7 @@ def _goes_on(job: JobState, lease: Lease | None, result: JobResult, step: Step, 
 def _closed(
     state: State, worker: Worker, lease: Lease | None, result: JobResult, step: Step, *, granted: bool
 ) -> None:
-    """A result of a job that is done or was cancelled, or of a lease that this worker was not given."""
+    """Process a result of a job that is done or was cancelled, or of a lease that this worker was not granted."""
     if lease is not None:
         live = lease.live
         leases.release(state, worker, lease, step, f"reported late: {result.kind}", sure=True)
@@ -100,7 +101,7 @@ def _closed(
 
 
 def _silent(state: State, lease: Lease, now: float) -> bool:
-    """Whether the holder of a lease may have stood still during it."""
+    """Whether the holder of a lease may have been frozen during it."""
     if lease.job.failures >= state.settings.doubts_max:
         return False
     unheard_s = now - lease.renewed
@@ -155,7 +156,7 @@ def _done(
 
 
 def commit(state: State, worker: Worker, job: JobState, result: JobResult, step: Step) -> None:
-    """Make the outcomes durable and the job done."""
+    """Make the outcomes durable, and close the job."""
     group = job.group
     groups.close_job(state, job, step, "done by another attempt")
     if job.begun is not None:

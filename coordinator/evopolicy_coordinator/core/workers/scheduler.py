@@ -1,12 +1,15 @@
-"""Brings waiting jobs and waiting workers together.
+"""Matches waiting jobs with waiting workers.
 
 Rules that this module owns:
-- Work is pulled: a worker's poll says how many leases it can take and waits until there is some. Free slots are filled
-  first. Ahead of them a worker gets only short episodes, worth about `batch_s` a slot, even more of them than it asked
-  for, and never so many that another idle worker goes without.
-- A poll whose time is over gets no lease: while the loop stood still its worker has given it up, and would never see it.
-- New work goes first to a waiting worker that has its bundle, then its environment, warm; else to the longest waiting.
-- At the end of each step `dispatch` hands out what the step made available; nothing else calls the scheduler but a poll.
+- Work is pulled: a worker's poll states how many leases it can take and waits until there are some. Free slots are
+  filled first. In advance a worker gets only short episodes, worth about `batch_s` per slot, even more of them than it
+  requested, but never so many that another idle worker gets none.
+- A poll that has timed out gets no lease: while the loop was blocked, its worker has given it up and would never see
+  the reply.
+- New work goes first to a waiting worker that has its bundle warm, then to one with its environment warm, then to the
+  longest waiting.
+- At the end of each step `dispatch` leases the work that the step made available; apart from it only a poll and the
+  end of a bench time call the scheduler.
 """
 
 from __future__ import annotations
@@ -25,26 +28,26 @@ from evopolicy_coordinator.core.step import Step
 from . import preemption, suspects
 
 PREFETCH_BELOW_S = 1.0
-"""Longer episodes are leased to free slots only: fetching them takes no time beside playing them."""
+"""Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""
 
 TRIES_MAX = 4
-"""Parked workers that are tried for a lane in one step before the rest waits for the next."""
+"""Most parked workers tried for a lane in one step; the rest waits for the next step."""
 
 LOOKS_MAX = 64
-"""Parked workers whose kernels may be barred to a lane that are looked past in one step."""
+"""Most parked workers on kernels barred to a lane that are skipped in one step."""
 
 LEASES_MAX = 256
-"""Most leases in one answer: it has to fit into a message."""
+"""Most leases in one reply: it must fit into a message."""
 
 EPISODES_MAX = 2048
-"""Of jobs with many episodes fewer are leased at once, but at least one."""
+"""Most episodes leased at once, but always at least one job."""
 
 HELD_MAX = 16_384
 """Most leases that a worker may hold: its heartbeats name them all."""
 
 
 def poll(state: State, worker: Worker, event: Asked[wire.LeaseRequest], step: Step) -> None:
-    """A worker asks for leases; an older poll of it is answered with none."""
+    """A worker polls for leases; an older poll of it is answered with none."""
     message = event.message
     fleet.drop_poll(state, worker, step)
     if message.n < 1 or event.waited_s > message.wait_s + state.settings.late_s:
@@ -62,7 +65,7 @@ def poll(state: State, worker: Worker, event: Asked[wire.LeaseRequest], step: St
 
 
 def _park(state: State, worker: Worker, step: Step) -> None:
-    """Let a worker's poll wait where new work finds it, if it has a slot for it. Else its next free slot is what
+    """Park a worker's poll for new work, if it has a free slot. Otherwise its next free slot
     brings the poll up again."""
     if worker.n_live >= worker.slots or worker.reserved is not None:
         return
@@ -74,7 +77,7 @@ def _park(state: State, worker: Worker, step: Step) -> None:
 
 
 def _serve(state: State, worker: Worker, step: Step) -> bool:
-    """Answer a worker's poll if there is anything for it."""
+    """Answer a worker's poll if there are leases for it; returns whether it was answered."""
     found = _fill(state, worker, step)
     if found:
         fleet.answer_poll(state, worker, tuple(found), step)
@@ -105,10 +108,10 @@ def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
 
 
 def _limit(state: State, worker: Worker, n: int, free: int) -> int:
-    """How many leases a poll for `n` gets at most, `free` of the worker's slots having nothing to play.
+    """Returns how many leases a poll for `n` gets at most; `free` of the worker's slots are idle.
 
-    More than the free slots can take only of short episodes, not ahead of what has less right to the slot, and no
-    more than the worker's part of what waits.
+    Leases beyond the free slots are of short episodes only, only while the worker holds no lease of lower priority, and
+    no more than the worker's share of the waiting jobs.
     """
     settings, found = state.settings, queue.leading(state, worker)
     if found is None or found[0].lane is None:
@@ -129,7 +132,7 @@ def _limit(state: State, worker: Worker, n: int, free: int) -> int:
 
 
 def dispatch(state: State, step: Step) -> None:
-    """Hand out what this step made available."""
+    """Lease the work that this step made available."""
     if state.grantable:
         permits.settle(state, step)
     while state.freed:
@@ -148,7 +151,7 @@ def dispatch(state: State, step: Step) -> None:
         if lane.n_ready[TRAIN]:
             preemption.preempt(state, lane, step)
     while step.dirty:
-        # What was stopped just now waits again: another worker may have a slot for it.
+        # Jobs that were stopped just now wait again: another worker may have a slot for them.
         lane = next(iter(step.dirty))
         del step.dirty[lane]
         _feed(state, lane, step)
@@ -159,7 +162,7 @@ def dispatch(state: State, step: Step) -> None:
 
 
 def _place_suspects(state: State, step: Step) -> None:
-    """Have hidden jobs make room for suspects that wait, and see whether an idle worker takes one."""
+    """Let hidden jobs make room for waiting suspects, and offer the suspects to idle workers."""
     for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
         lane = job.group.flow.lane
         if lane is not None and job.queued:
@@ -170,7 +173,7 @@ def _place_suspects(state: State, step: Step) -> None:
 
 
 def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
-    """Tell a worker now what to stop, if any answer of ours is due to it; else its next heartbeat brings it."""
+    """Tell a worker which leases to stop if a heartbeat or poll of it waits; otherwise its next heartbeat does."""
     worker = state.workers.get(name)
     if worker is None:
         return
@@ -181,7 +184,7 @@ def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
 
 
 def reconsider(state: State, worker: Worker, step: Step) -> None:
-    """A worker with a waiting poll may have become available."""
+    """Serve a waiting poll of a worker that may have become available."""
     if worker.poll is None or not fleet.available(worker, step.now):
         return
     if not _serve(state, worker, step):
@@ -189,14 +192,14 @@ def reconsider(state: State, worker: Worker, step: Step) -> None:
 
 
 def bench_ended(state: State, name: str, step: Step) -> None:
-    """A worker has sat out for long enough."""
+    """A worker's bench time is over."""
     worker = state.workers.get(name)
     if worker is not None:
         reconsider(state, worker, step)
 
 
 def _feed(state: State, lane: Lane, step: Step) -> None:
-    """Answer parked polls while the lane has something for them."""
+    """Answer parked polls while the lane has jobs for them."""
     tries = 0
     while any(lane.n_ready) and tries < TRIES_MAX:
         worker = _parked(state, lane)
@@ -225,7 +228,7 @@ def _to_the_back(state: State, worker: Worker, step: Step) -> None:
 
 
 def _parked(state: State, lane: Lane) -> Worker | None:
-    """The waiting worker that should get what goes next in the lane."""
+    """The waiting worker that should get the lane's next job; None for none."""
     following = queue.next_bundle(lane)
     if following is None:
         return None

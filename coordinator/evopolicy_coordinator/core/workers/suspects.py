@@ -1,7 +1,7 @@
-"""Suspects: jobs that may take workers down run with nothing beside them.
+"""Suspects: jobs that may crash workers run with no other job beside them.
 
-Rule that this module owns: a suspect runs alone, on an idle worker, or on one that is emptied for it; nothing else goes there
-meanwhile.
+Rule that this module owns: a suspect runs alone, on an idle worker or on one that is emptied for it; that worker gets
+no other job in the meantime.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from evopolicy_coordinator.core.step import Step
 from . import preemption
 
 SUSPECTS_MAX = 16
-"""Suspects looked at in one step."""
+"""Most suspects checked in one step."""
 
 
 def next_of(state: State, worker: Worker, step: Step) -> wire.Lease | None:
-    """The suspect that an idle worker is to play; a busy one may be reserved for one instead."""
+    """Lease a suspect to an idle worker; a busy worker may be reserved for one instead (returns None)."""
     idle = not worker.leases
     if worker.reserved is not None:
         job = worker.reserved
@@ -56,7 +56,7 @@ def _barred(state: State, job: JobState, worker: Worker) -> bool:
 
 
 def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
-    """Begin to empty a busy worker for a suspect; a train job does not wait for what is hidden there to end."""
+    """Start to empty a busy worker for a suspect; a train job stops the hidden jobs there rather than wait for them."""
     job.reserved = worker.name
     worker.reserved = job
     state.trace.add(step.now, step.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
