@@ -38,10 +38,10 @@ ENVS = tuple(f"toy/env{index}" for index in range(16))
 EPISODES = 128
 """In a submit."""
 SUBMITS = 4
-"""In a run; then it is validated, scored, and another begins."""
+"""In a run; then it is validated and scored, and another run starts."""
 SLOTS = 2
 EPISODE_S = 2.0
-"""Simulated: long enough that leases go one by one, the dearest case."""
+"""Simulated; long enough that leases are granted one by one, the most expensive case."""
 BEAT_S = 2.0
 
 
@@ -54,7 +54,7 @@ class Row:
     cpu_us_per_job: float
     events_per_job: float
     longest_ms: float
-    """Longest that one event took."""
+    """Longest processing time of one event."""
     kib_early: float
     """Memory after two fifths of the second pass."""
     kib_late: float
@@ -62,7 +62,7 @@ class Row:
 
 
 class Load:
-    """A core under load: workers that poll, beat and report, gateways that submit again as soon as they may."""
+    """A core under load: workers poll, send heartbeats and report, and gateways submit again as soon as they may."""
 
     def __init__(self, workers: int, jobs: int, *, memory: bool) -> None:
         self.now = 1000.0
@@ -82,7 +82,7 @@ class Load:
         self._runs = max(2, min(2 * workers * SLOTS // EPISODES + 16, jobs // EPISODES))
         self._created = 0
         self._submitted: dict[str, int] = {}
-        """Submits so far of each open run."""
+        """Number of submits so far of each open run."""
         self._seq = 0
 
     def tell(self, event: Any) -> None:
@@ -106,7 +106,7 @@ class Load:
         self._requests += 1
         return self._requests
 
-    # ---- who does what ----
+    # ---- clients ----
 
     def start(self) -> None:
         descriptions = tuple(
@@ -139,7 +139,7 @@ class Load:
     def _create(self) -> None:
         self._created += 1
         run = f"run-{self._created}"
-        # The first runs are staggered, so that at any time as many are trained as are scored.
+        # The first runs are staggered, so that at any time about as many runs train as are scored.
         self._submitted[run] = self._created % SUBMITS if self._created <= self._runs else 0
         self.tell(
             asked(
@@ -242,14 +242,15 @@ class Load:
             self._create()
 
     def _go_on(self, run: str) -> None:
-        """A submit is over: the next, or the run's end; when it is scored, a new run begins."""
+        """A submit has ended: send the next one, or close the run; when the run is scored, a new one starts."""
         if self._submitted[run] < SUBMITS:
             self._submit(run)
         else:
             self.tell(asked(gateway.CloseRun, request=self.request(), run=run, reason="budget_spent"))
 
     def run(self) -> None:
-        """Until so many jobs are done, train and hidden; workers beat in turn, each every `BEAT_S` simulated seconds."""
+        """Run until `jobs` jobs are done, train and hidden; each worker sends a heartbeat every `BEAT_S`
+        simulated seconds, in turn."""
         workers = len(self._names)
         playing: deque[tuple[float, int, wire.Lease]] = deque()
         next_beat, beating = self.now, 0
@@ -296,7 +297,7 @@ class Load:
 
 
 def measure(workers: int, jobs: int) -> Row:
-    """One line: CPU in one pass, memory in another, for watching memory is slow."""
+    """One row: CPU time in one pass, memory in another, since tracing memory is slow."""
     load = Load(workers, jobs, memory=False)
     load.start()
     gc.collect()

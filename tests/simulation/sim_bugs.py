@@ -1,6 +1,6 @@
-"""Bugs to plant in the production core, one at a time: each is a change of a few words in one function's source.
+"""Bugs to plant in the production core, one at a time: each changes a few words in one function's source.
 
-The simulation is worth what it catches: a test plants each and sees that some seed fails.
+A test plants each bug and requires that some seed fails; this shows that the simulation detects errors.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Bug:
 
 @contextmanager
 def planted(bug: Bug) -> Iterator[None]:
-    """The bug is there while this lasts."""
+    """Context manager: the bug is in the core while the context is open."""
     function = getattr(bug.owner, bug.name)
     source = textwrap.dedent(inspect.getsource(function))
     assert source.count(bug.old) >= 1, f"{bug.title}: {bug.old!r} is not in {bug.name}"

@@ -1,7 +1,7 @@
-"""What must never happen, and what must have happened in the end; apart from how scenarios are made.
+"""Checks of safety and of final results, separate from the generation of scenarios.
 
-Everything here is judged from outside: rows as they are committed, requests and their answers, what workers play; and, after
-every few steps, the core's own invariants.
+The checks observe from outside: rows as they are committed, requests and their replies, the jobs that workers play;
+and, every few steps, the core's own invariants.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
     from sim_scenario import Simulation
 
 QUIET_S = 600.0
-"""Longest without a commit, once there are no more faults, that slow workers and long episodes can account for."""
+"""Longest time without a commit, after the last fault, that slow workers and long episodes can explain."""
 VALIDATE_EVERY = 7
-"""Steps between looks at the core's invariants, which are costly."""
+"""Steps between checks of the core's invariants, which are expensive."""
 HEARD_S = 4.0
-"""A worker that was heard at least so often was never taken for lost."""
+"""A worker whose contacts are at most this far apart is never considered lost."""
 PREEMPT_S = 19.0
-"""A train job may wait so long while hidden jobs run in its lane: a worker that was told to stop and is cut off counts as
-about to stop until its lease would have expired."""
+"""Longest time that a train job may wait while hidden jobs run in its lane: a partitioned worker that was told to stop
+counts as about to stop until its lease would have expired."""
 
 
 class ViolationError(AssertionError):
-    """Something that must not happen did."""
+    """A checked property does not hold."""
 
 
 def want(holds: bool, what: str, *about: Any) -> None:
@@ -55,7 +55,7 @@ def want(holds: bool, what: str, *about: Any) -> None:
 
 
 class Checkers:
-    """Watches one simulation."""
+    """Observes one simulation."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
@@ -64,14 +64,14 @@ class Checkers:
         self._expected: dict[str, ExpectedRun] = {plan.name: expect(plan) for plan in simulation.plans}
         self._granted: dict[str, tuple[str, int]] = {}
         self._attempts: dict[tuple[str, int], tuple[str, int]] = {}
-        """Lease to worker and incarnation it was granted in."""
+        """Job and attempt to the worker and incarnation of the grant."""
         self._attempts: dict[str, int] = {}
         """Job to its highest attempt."""
         self._handed_in: set[str] = set()
         self._granted_at: dict[str, float] = {}
-        """Leases to when they were told."""
+        """Lease to the time when its grant was sent."""
         self._heard: dict[str, tuple[float, float]] = {}
-        """Workers to when they were last heard, and since when without a long silence."""
+        """Worker to the time of its last contact, and the start of its present time without a long silence."""
         self._steps = 0
         self._moved_at = 0.0
         self._core: Core | None = None
@@ -79,7 +79,7 @@ class Checkers:
         self.drained_at: dict[str, float] = {}
         self.retries = 0
         self.unreasoned = 0
-        """Retries that no fault accounts for, in scenarios whose faults must cost none."""
+        """Retries without a fault that explains them, in scenarios whose faults must cause none."""
         self.finished_runs: set[str] = set()
         self.named: set[str] = set()
         """Workers that were quarantined."""
@@ -87,7 +87,7 @@ class Checkers:
     # ---- rows ----
 
     def committing(self, rows: tuple[Row, ...]) -> None:
-        """A transaction is about to be written: may it?"""
+        """Check a transaction that is about to be written."""
         self._moved_at = self._simulation.world.now
         arrived: Counter[str] = Counter()
         for row in rows:
@@ -110,7 +110,7 @@ class Checkers:
                 want(pinned, "a run keeps its fingerprint class", old, row)
 
     def _audit(self, row: AuditRow) -> None:
-        """All players here are honest, and all auditors but one."""
+        """All players are honest, and all auditors but one."""
         slandered = self._simulation.slanderer in row.replayed_by
         want(slandered or (row.state != "disputed" and not row.difference), "honest workers agree", row)
         want(not row.forger, "no honest player is called a forger", row)
@@ -182,7 +182,7 @@ class Checkers:
     # ---- requests and answers ----
 
     def asking(self, event: events.Event) -> None:
-        """A request reached the core."""
+        """Note a request that reached the core."""
         message = event.message if isinstance(event, events.Asked) else None
         if isinstance(message, wire.Heartbeat | wire.Register):
             now = self._simulation.world.now
@@ -192,7 +192,7 @@ class Checkers:
             self._handed_in.update(result.lease_id for result in message.results)
 
     def answering(self, request: Message, message: Any) -> None:
-        """An answer is about to be sent: is what it tells durable, and may it be told?"""
+        """Check a reply that is about to be sent: its content is durable and may be reported."""
         disk = self._disk
         if isinstance(message, gateway.SubmitAccepted) and isinstance(request, gateway.Submit):
             row = disk.submits.get((request.run, message.submit_index))
@@ -228,7 +228,7 @@ class Checkers:
                 self._leased(request.worker, lease)
 
     def _taken(self, result: wire.JobResult) -> None:
-        """A result was acknowledged, so the worker forgets it."""
+        """Check an acknowledged result: the worker now drops it."""
         group = result.job_id.rpartition("/")[0]
         if "/audit-" in group:
             return
@@ -279,7 +279,8 @@ class Checkers:
         )
 
     def _thrown_once(self, lease: wire.Lease) -> None:
-        """A hidden episode goes on from what its policy had returned, unless its worker cannot have told."""
+        """A hidden episode resumes from the actions that its policy had returned, unless its worker
+        cannot have reported them."""
         job, now = lease.job, self._simulation.world.now
         group, _, first = job.job_id.rpartition("/")
         row = self._disk.begun.get((group, int(first)))
@@ -302,7 +303,7 @@ class Checkers:
                 )
 
     def refused(self, message: Any) -> None:
-        """The answer to a submit that must be refused."""
+        """Check the reply to a submit that must be refused."""
         want(isinstance(message, wire.Refused), "a wrong submit is refused", message)
 
     def submit_refused(self, plan: PlannedRun, position: int, message: wire.Refused) -> None:
@@ -342,7 +343,7 @@ class Checkers:
             want(not rows, "nothing is shown of a bundle without a Policy", indexes)
 
     def finished(self, plan: PlannedRun, result: operator.RunFinished) -> None:
-        """An operator has got a run's result."""
+        """An operator has received a run's result."""
         self.finished_runs.add(plan.name)
         if plan.cancel_at is not None and result.status == "cancelled":
             return
@@ -366,7 +367,7 @@ class Checkers:
         want(got == wanted, "a run comes to what it does without faults", plan.name, got, wanted)
 
     def _audited(self, plan: PlannedRun, result: operator.RunFinished) -> None:
-        """Of what was drawn each episode was confirmed, or it is told why it was not."""
+        """Each drawn episode was confirmed, or the record gives the reason why not."""
         share, audit = self._simulation.audit_share, result.audit
         want((audit is None) == (share == 0.0), "audits are told where there are any", plan.name, audit)
         if audit is None:
@@ -408,7 +409,7 @@ class Checkers:
             self._drained(core)
 
     def _preempted(self, core: Core) -> None:
-        """No early validation goes on for long while train jobs wait in its lane."""
+        """Early validation does not run for long while train jobs wait in its lane."""
         now = self._simulation.world.now
         for lane in core.state.lanes.values():
             name = str(lane.key)
@@ -436,7 +437,7 @@ class Checkers:
             self.unreasoned += 1
 
     def playing(self, worker: str, lease: wire.Lease) -> None:
-        """A worker begins to play what it was leased."""
+        """A worker starts to play a lease."""
         granted = self._granted.get(lease.lease_id)
         want(
             granted is not None and granted[0] == worker,
@@ -448,7 +449,7 @@ class Checkers:
     # ---- the end ----
 
     def ended(self, core: Core | None) -> None:
-        """All runs are over: nothing may be left of them in memory, and nothing was retried without a reason."""
+        """All runs are over: none of their state is left in memory, and every retry had a reason."""
         want(core is not None, "the coordinator is there in the end")
         assert core is not None
         core.validate()

@@ -1,4 +1,4 @@
-"""Those who ask for runs: an operator who creates them and waits, a gateway that plays its plan and may die on the way."""
+"""Clients: an operator who creates runs and waits, and a gateway that plays its plan and may crash on the way."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class SimOperator(Asker):
-    """Creates one run, waits until it is finished, perhaps cancels it."""
+    """Creates one run, waits until it is finished, and may cancel it."""
 
     def __init__(self, simulation: Simulation, plan: PlannedRun, start_s: float) -> None:
         super().__init__(simulation, f"operator-{plan.name}")
@@ -77,7 +77,7 @@ class SimOperator(Asker):
 
     def _cancel(self) -> None:
         def cancelled(message: Any) -> None:
-            # The command that cancels ends the agent too, within what it is given for that.
+            # The command that cancels also ends the agent, within its time limit.
             agents = self.simulation.truth
             self.world.after(self.world.chance.random() * 20.0, agents.agent_ends, self.plan)
 
@@ -85,13 +85,14 @@ class SimOperator(Asker):
 
 
 class SimGateway(Asker):
-    """Plays a run's plan, submit after submit. What it wrote down survives its death: keys, and what it has seen finished."""
+    """Plays a run's plan, submit after submit. Its durable state survives a crash: keys, and the submits
+    it has seen finished."""
 
     def __init__(self, simulation: Simulation, plan: PlannedRun) -> None:
         super().__init__(simulation, f"gateway-{plan.name}")
         self.plan = plan
         self.position = 0
-        """Submits of the plan that are over; durable."""
+        """Number of the plan's submits that have ended; durable."""
         self.closed = False
         self.machine, self.tells_kernel = simulation.machine_of(plan)
         self.asks_permit = simulation.asks_permit(plan)
@@ -99,12 +100,13 @@ class SimGateway(Asker):
         self._open()
 
     def machine_starts_anew(self) -> None:
-        """It and its agent are gone, and come back on another kernel."""
+        """The machine reboots: the gateway and its agent end, and return on another kernel."""
         self.simulation.truth.agent_ends(self.plan, self.boot_id)
         self.crash()
 
     def moves(self, machine: Machine) -> None:
-        """Its machine is given up: an operator sees to it that the agent is not alive, says so, and goes on elsewhere."""
+        """Its machine is given up: an operator makes sure that the agent is not alive, reports so,
+        and resumes elsewhere."""
         self.world.note(f"{self.name} is lost on {self.machine.name}")
         self.life += 1
         life = self.life
@@ -142,7 +144,7 @@ class SimGateway(Asker):
             if message.status in NOT_NOW:
                 self.later(1.0, self._open)
                 return
-            self._over()  # finished, or cancelled
+            self._over()  # the run is finished or cancelled
             return
         self.simulation.truth.asked_at.setdefault(self.plan.name, self.world.now)
         self._ask_permit()

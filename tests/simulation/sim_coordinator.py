@@ -1,7 +1,8 @@
-"""The coordinator as simulated: the production core, a loop that can stall, a disk that can fail, a process that can die.
+"""The simulated coordinator: the production core, a loop that can block, a disk that can fail, a process that can
+crash.
 
-Effects are carried out as the contract says, in order and a little later than the core asks for them, while it takes in
-more events: it runs ahead of its disk. The process may die before any transaction and after any effect.
+Effects are carried out as the contract requires, in order and a little later than the core requests them, while the
+core takes in more events: it runs ahead of its disk. The process may crash before any transaction and after any effect.
 """
 
 from __future__ import annotations
@@ -36,21 +37,21 @@ from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server.reason_texts import message
 
 PAGE = 5
-"""Episodes in a page, at most."""
+"""Most episodes in a page."""
 FLUSH_S = 0.004
 AUDIT_S = 0.5
-"""Longest that reading and comparing a recording takes."""
+"""Longest time to read and compare a recording."""
 
 
 class Page:
-    """A results or evaluation page, as read from the disk."""
+    """A results or evaluation page, read from the disk."""
 
     def __init__(self, rows: list[Any], cursor: int, done: Any) -> None:
         self.rows, self.cursor, self.done = rows, cursor, done
 
 
 class SimCoordinator:
-    """Executes a core's effects in the simulated world."""
+    """Carries out a core's effects in the simulated world."""
 
     def __init__(self, world: World, disk: Disk, checkers: Checkers, settings: CoreSettings) -> None:
         self.world, self.disk, self.checkers, self.settings = world, disk, checkers, settings
@@ -79,7 +80,7 @@ class SimCoordinator:
         self._take(effects)
 
     def crash(self, why: str) -> None:
-        """Die with all that is not on disk; another process takes over later."""
+        """Lose all state that is not on disk; another process takes over later."""
         if self.core is None:
             return
         self.world.note(f"coordinator dies: {why}")
@@ -93,7 +94,7 @@ class SimCoordinator:
         self._stalled_until = self.world.now + seconds
 
     def _later(self, call: Callable[..., None], *args: Any) -> bool:
-        """While the loop stands still everything waits for it."""
+        """Postpone a call while the loop is blocked; returns whether it was postponed."""
         if self.world.now < self._stalled_until:
             self.world.after(self._stalled_until - self.world.now, call, *args)
             return True
@@ -109,7 +110,7 @@ class SimCoordinator:
         answer: Callable[[Any], None],
         arrived: float | None = None,
     ) -> None:
-        """A request arrives (or has at `arrived`, and is read now); `answer` carries its reply back."""
+        """A request arrives, or arrived at `arrived` and is read now; `answer` delivers the reply."""
         arrived = self.world.now if arrived is None else arrived
         if self._later(self.receive, endpoint, kind, fields, answer, arrived):
             return
@@ -156,7 +157,7 @@ class SimCoordinator:
         self._set_alarm()
 
     def _flush(self, life: int) -> None:
-        """Carry out what waits, in order; it may be cut short anywhere."""
+        """Carry out the queued effects in order; a crash may interrupt it anywhere."""
         if life != self.life or self._later(self._flush, life):
             return
         world, faults = self.world, self.world.faults
@@ -185,7 +186,7 @@ class SimCoordinator:
                     return
 
     def _audit(self, effect: PrepareAudit | CompareAudit, life: int) -> None:
-        """What the shell's thread does for an audit; a recording here is the return that was reported."""
+        """The shell's background work for an audit; here the reported return serves as the recording."""
         if life != self.life or self.core is None or self._later(self._audit, effect, life):
             return
         played = self.disk.outcomes[effect.group][effect.index].outcome

@@ -1,4 +1,4 @@
-"""Every fault the simulation knows, as one record: named, with its rate, off by default, drawn from the seed."""
+"""All faults of the simulation in one record: named, with a rate, off by default, drawn from the seed."""
 
 from __future__ import annotations
 
@@ -8,42 +8,43 @@ from dataclasses import dataclass, fields, replace
 
 @dataclass(frozen=True)
 class Faults:
-    """Rates are probabilities per message, per effect, or events per simulated minute, as said."""
+    """Each rate is a probability per message, effect, transaction or job, or a number of events
+    per simulated minute."""
 
     loss: float = 0.0
-    """Per message: it never arrives."""
+    """Per message: it is lost."""
     delay: float = 0.0
-    """Per message: it takes up to `delay_s` longer; messages overtake each other then."""
+    """Per message: it takes up to `delay_s` longer; messages then overtake each other."""
     delay_s: float = 3.0
     duplicate: float = 0.0
     """Per message: it arrives twice."""
     partition: float = 0.0
-    """Per minute: one endpoint is cut off for up to 30 s."""
+    """Per minute: one endpoint is partitioned for up to 30 s."""
     worker_crash: float = 0.0
-    """Per minute: a worker dies with all it holds, and comes back."""
+    """Per minute: a worker crashes with all its state, and restarts."""
     worker_freeze: float = 0.0
-    """Per minute: a worker stands still for up to 40 s."""
+    """Per minute: a worker is frozen for up to 40 s."""
     slow_worker: float = 0.0
     """Probability that a worker plays four times slower."""
     worker_trouble: float = 0.0
-    """Per job: the worker fails by itself (disk full, environment crashed)."""
+    """Per job: it fails through the worker's own fault (disk full, environment crashed)."""
     gateway_crash: float = 0.0
-    """Per minute: a gateway dies and comes back with what it had written down."""
+    """Per minute: a gateway crashes and restarts with its durable state."""
     coordinator_crash: float = 0.0
-    """Per carried-out effect: the coordinator dies right after it."""
+    """Per carried-out effect: the coordinator crashes right after it."""
     crash_before_persist: float = 0.0
-    """Per transaction: the coordinator dies just before it."""
+    """Per transaction: the coordinator crashes just before it."""
     coordinator_stall: float = 0.0
-    """Per minute: the coordinator's loop stands still for up to 40 s."""
+    """Per minute: the coordinator's loop is blocked for up to 40 s."""
     disk_error: float = 0.0
     """Per transaction: it fails."""
     liveness_flap: float = 0.0
-    """Per minute: a worker's liveliness token goes although the worker is well."""
+    """Per minute: a worker's liveliness token disappears although the worker is well."""
     until_s: float = 80.0
-    """No fault begins later than this."""
+    """No fault starts later than this."""
 
     def named(self) -> str:
-        """What is switched on, for the summary of a failure."""
+        """The faults that are on, for a failure's summary."""
         default = Faults()
         on = [
             f"{each.name}={getattr(self, each.name):.3g}"
@@ -69,14 +70,15 @@ RATES: dict[str, float] = {
     "disk_error": 0.05,
     "liveness_flap": 3.0,
 }
-"""The worst that a seed may draw of each."""
+"""The highest rate of each fault that a seed may draw."""
 
 HARMLESS = ("liveness_flap", "coordinator_stall")
-"""Faults that must not cost a single retry."""
+"""Faults that must not cause a single retry."""
 
 
 def draw(chance: random.Random) -> Faults:
-    """The faults of a seed: one in eight has none, one in eight harmless ones, one in four a single kind; else several."""
+    """Draws the faults of a seed: one in eight has none, one in eight harmless ones, one in four a single
+    kind, the others several."""
     kind = chance.random()
     if kind < 0.125:
         return Faults()

@@ -1,7 +1,7 @@
-"""What must come out, worked out from the scenario alone: no core, no faults, no time.
+"""The expected results, computed from the scenario alone: no core, no faults, no time.
 
-Policies here are names that say how they behave, so what an episode comes to follows from its case, its policy, its policy
-seed and what the policy is told:
+A policy's name here states its behaviour, so an episode's result follows from its case, its policy, its policy seed and
+the metadata that the policy receives:
   good-N       plays
   raises-N     fails in every episode at `act`, which is a result
   none-N       yields no Policy, in any episode
@@ -30,7 +30,7 @@ class PlannedSubmit:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run as its gateway will play it, and the cases it is given."""
+    """A run as its gateway will play it, with its cases."""
 
     name: str
     env: str
@@ -42,7 +42,7 @@ class PlannedRun:
     cancel_at: float | None = None
     """When an operator cancels it, seconds after the start; None for never."""
     kin: str = ""
-    """Runs of one kin have the same hidden cases; its own where it has none."""
+    """Runs with equal `kin` have the same hidden cases; empty: cases of its own."""
 
     def related(self, other: PlannedRun) -> bool:
         """Whether they share a hidden case."""
@@ -67,7 +67,7 @@ class PlannedRun:
         return [HELDOUT_SEEDS[salt + index] for index in range(self.n_heldout)]
 
     def admitted(self) -> list[PlannedSubmit]:
-        """The submits that fit the budget, in order: the others are refused."""
+        """The submits that fit the budget and the case ids, in order; the others are refused."""
         left, taken = self.budget, []
         for submit in self.submits:
             if 1 <= len(submit.ids) <= left and all(0 <= case_id < 64 for case_id in submit.ids):
@@ -78,7 +78,7 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class Expected:
-    """What must be stored of one episode."""
+    """The stored outcome of one episode."""
 
     episode_return: float
     failure: FailureCategory | None
@@ -102,7 +102,7 @@ class ExpectedRun:
 
 
 def failure_of(bundle: str | None, index: int) -> FailureCategory | None:
-    """How the policy fails in the episode at `index`, when it does."""
+    """Failure of the policy in the episode at `index`; None for none."""
     kind = "" if bundle is None else bundle.split("-")[0]
     if kind == "none" or (kind == "late" and index > 0):
         return "init_error"
@@ -112,7 +112,7 @@ def failure_of(bundle: str | None, index: int) -> FailureCategory | None:
 def return_of(
     case_seed: int, bundle: str | None, policy_seed: bytes, episode_index: int, told: dict[str, Any]
 ) -> float:
-    """An episode's return: depends on all that an episode may depend on, and on nothing else."""
+    """An episode's return: depends on everything that an episode may depend on, and on nothing else."""
     meta = sorted(
         (name, value) for name, value in told.items() if name not in ("obs_storage", "max_episode_steps")
     )
@@ -126,7 +126,7 @@ def _seed(run: PlannedRun, submit_index: int, split: str, case_id: int, occurren
 
 
 def _reference_seed(case_seed: int) -> bytes:
-    """Random actions follow from split and case alone, whatever the run."""
+    """Random actions follow from split and case alone, in every run."""
     text = f'["heldout", {case_seed}, null, 0]'
     return hashlib.sha256(b"evopolicy random reference\0" + text.encode()).digest()[:16]
 
@@ -157,7 +157,7 @@ def _mean(episodes: tuple[Expected, ...]) -> float:
 
 
 def expect(run: PlannedRun) -> ExpectedRun:
-    """What a run must come to when it is not cancelled."""
+    """The result of a run that is not cancelled."""
     submits: list[ExpectedSubmit] = []
     heldout_of: dict[int, tuple[float, ...]] = {}
     left = run.budget

@@ -1,4 +1,4 @@
-"""From a seed to a scenario: which workers, runs, policies and faults; and its run, watched by the checkers."""
+"""From a seed to a scenario (workers, runs, policies and faults) and its run under the checkers."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server.reason_texts import words
 
 HORIZON_S = 1500.0
-"""Simulated seconds after which what is not finished never will be."""
+"""Simulated seconds after which an unfinished run counts as stuck."""
 AUDIT_WAIT_S = 60.0
 HIDDEN_WAIT_S = 20.0
 PERMIT_S = 400.0
-"""Without faults no agent waits longer for its permit."""
+"""Longest time that an agent waits for its permit without faults, seconds."""
 ENVS = ("toy/line", "toy/maze")
 KINDS = ("good",) * 7 + ("raises", "raises", "none", "late")
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much there is to play."""
+    """Upper bounds of a scenario."""
 
     runs: int = 2
     submits: int = 3
@@ -45,7 +45,7 @@ class Size:
 
 
 class Simulation:
-    """One seed."""
+    """The scenario of one seed."""
 
     def __init__(
         self, seed: int, size: Size = Size(), faults: Faults | None = None, *, trace: bool = False
@@ -53,7 +53,7 @@ class Simulation:
         chance = random.Random(seed * 7919 + 1)
         faults = draw(chance) if faults is None else faults
         self.crowd = seed % 16 == 3
-        """Six siblings on one machine with one slot, each beside the next; without faults in every other such seed."""
+        """Six sibling runs whose agents share one machine and its single slot; every other such seed has no faults."""
         if seed % 32 == 3:
             faults = Faults()
         self.faults = faults
@@ -68,9 +68,9 @@ class Simulation:
         self.disk = Disk()
         self.plans = [_plan(f"r{index}", size, chance) for index in range(chance.randint(1, size.runs))]
         self.places = random.Random(seed * 6007 + 3)
-        """Who is on which machine, and what becomes of machines."""
+        """Randomness for the placement on machines and for the machines' fate."""
         self.near = seed % 2 == 1
-        """Agents are on the workers' machines, and runs have siblings; else each is on a machine of its own."""
+        """Agents are on the workers' machines, and runs may have siblings; otherwise each agent has its own machine."""
         if self.crowd:
             env = ENVS[0]
             self.plans = [
@@ -79,10 +79,10 @@ class Simulation:
         if self.near and (self.crowd or self.places.random() < 0.7):
             self.plans = [replace(plan, kin=f"kin-{seed}") for plan in self.plans]
         self.thinks_s = 12.0 if self.crowd else 0.0
-        """How long agents are alive between submits, at least."""
+        """Shortest time that agents are alive between submits."""
         self.truth = Truth(self)
         self.orderly = self.crowd and faults == Faults()
-        """Whether nothing but the rules decides who waits for how long."""
+        """Whether the rules alone decide who waits and for how long."""
         self.machines = [
             Machine(f"m{index}") for index in range(1 if self.crowd else self.places.randint(1, 3))
         ]
@@ -90,19 +90,20 @@ class Simulation:
         self._older = {
             plan.name for plan in self.plans if self.near and not self.crowd and self.places.random() < 0.12
         }
-        # One slot plays six runs in a crowd.
+        # In a crowd one slot plays six runs.
         self._horizon_s = HORIZON_S * max(2.0 if self.crowd else 1.0, size.episodes / Size.episodes)
         self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
         self.checkers = Checkers(self)
         self.workers: dict[str, SimWorker] = {}
         self.gateways: list[SimGateway] = []
-        # In one seed of four, so that the others show what holds without audits.
+        # One seed in four has audits; the others test the behaviour without them.
         self.audit_share = (0.3, 1.0)[seed // 4 % 2] if seed % 4 == 0 else 0.0
         self._out_of_service = ("draining", "paused")[seed % 2]
         self.absent = {7: "frozen", 15: "paused"}.get(seed % 16)
-        """How all workers are away when the runs are opened."""
+        """How all workers become unavailable when the runs are opened."""
         self.slanderer = "w1" if seed % 8 == 4 else None
-        """The worker that lies about what it plays again; players are honest, so all runs come to what they must."""
+        """The worker that reports false replays as an auditor; players are honest, so all runs get
+        their expected results."""
         settings = CoreSettings(
             audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=HIDDEN_WAIT_S
         )
@@ -113,7 +114,7 @@ class Simulation:
             name = f"w{index}"
             slots = chance.randint(1, 3)
             machine = self.places.choice(self.machines) if self.near else Machine(f"m-of-{name}")
-            # The first tells, so that somewhere there is a kernel for hidden episodes.
+            # The first worker reports its kernel, so that one exists for hidden episodes.
             tells = not self.near or index == 0 or version != "1" or self.places.random() < 0.8
             self.workers[name] = SimWorker(
                 self, name, 1 if self.crowd else slots, envs, version, machine, tells_kernel=tells
@@ -125,10 +126,10 @@ class Simulation:
         ]
         self._plan_faults()
 
-    # ---- where ----
+    # ---- machines ----
 
     def machine_of(self, plan: PlannedRun) -> tuple[Machine, bool]:
-        """The machine of a run's gateway and agent, and whether it is told."""
+        """The machine of a run's gateway and agent, and whether the gateway reports it."""
         if plan.name not in self._of_run:
             apart = not self.near or (not self.crowd and self.places.random() < 0.25)
             machine = Machine(f"m-of-{plan.name}") if apart else self.places.choice(self.machines)
@@ -137,11 +138,11 @@ class Simulation:
         return self._of_run[plan.name]
 
     def asks_permit(self, plan: PlannedRun) -> bool:
-        """Whether its gateway is of a version that asks for permits."""
+        """Whether its gateway is of a version that requests permits."""
         return plan.name not in self._older
 
     def _reboot(self) -> None:
-        """A machine starts anew: its workers, gateways and agents end."""
+        """A machine reboots: its workers, gateways and agents end."""
         machine = self.places.choice(self.machines)
         self.world.note(f"{machine.name} starts anew")
         machine.boots += 1
@@ -158,15 +159,15 @@ class Simulation:
         if movable:
             self.places.choice(movable).moves(Machine(f"another-{len(self.machines)}"))
 
-    # ---- how long, and how ----
+    # ---- play time ----
 
     def seconds_of(self, job: Job, spec: EpisodeSpec) -> float:
-        """How long an episode takes: by its case and policy, so the same in every attempt."""
+        """An episode's play time: follows from its case and policy, so it is the same in every attempt."""
         part = zlib.crc32(f"{spec.case.seed} {job.bundle}".encode()) % 100 / 100.0
         hidden = 4.0 if "validation" in job.job_id else 1.0
         return self.lengths * (0.5 + part) * hidden
 
-    # ---- faults that come by themselves ----
+    # ---- scheduled faults ----
 
     def _plan_faults(self) -> None:
         faults, chance, world = self.faults, self.world.chance, self.world
@@ -218,12 +219,12 @@ class Simulation:
         self._take_out(self._some_worker().name, self._out_of_service, 20.0)
 
     def _take_out(self, name: str, state: str, for_s: float) -> None:
-        """An operator takes a worker out of service and back later."""
+        """An operator takes a worker out of service, and reactivates it later."""
         operator = self.operators[0]
 
         def drained(message: object) -> None:
             if isinstance(message, wire.Refused):
-                return  # it is quarantined, and stays so
+                return  # the worker stays quarantined
             self.checkers.drained_at[name] = self.world.now
             operator.later(for_s, back)
 
@@ -236,7 +237,7 @@ class Simulation:
     # ---- running ----
 
     def run(self) -> None:
-        """Play the seed to its end; raises what the checkers or the core raise."""
+        """Play the seed to its end. Raises the errors of the checkers and the core."""
         finished = self.world.run(self.world.now + self._horizon_s, self._all_done)
         if not finished:
             missing = {plan.name for plan in self.plans} - self.checkers.finished_runs

@@ -1,4 +1,4 @@
-"""A disk: rows under their keys, transactions that happen as a whole or not at all."""
+"""A disk: rows under their keys, written in atomic transactions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.records import (
 
 
 class Disk:
-    """What survives the coordinator."""
+    """The state that survives the coordinator."""
 
     def __init__(self) -> None:
         self.incarnation = 0
@@ -80,7 +80,7 @@ class Disk:
         return [row for row in rows if cursor <= row.seq < upto][:most]
 
     def snapshot(self) -> Snapshot:
-        """What a core is loaded from: heads of unfinished runs and evaluations only, as the contract asks."""
+        """The snapshot to load a core from: heads of unfinished runs and evaluations only, as the contract requires."""
         live = {name for name, state in self.states.items() if state.phase != "finished"}
         groups = {
             evaluation_group(name) for name, evaluation in self.evaluations.items() if not evaluation.finished

@@ -1,6 +1,6 @@
-"""What is truly on which kernel: machines that start anew, agents that are alive, episodes that are being played.
+"""Ground truth of the kernels: machines that reboot, agents that are alive, episodes that are being played.
 
-The coordinator is told of it by messages that are lost, late or false by omission; what it believes is not asked here.
+The coordinator learns of it from messages that are lost, late or incomplete; its view is not consulted here.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 LONGEST_S = 30.0
-"""A closed run may be kept waiting for so long by agents that start after its closing: `HIDDEN_WAIT_S`, and some."""
+"""Longest time that agents that start after a run's closing may delay it: `HIDDEN_WAIT_S` plus a margin."""
 
 
 @dataclass(eq=False)
 class Machine:
-    """A machine, with as many kernels one after another as it was started times."""
+    """A machine; each boot is another kernel."""
 
     name: str
     boots: int = 1
@@ -33,24 +33,24 @@ class Machine:
 
 
 class SharedKernelError(AssertionError):
-    """A hidden episode was played where it must not be."""
+    """A hidden episode was played on a forbidden kernel, or an agent started too early."""
 
 
 class Truth:
-    """Agents and episodes by kernel."""
+    """Live agents and playing episodes by kernel."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self.agents: dict[tuple[str, str], PlannedRun] = {}
-        """Those that are alive, by run and boot id."""
+        """Live agents, by run and boot id."""
         self.plays: dict[tuple[str, str], tuple[str, PlannedRun, str]] = {}
-        """By worker and lease: boot id, run, and whether it is `hidden` or `train`."""
+        """By worker and lease: boot id, run, and `hidden` or `train`."""
         self.kept_since: dict[str, float] = {}
-        """Closed runs that are not finished to since when related agents were alive without a break."""
+        """Closed, unfinished run to the time since when a related agent has been alive without a break."""
         self.asked_at: dict[str, float] = {}
-        """When a run's gateway first asked for its permit."""
+        """When a run's gateway first requested its permit."""
         self.waited_s: list[float] = []
-        """How long agents waited for permits."""
+        """Seconds that agents waited for permits."""
 
     # ---- agents ----
 
@@ -76,7 +76,7 @@ class Truth:
         self._look()
 
     def closed(self, plan: PlannedRun) -> None:
-        """A run's closing was answered."""
+        """The closing of a run was acknowledged."""
         self.kept_since.setdefault(plan.name, self._simulation.world.now)
         self._look()
 
@@ -95,7 +95,7 @@ class Truth:
                 self.kept_since[plan.name] = self._simulation.world.now
 
     def _not_after_others(self, plan: PlannedRun) -> None:
-        """Where all are on one machine no agent starts when hidden cases have waited for long."""
+        """In an orderly crowd, on a single machine, no agent starts once hidden cases have waited for long."""
         self._look()
         for name, since in self.kept_since.items() if self._simulation.orderly else ():
             waited_s = self._simulation.world.now - since

@@ -1,8 +1,9 @@
-"""A worker as simulated: registers, polls, beats, plays, reports; it can die, stand still, be slow, and be in trouble.
-One may slander: what it plays again as an auditor it says to have gone otherwise.
+"""A simulated worker: it registers, polls, sends heartbeats, plays and reports; it can crash, freeze, be slow, and fail
+jobs. One may slander: as an auditor it reports a false result of a replay.
 
-What it plays depends on the job alone, as with the real one; only its faults come from chance. What the policy of a hidden
-episode has returned, were its luck the clock's, is named by the attempt that it is of, and handed back when that is stopped.
+The result of a job depends on the job alone, as with a real worker; only its faults are random. The actions that the
+policy of a hidden episode has returned are named by their attempt, as if the clock had decided them, and returned with
+the job when it is stopped.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ if TYPE_CHECKING:
 POLL_S = 5.0
 BEAT_S = 2.0
 SILENCE_S = 15.0
-"""What is to be stopped in silence is, when no beat was answered for so long."""
+"""Leases with `stop_in_silence` are stopped when no heartbeat was answered for so long."""
 FROZEN_LIMIT_S = 18.0
-"""An episode during which the worker stood still for so long ends with a false verdict about a time limit."""
+"""An episode during which the worker was frozen for so long ends with a false verdict about a time limit."""
 
 
 class Asker:
-    """Someone who asks the coordinator, again and again until there is an answer; can die and stand still."""
+    """A client of the coordinator that retries every request until it is answered; can crash and freeze."""
 
     def __init__(self, simulation: Simulation, name: str) -> None:
         self.simulation, self.world, self.name = simulation, simulation.world, name
@@ -44,10 +45,10 @@ class Asker:
         then: Callable[[Any], None],
         wait_s: float = 0.0,
     ) -> None:
-        """Ask, and ask again after a while without an answer; `then` is called once, by an answer to the latest."""
+        """Send a request, and retry it after a timeout; `then` is called once, by a reply to the latest attempt."""
         life = self.life
         current = [0]
-        """The latest sending; -1 once it was answered."""
+        """Number of the latest attempt; -1 once it was answered."""
 
         def answer(serial: int, message: Any) -> None:
             if life != self.life or serial != current[0]:
@@ -72,7 +73,7 @@ class Asker:
         send(1)
 
     def later(self, delay_s: float, call: Callable[..., None], *args: Any) -> None:
-        """As `World.after`, but not past a death, and not while it stands still."""
+        """As `World.after`, but cancelled by a crash, and postponed while the client is frozen."""
         life = self.life
 
         def due() -> None:
@@ -91,7 +92,7 @@ class Asker:
 
 
 class SimWorker(Asker):
-    """One supervisor with its slots."""
+    """One worker supervisor with its slots."""
 
     def __init__(
         self,
@@ -132,7 +133,7 @@ class SimWorker(Asker):
 
     @property
     def settled(self) -> int:
-        """Number of the last poll that is over, as all before it are."""
+        """All polls up to this number are finished."""
         return min(self.outstanding) - 1 if self.outstanding else self.serial
 
     def crash(self) -> None:
@@ -175,7 +176,7 @@ class SimWorker(Asker):
 
         def registered(message: Any) -> None:
             if isinstance(message, wire.Refused):
-                self.life += 1  # quarantined: it ends
+                self.life += 1  # quarantined: the worker ends
                 return
             self.session = message.session
             if first:
@@ -196,7 +197,7 @@ class SimWorker(Asker):
         return False
 
     def _beat(self) -> None:
-        """Beat, whatever became of the last one."""
+        """Send a heartbeat, whether or not the last one was answered."""
         self.later(BEAT_S, self._beat)
         if not self.session:
             return
@@ -352,7 +353,7 @@ class SimWorker(Asker):
 
 
 def begun_of(lease: wire.Lease) -> BlobRef | None:
-    """What its policy has returned once it is played: what stands from before, or a throw of its own."""
+    """The actions that its policy has returned once it is played: those of an earlier attempt, or its own."""
     job = lease.job
     if job.bundle is None or job.record == "full":
         return None

@@ -1,6 +1,8 @@
-"""The simulated world: one clock, one source of chance, a network that loses, delays, doubles and reorders.
+"""The simulated world: one clock, one source of randomness, a network that loses, delays, duplicates and reorders
+messages.
 
-Everything that happens is a call at a time; calls at one time happen in the order they were asked for, so a seed says it all.
+Every event is one call at a simulated time; calls at the same time run in the order they were scheduled, so the seed
+determines everything.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from sim_faults import Faults
 
 
 class World:
-    """Clock, chance and the network."""
+    """Clock, randomness and the network."""
 
     def __init__(self, seed: int, faults: Faults) -> None:
         self.seed = seed
@@ -24,18 +26,18 @@ class World:
         self.calls = 0
         self.trace: list[str] | None = None
         self.calm_at = self.now + faults.until_s
-        """No fault begins after this."""
+        """No fault starts after this."""
         self._heap: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._count = 0
         self._cut: dict[str, float] = {}
-        """Endpoint to when its partition ends."""
+        """Endpoint to the end of its partition."""
 
     def after(self, delay_s: float, call: Callable[..., None], *args: Any) -> None:
         self._count += 1
         heapq.heappush(self._heap, (self.now + delay_s, self._count, call, args))
 
     def run(self, until: float, done: Callable[[], bool]) -> bool:
-        """Let things happen until `done` or `until`; tells whether it was `done`."""
+        """Process events until `done` or `until`; returns whether it is `done`."""
         while self._heap and self._heap[0][0] <= until:
             at, _, call, args = heapq.heappop(self._heap)
             self.now = max(self.now, at)
@@ -52,7 +54,7 @@ class World:
     # ---- network ----
 
     def send(self, endpoint: str, deliver: Callable[..., None], *args: Any) -> None:
-        """Carry a message between `endpoint` and the coordinator, as far as the network lets it."""
+        """Deliver a message between `endpoint` and the coordinator, subject to the network's faults."""
         faults, chance = self.faults, self.chance
         stormy = self.now < self.calm_at
         if self._cut.get(endpoint, 0.0) > self.now or (stormy and chance.random() < faults.loss):

@@ -18,7 +18,7 @@ NIGHTLY = Size(runs=4, submits=6, episodes=12, hidden=6, workers=6)
 
 
 def play(seed: int, size: Size = SMALL, *, trace: bool = False) -> Simulation:
-    """Play one seed; raises what goes wrong."""
+    """Play one seed. Raises its errors."""
     simulation = Simulation(seed, size, trace=trace)
     try:
         simulation.run()
@@ -30,7 +30,7 @@ def play(seed: int, size: Size = SMALL, *, trace: bool = False) -> Simulation:
 
 
 def replay_command(seed: int, *, nightly: bool = False) -> str:
-    """What to type to see a seed again."""
+    """The command that replays a seed."""
     return f'make sim ARGS="--seed {seed} --trace{" --nightly" if nightly else ""}"'
 
 

@@ -1,4 +1,4 @@
-"""The simulation in CI: a thousand seeds of the production core under faults, and bugs planted in it."""
+"""The simulation in CI: a thousand seeds of the production core under faults, and bugs planted in the core."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NOTICED_BY = {
     "let an agent start before hidden episodes have stopped": 19,
     "forget permits at a restart": 13,
 }
-"""Seeds that are tried first, of bugs that few seeds notice. When the core changes, others may: then all are searched."""
+"""Seeds to try first for bugs that few seeds detect. After a change of the core other seeds may: then all are tried."""
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, 100))

@@ -3,7 +3,7 @@
 Rules that this module owns:
 - A lane is (environment, sandbox tier, fingerprint class); a flow (a run, or an evaluation) is in one lane, or in none
   until it is pinned to a class.
-- A lower priority rank goes first, whatever the shares are.
+- Priorities of an earlier rank (`RANKS`) go first, whatever the shares are.
 - Between flows of one rank the one with the least play time goes first (start-time fair queueing: each rank has a
   virtual clock; an idle flow starts at the clock, so that idleness earns nothing). A worker that has the environment or
   the bundle warm may deviate from this by a bounded amount.
