@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 POLL_S = 5.0
 BEAT_S = 2.0
 SILENCE_S = 15.0
-"""Leases with `stop_in_silence` are stopped when no heartbeat was answered for so long."""
+"""Leases with `stop_in_silence` are stopped when no heartbeat was answered for this long."""
 FROZEN_LIMIT_S = 18.0
-"""An episode during which the worker was frozen for so long ends with a false verdict about a time limit."""
+"""An episode during which the worker was frozen for this long ends with a false verdict about a time limit."""
 
 
 class Asker:

@@ -138,8 +138,8 @@ class JobState:
     held_attempts: set[int] = field(default_factory=set)
     """Attempts that this incarnation granted or adopted: none is adopted twice."""
     begun: BlobRef | None = None
-    """Actions that its policy returned before it was given back; the next attempt plays them
-    first. None: starts anew."""
+    """Actions that its policy returned before the job was given back; the next attempt plays them
+    first. None for none."""
     begun_attempt: int = 0
     """The attempt that reported them."""
     parting: Lease | None = None
@@ -184,7 +184,8 @@ class JobGroup:
     first_leased_at: float | None = None
     n_leased: int = 0
     held_since: float | None = None
-    """When hidden jobs began to keep all its episodes from its kernels, so that none runs; None when they do not."""
+    """Since when none of its episodes runs because hidden jobs keep them from its kernels; None
+    while it is not held."""
     held_s: float = 0.0
     """Seconds held before `held_since`."""
     held_counted_s: float = 0.0

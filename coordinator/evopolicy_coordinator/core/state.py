@@ -1,5 +1,5 @@
-"""All state of a core: tables of open work and indices into them. `loading` fills it, the rules change
-it; it has no rules."""
+"""All state of a core: tables of open work and indices into them, without rules. `loading` fills it;
+the rules change it."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class State:
         self.rate = Rate()
         self.loading: Loading | None = None
         self.hold_until = now + settings.lease_ttl_s
-        """No lease expires before."""
+        """No lease expires before this time."""
         self.stalled_at = now
         """When the loop last resumed after it was blocked for long, or started."""
 

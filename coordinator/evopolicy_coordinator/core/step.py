@@ -3,8 +3,8 @@
 Rules that this module owns:
 - All rows that a step makes durable are in a single `Persist` ahead of all its other effects, so no reply reports a
   change that a crash would undo.
-- A rule calls rules that it builds on, never rules that build on it: leases do not know runs. Events are passed upwards
-  as news, for which `machine` has a table. The consequences of a piece of news come before the pieces told after it.
+- A rule calls rules that it builds on, never rules that build on it: leases do not know runs. It reports upwards by
+  news, for which `machine` has a table. The consequences of a piece of news come before the pieces told after it.
 - Work that became available is marked (`dirty`, `State.freed`); the scheduler processes the marks at the end of the
   step.
 """
@@ -49,7 +49,7 @@ class EpisodesDone:
 
     group: JobGroup
     worker: Worker | None
-    """The player; None: before the core was loaded."""
+    """The player; None when the outcomes were stored before the core was loaded."""
     outcomes: tuple[EpisodeOutcome, ...]
 
     @property
@@ -175,14 +175,14 @@ class Step:
     # ---- durable changes ----
 
     def change_run(self, run: Run, **fields: object) -> None:
-        """Change a run's stored state; raises InvariantError when the phase may not follow."""
+        """Change a run's stored state; raises InvariantError when the new phase may not follow the old one."""
         before, run.state = run.state, msgspec.structs.replace(run.state, **fields)
         if run.state.phase != before.phase:
             transitions.check(transitions.RUN, run.id, before.phase, run.state.phase)
         self.persist(run.state)
 
     def change_submit(self, run: Run, index: int, **fields: object) -> SubmitRow:
-        """Change a stored submit; raises InvariantError when the status may not follow."""
+        """Change a stored submit; raises InvariantError when the new status may not follow the old one."""
         before = run.submits[index]
         row = run.submits[index] = msgspec.structs.replace(before, **fields)
         if row.status != before.status:
@@ -192,7 +192,7 @@ class Step:
         return row
 
     def put_audit(self, run: Run, row: AuditRow) -> AuditRow:
-        """Store a new or changed audit; raises InvariantError when the state may not follow."""
+        """Store a new or changed audit; raises InvariantError when the new state may not follow the old one."""
         before = run.audits.get(row.audit)
         if before is not None and row.state != before.state:
             transitions.check(transitions.AUDIT, row.audit, before.state, row.state)

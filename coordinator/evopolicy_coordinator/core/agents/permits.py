@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 CANCELLED_S = 30.0
-"""An agent has so long to end after its run was cancelled."""
+"""An agent has this long to end after its run was cancelled."""
 
 
 def place(run: Run, boot_id: str) -> str | None:

@@ -33,7 +33,7 @@ LOOK_S = 1.0
 """Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""
 
 DONE_LOOKS = 3
-"""After so many checks without hidden jobs they count as done: jobs that follow from the last one may
+"""After this many checks without hidden jobs they count as done: jobs that follow from the last one may
 take a moment to queue."""
 
 

@@ -18,7 +18,7 @@ from evopolicy_coordinator.core.structures.polls import Poll
 from . import permits
 
 ASK_AGAIN_S = 10.0
-"""A declined permit request is kept for so long, until the gateway repeats it."""
+"""A declined permit request is kept for this long, until the gateway repeats it."""
 
 
 def requested(state: State, event: events.Asked[gateway.RequestPermit], step: Step) -> None:

@@ -120,7 +120,7 @@ def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | No
 
 
 def adoptable(state: State, job: JobState, worker: Worker) -> bool:
-    """Whether a job that a worker has played since before the core was loaded may continue there."""
+    """Whether a job that a worker reports to hold since before the core was loaded may continue there."""
     family, here = job.group.flow.family, (worker.kernel, state.everywhere)
     if not state.isolates or not (job.group.hidden or job.priority == TRAIN):
         return True

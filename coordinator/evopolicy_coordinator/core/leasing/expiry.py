@@ -16,7 +16,7 @@ from . import fleet, leases
 from .retry import JobFailure
 
 FORGET_S = 3600.0
-"""A lost worker is listed for so long."""
+"""A lost worker is listed for this long."""
 
 
 def look_at(state: State, name: str, step: Step) -> None:

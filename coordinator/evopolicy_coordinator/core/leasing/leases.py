@@ -29,7 +29,7 @@ from .jobs import build
 from .retry import JobFailure, decide
 
 MISSING_BEATS = 3
-"""A lease that its worker has not named for so many heartbeat intervals since the grant has never arrived."""
+"""A lease that its worker has not named for this many heartbeat intervals since the grant has never arrived."""
 
 
 def lease_id(secret: bytes, job_id: str, attempt: int, worker: str) -> str:

@@ -36,7 +36,7 @@ from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import Step
 
 LOOK_AGAIN_S = 1.0
-"""A lane is checked again after so long when jobs wait although workers wait too (they avoid each other)."""
+"""A lane is checked again after this time when jobs wait although workers wait too (they avoid each other)."""
 
 SKIPS_MAX = 16
 """Most jobs of a flow that are skipped because they avoid the polling worker; after that the flow is passed over."""

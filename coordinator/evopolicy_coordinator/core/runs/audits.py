@@ -9,7 +9,7 @@ Rules that this module owns:
 - Where machines have credentials of their own, player and auditors are on different machines, and a forger's machine is
   quarantined with it: the owner of several workers has one vote.
 - Two workers that disagree are in dispute; a third one decides. The worker that stands alone against two is named and
-  gets no more leases. A settled verdict is final; the run's record shows the dispute.
+  gets no more leases. A dispute changes no committed outcome; the run's record reports it.
 - Audits are last in the queue and are stopped for any train job. A run that is otherwise done waits for them
   `CoreSettings.audit_wait_s` at most, and not at all for audits that no other worker can play. Time during which a
   hidden audit is kept from all workers that could play it (`isolation`) does not count.
