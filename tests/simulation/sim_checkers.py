@@ -41,8 +41,8 @@ VALIDATE_EVERY = 7
 HEARD_S = 4.0
 """A worker whose contacts are at most this far apart is never considered lost."""
 PREEMPT_S = 19.0
-"""Longest time that a train job may wait while hidden jobs run in its lane: a partitioned worker that was told to stop
-counts as about to stop until its lease would have expired."""
+"""Longest time that a train job may wait while hidden jobs run in its lane: a partitioned worker with jobs to stop
+counts as about to stop them until their leases would have expired."""
 
 
 class ViolationError(AssertionError):

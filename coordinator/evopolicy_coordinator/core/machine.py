@@ -137,7 +137,8 @@ class Core:
 
 
 def drain(state: State, this: Step) -> None:
-    """Deliver the news of a step in order. The consequences of a piece of news come before the pieces told after it."""
+    """Deliver the news of a step in order. The consequences of a piece of news come before the
+    pieces queued after it."""
     pending = this.news
     while pending:
         piece = pending.popleft()

@@ -21,8 +21,8 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     late_s: float = 1.0
     """A deadline served later than this means that the loop was blocked: then no lease expires for one time to live."""
     silence_s: float = 7.5
-    """After this long without a request from its worker, a limit verdict or a slot's death may be caused by the silence:
-    it does not count and the job is played again."""
+    """After this long without a request from its worker, a limit verdict or a slot's death may be caused by the
+    silence: it does not count and the job is played again."""
     standstill_s: float = 5.0
     """The same holds for jobs that were leased before the coordinator's own loop was blocked for this long."""
     doubts_max: int = 8
@@ -56,7 +56,7 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     hidden_wait_s: float = 60.0
     """After hidden jobs of closed runs were barred from all kernels for this long, one kernel is reserved for them."""
     silent_bar_s: float = 60.0
-    """After this time, a silent worker has surely stopped its hidden jobs. Well above `lease_ttl_s`, the time after which
-    the worker stops them itself."""
+    """After this time, a silent worker has surely stopped its hidden jobs. Well above `lease_ttl_s`, the time after
+    which the worker stops them itself."""
     max_wait_s: float = 60.0
     """Upper bound on any long poll."""

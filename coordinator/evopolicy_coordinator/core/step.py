@@ -4,7 +4,7 @@ Rules that this module owns:
 - All rows that a step makes durable are in a single `Persist` ahead of all its other effects, so no reply reports a
   change that a crash would undo.
 - A rule calls rules that it builds on, never rules that build on it: leases do not know runs. It reports upwards by
-  news, for which `machine` has a table. The consequences of a piece of news come before the pieces told after it.
+  news, for which `machine` has a table. The consequences of a piece of news come before the pieces queued after it.
 - Work that became available is marked (`dirty`, `State.freed`); the scheduler processes the marks at the end of the
   step.
 """

@@ -103,7 +103,7 @@ def _withdraw(state: State, run: str, kernel: Kernel, family: Family) -> Ask | N
 
 
 def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
-    """Remove a permit request that was not repeated, and free what it barred."""
+    """Remove a permit request that was not repeated, and free the jobs that it barred."""
     ask = state.asks.get((run, boot_id))
     if ask is not None:
         kernels.freed(state, ask.family, step, train_too=False)

@@ -6,7 +6,7 @@ Rules that this module owns:
 - Workers of one profile (environments with their fingerprint classes, tiers) are interchangeable except for their warm
   environments and bundles.
 - A worker that is paused, draining, lost, quarantined, benched or reserved for a suspect gets no more work. A draining
-  worker is told to end after its present jobs; a paused one stays, and works as before once it is set active.
+  worker is requested to end after its present jobs; a paused one stays, and works as before once it is set active.
 - A worker whose jobs keep failing through its own fault is benched: it gets no leases for a growing time.
 """
 

@@ -1,14 +1,14 @@
-"""Leases: the right of a worker to play a job, and what happens to the job when it ends. `expiry` decides when a lease
+"""Leases: a worker's right to play a job, and what happens to the job when it ends. `expiry` decides when a lease
 expires.
 
 Rules that this module owns:
 - A job has at most one live lease. Every lease has the job's next attempt number; given-up attempts are fenced off:
-  their failures do not affect the job, and their holders are told to stop. (An outcome is accepted from any attempt,
-  see `workers.results`: it is the same whoever plays it.)
+  their failures do not affect the job, and their holders must stop. (An outcome is accepted from any attempt, see
+  `workers.results`: it is the same on every worker.)
 - Heartbeats that name a lease keep it alive. A lease that never arrived at its worker is given up.
 - A lease that this incarnation did not grant is adopted from its holder's heartbeat if its job waits.
 - Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
-- A policy's job that is stopped through nobody's fault returns to the queue only after its worker has released it: the
+- A policy's job that is stopped without a failure returns to the queue only after its worker has released it: the
   worker returns the policy's actions so far, and the next attempt plays them first.
 """
 
@@ -292,7 +292,7 @@ def give_back(
 
 
 def put_off(state: State, lease: Lease, why: str, step: Step) -> None:
-    """Stop a hidden job through nobody's fault. It returns to the queue, but a policy's job only after its
+    """Stop a hidden job without a failure. It returns to the queue, but a policy's job only after its
     worker has released it."""
     job = lease.job
     stop(state, lease, step, why)

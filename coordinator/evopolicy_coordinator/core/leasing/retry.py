@@ -2,7 +2,7 @@
 
 Rules that this module owns:
 - Only infrastructure failures are retried, without limit. A policy's failure is a result and never handled here.
-- A job that is given back (drained, preempted, cancelled) is nobody's fault: no delay, no blame.
+- A job that is given back (drained, preempted, cancelled) has not failed: no delay, no blame.
 - The jobs that ran on a lost worker become suspects and rerun alone. The jobs that waited there behind them just return
   to the queue.
 """
@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 from evopolicy_coordinator.core.settings import CoreSettings
 
 JobFailure = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
-"""returned: given back unfinished, through nobody's fault. unlisted: its worker is alive but does not know the lease,
+"""returned: given back unfinished, without a failure. unlisted: its worker is alive but does not know the lease,
 which never arrived. failed: the worker's own fault. worker_lost: its worker went silent. overdue: played for longer
 than any episode may take."""
 

@@ -94,7 +94,7 @@ def cancel(state: State, name: str, step: Step) -> bool:
 
 
 def end(state: State, group: JobGroup, error: str, step: Step) -> None:
-    """End an evaluation: close its group and answer waiting polls. `error` says why it ended early."""
+    """End an evaluation: close its group and answer waiting polls. `error` is the reason of an early end."""
     evaluation = state.evaluations.pop(group.run)
     step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
     state.ended_evaluations[group.run] = Ended(group.done)

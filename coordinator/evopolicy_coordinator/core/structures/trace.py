@@ -36,7 +36,8 @@ class Trace:
         self._lines.append(TraceEntry(at, stimulus_id, key, what))
 
     def of(self, key: str) -> list[TraceEntry]:
-        """Entries about `key`, its children (`run` → `run/…`), its attempts (`job#…`), and entries that mention it."""
+        """Entries about `key`, its children (`run` → `run/…`) and attempts (`job#…`), and entries that mention it or
+        have it as stimulus id."""
         return [
             line
             for line in self._lines

@@ -101,7 +101,7 @@ def lease_requested(state: State, event: events.Asked[wire.LeaseRequest], step: 
 
 
 def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> None:
-    """Renew the leases that a worker names, and tell it which to stop."""
+    """Renew the leases that a worker names, and reply with those to stop."""
     message = event.message
     worker = worker_of(state, event, step)
     if worker is None:

@@ -173,7 +173,7 @@ def _place_suspects(state: State, step: Step) -> None:
 
 
 def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
-    """Tell a worker which leases to stop if a heartbeat or poll of it waits; otherwise its next heartbeat does."""
+    """Notify a worker of leases to stop if a heartbeat or poll of it waits; otherwise its next heartbeat does so."""
     worker = state.workers.get(name)
     if worker is None:
         return
