@@ -1,1 +1,1 @@
-"""The coordinator: owns the budget ledger, the hidden splits, the queue, every checkpoint and every result."""
+"""The coordinator: owns the budget ledger, the hidden splits, the job queue, all checkpoints and all results."""

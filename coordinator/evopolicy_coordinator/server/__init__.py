@@ -1,1 +1,1 @@
-"""The running coordinator around its core: requests in, effects out."""
+"""The coordinator's shell around the core: requests in, effects out."""

@@ -1,9 +1,9 @@
-"""What an audit needs of the stored recordings: the actions by themselves, and whether two records are the same.
+"""Reads the stored recordings for an audit: extracts the actions, and compares two records.
 
 Rules that this module owns:
-- A worker that plays an episode again is given its actions and nothing that came of them.
-- What a player reported is never trusted to be a recording; what cannot be read is its fault, what the store has lost is
-  not.
+- A worker that replays an episode gets its actions and none of their results.
+- A player's report is never trusted to be a valid recording. An unreadable recording is the player's fault; one lost
+  by the store is not.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ _LOST = "its record is not in the store any more"
 
 
 def carry_out(effect: AuditEffect, reader: Reader, blobs: BlobStore) -> AuditEvent:
-    """Carries out an audit's effect: reads, stores, compares. Never raises for what a worker reported, or the store."""
+    """Carries out an audit's effect: reads, stores, compares. Never raises for a bad report of a worker or a store
+    error."""
     return (
         _prepare(effect, reader, blobs)
         if isinstance(effect, PrepareAudit)
@@ -75,9 +76,9 @@ def _compare(effect: CompareAudit, reader: Reader, blobs: BlobStore) -> AuditCom
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: BlobStore) -> str | None:
-    """Where two outcomes of the same actions part, in words; None when they are the same bit for bit.
+    """Describes the first difference of two outcomes of the same actions; None when they are equal bit for bit.
 
-    The policy's side of them (failure, output, times) is left out. StorageError when the store has lost a recording.
+    Ignores the policy's side (failure, output, times). Raises StorageError when the store has lost a recording.
     """
     recordings = []
     for outcome in (ours, theirs):
@@ -99,7 +100,7 @@ def _outcome(reader: Reader, group: str, index: int) -> EpisodeOutcome:
 
 
 def _recording(outcome: EpisodeOutcome, blobs: BlobStore) -> Trajectory:
-    """The outcome's recording; ProtocolError when it is none."""
+    """Decodes the outcome's recording. Raises ProtocolError when there is none or it is unreadable."""
     ref = outcome.trajectory
     if ref is None:
         raise ProtocolError("there is none")

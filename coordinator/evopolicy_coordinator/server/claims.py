@@ -1,10 +1,10 @@
-"""Which host plays which run of a sweep.
+"""Claims decide which host plays which run of a sweep.
 
 Rules:
-- A claim is held by one holder until its time is up, it is given back, or it is settled. A settled one is settled for good.
-- Who holds it and what it came to are on disk before they are answered. The time is not: after a restart every holder has
-  its full time again, so nothing is taken from a host for the coordinator's being away.
-- A holder that asks again, also after its own restart, keeps what it has.
+- A claim has one holder until it expires, is given back, or is settled. A settled claim stays settled.
+- The holder and the result are on disk before the reply. The expiry time is not: after a restart every holder gets
+  its full time again, so the coordinator's downtime costs no host its claim.
+- A holder that requests its claim again, also after its own restart, keeps it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAX_RESULT_BYTES = 1 << 16
 
 
 class ClaimRow(msgspec.Struct, frozen=True, kw_only=True):
-    """What is on disk of a claim."""
+    """The stored part of a claim."""
 
     holder: str
     run: str = ""
@@ -39,17 +39,20 @@ _rows = msgspec.msgpack.Decoder(ClaimRow)
 
 
 class Claims:
-    """All claims; read from the store when the first is asked for."""
+    """All claims; loaded from the store on the first request."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
         self._rows: dict[tuple[str, str], ClaimRow] | None = None
         self._until: dict[tuple[str, str], float] = {}
-        """When a held claim's time is up, Unix seconds."""
+        """Expiry of each held claim, Unix seconds."""
         self._one_at_a_time = asyncio.Lock()
 
     async def ask(self, message: Claim, now: float) -> ClaimState:
-        """Takes, renews, gives back or settles. RefusedError for what cannot be asked, StorageError when the disk refuses."""
+        """Takes, renews, gives back or settles a claim.
+
+        Raises RefusedError for an invalid request, StorageError when the disk refuses.
+        """
         _check(message)
         async with self._one_at_a_time:
             rows = await self._loaded(now)

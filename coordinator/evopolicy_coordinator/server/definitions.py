@@ -1,12 +1,14 @@
-"""Which definitions of environments a cluster plays: a worker could announce an easier one, or a text that prompts agents.
+"""Decides which definitions of environments a cluster plays.
+
+A worker could announce an easier definition, or a task text that prompts agents.
 
 Rules that this module owns:
-- An environment that ships is taken in its shipped definition alone. An announcement of another one is not listened to, and the
-  worker is told.
-- Any other environment needs the operator's word for its definition: with the request (`ID@DIGEST`), or once and for all
-  (`approve`, kept in the state folder).
-- A coordinator that trusts its workers, as that of a local command does, takes what they announce.
-- What a definition tells is bounded, and has no characters that cannot be seen.
+- An environment that ships is accepted in its shipped definition only. Other announcements are ignored, and the
+  worker is notified.
+- Any other environment needs the operator's approval of its definition: with the request (`ID@DIGEST`), or
+  permanently (`approve`, stored in the state folder).
+- A coordinator that trusts its workers, such as that of a local command, accepts their announcements.
+- The texts of a definition are bounded and have no unprintable characters.
 """
 
 from __future__ import annotations
@@ -29,28 +31,29 @@ MAX_TEXT = 64 << 10
 MAX_SPACE_BYTES = 1 << 20
 MAX_NAME = 120
 LEAST_DIGITS = 8
-"""Of a digest that an operator names."""
+"""Minimum length of a digest that an operator names, hex digits."""
 
 
 class Definitions:
-    """What is accepted, and what the operator has approved."""
+    """The accepted definitions, and those that the operator has approved."""
 
     def __init__(
         self, file: Path | None = None, *, shipped: Mapping[str, str] | None = None, trusting: bool = True
     ) -> None:
-        """`file`: where approvals are kept; None: nowhere. `shipped`: id to the first digits of its definition's digest."""
+        """`file`: where approvals are stored; None: not stored. `shipped`: by environment id, the first digits of its
+        definition's digest."""
         self._file = file
         self._shipped = shipped or {}
         self._trusting = trusting
         self.approved: dict[str, list[str]] = {}
-        """By environment the definitions that the operator has approved, the latest last."""
+        """By environment, the definitions that the operator has approved, the latest last."""
         if file is not None and file.exists():
             self.approved = msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
 
     def admit(
         self, announced: Iterable[EnvironmentDescription]
     ) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
-        """The descriptions that are listened to, and by environment why another is not."""
+        """Returns the accepted descriptions, and by environment the reason why another is refused."""
         refused = {each.env: why for each in announced if (why := self._fault(each))}
         return tuple(each for each in announced if each.env not in refused), refused
 
@@ -71,10 +74,10 @@ class Definitions:
         return ""
 
     def pin(self, env: str, asked: str, workers: Iterable[Worker]) -> str:
-        """The definition that a run or an evaluation of `env` is played in; empty: any that is accepted.
+        """Returns the definition that a run or an evaluation of `env` is played in; empty: any accepted one.
 
-        `asked`: the first digits of the one that the operator has named. RefusedError, with what is near and what to do, when
-        nobody offers it, or the operator has not approved it.
+        `asked`: the first digits of the digest that the operator named. Raises RefusedError, with similar names and
+        the remedy, when no worker offers it or the operator has not approved it.
         """
         if self._trusting and not asked:
             return ""
@@ -115,7 +118,7 @@ class Definitions:
         found = [each for each in offers if each.startswith(asked) or asked.startswith(each)]
         if len(found) == 1:
             return found[0]
-        if self._trusting and not offers:  # its worker is about to come
+        if self._trusting and not offers:  # its worker is about to register
             return asked[:DEFINITION_DIGITS]
         offered = ", ".join(offers) or "none"
         raise RefusedError(
@@ -123,7 +126,7 @@ class Definitions:
         )
 
     def approve(self, env: str, asked: str, workers: Iterable[Worker]) -> None:
-        """The operator's word for a definition, kept. RefusedError when nobody offers it."""
+        """Approves a definition and stores the approval. Raises RefusedError when no worker offers it."""
         offers = {
             each.profile.fingerprints[env].definition: None
             for each in workers
@@ -163,12 +166,12 @@ class Definitions:
 
 
 def digits(description: EnvironmentDescription) -> str:
-    """The digest of a definition as people name it."""
+    """The shortened digest of a definition, as shown to people."""
     return description.digest()[:DEFINITION_DIGITS]
 
 
 def _unreadable(description: EnvironmentDescription) -> str:
-    """What of a description is too large, or cannot be seen; empty for nothing."""
+    """Describes a part that is too large or unprintable; empty when there is none."""
     texts = {
         "task text": description.task_text,
         "title": description.title,

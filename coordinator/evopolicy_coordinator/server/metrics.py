@@ -1,7 +1,7 @@
-"""Metrics in Prometheus' text format: what the core's effects tell, and the status at the time of asking.
+"""Metrics in Prometheus' text format: counters from the core's effects, and the status at the time of each scrape.
 
-Names and units follow Prometheus' conventions: a prefix, base units (seconds, bytes), `_total` for counters. No label holds a
-run, an agent or a worker: their number is not bounded, and hidden results have no place here.
+Names and units follow Prometheus' conventions: a prefix, base units (seconds, bytes), `_total` for counters. No label
+names a run, an agent or a worker: their number is unbounded, and hidden results must not appear here.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ _PHASES = ("open", "validation", "heldout", "random", "finished")
 
 
 class Meter:
-    """Counts what a coordinator's core does, from the effects of each step."""
+    """Counts a core's activity from the effects of each step."""
 
     def __init__(self, state: Path, status: Callable[[], operator.StatusReply | None]) -> None:
-        """`state`: the state folder, whose size is told. `status` is asked at every reading; None while there is no core."""
+        """`state`: the state folder, whose size is reported. `status` is called at every scrape; it returns None
+        while no core is loaded."""
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         self.registry.register(StatusCollector(status))
@@ -71,10 +72,10 @@ class Meter:
             registry=self.registry,
         )
         self._open: set[tuple[str, int]] = set()
-        """Submits without a verdict: a row of one may be stored again after its end, and counts once."""
+        """Submits without a verdict. A submit's row may be stored again after its end, and must count once."""
 
     def loaded(self, core: Core) -> None:
-        """A core was loaded from the store."""
+        """Resets the open submits to those of a newly loaded core."""
         self._open = {
             (run.id, row.submit_index)
             for run in core.state.runs.values()
@@ -83,7 +84,7 @@ class Meter:
         }
 
     def observe(self, effects: Iterable[Effect]) -> None:
-        """Takes the effects of one step."""
+        """Counts the effects of one step."""
         for effect in effects:
             if isinstance(effect, Persist):
                 for row in effect.rows:
@@ -98,7 +99,7 @@ class Meter:
                 self._events.labels(effect.event, effect.level).inc()
 
     def text(self) -> bytes:
-        """All of it now."""
+        """All metrics in the text format."""
         return generate_latest(self.registry)
 
     def _outcome(self, row: OutcomeRow) -> None:
@@ -123,7 +124,7 @@ class Meter:
 
 
 class StatusCollector(Collector):
-    """Gauges of a status."""
+    """Gauges from a status reply."""
 
     def __init__(self, status: Callable[[], operator.StatusReply | None]) -> None:
         self._status = status
@@ -192,7 +193,7 @@ class StatusCollector(Collector):
 
 
 class _StoreCollector(Collector):
-    """Sizes of the state folder."""
+    """Sizes of the state folder's database and of the free disk space."""
 
     def __init__(self, state: Path) -> None:
         self._state = state

@@ -1,4 +1,4 @@
-"""`--metrics ADDRESS`: `/metrics` and `/healthz` of a coordinator over HTTP, on its own event loop."""
+"""`--metrics ADDRESS`: serves a coordinator's `/metrics` and `/healthz` over HTTP, on the coordinator's event loop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from evopolicy_coordinator.server.metrics import CONTENT_TYPE, Meter
 
 @contextlib.asynccontextmanager
 async def metrics_server(address: str, meter: Meter, healthy: Callable[[], bool]) -> AsyncIterator[int]:
-    """Serves inside the `async with`; gives the port. ConfigError for an address that is none, or cannot be listened on."""
+    """Serves inside the `async with`; yields the port.
+
+    Raises ConfigError for an invalid address, or one that cannot be listened on.
+    """
     host, colon, port = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not colon or not host or not port.isdecimal() or int(port) >= 1 << 16:
@@ -58,7 +61,7 @@ async def metrics_server(address: str, meter: Meter, healthy: Callable[[], bool]
 
 
 class _Server(uvicorn.Server):
-    """Leaves signals to the coordinator."""
+    """A uvicorn server that leaves signals to the coordinator."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -1,6 +1,6 @@
-"""One coordinator process: everything opened in order, and closed in reverse.
+"""One coordinator process: opens all its parts in order and closes them in reverse.
 
-The state folder is locked first and released last; workers are told nothing before the core is loaded.
+The state folder is locked first and released last. Workers get no replies before the core is loaded.
 """
 
 from __future__ import annotations
@@ -37,32 +37,33 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """What a coordinator is started with."""
+    """Start options of a coordinator."""
 
     state: Path
     data: Path | None = None
-    """Folder of split files; None derives the splits from the state folder's secret."""
+    """Folder of split files; None: derive the splits from the state folder's secret."""
     listen: tuple[str, ...] = ()
-    """Endpoints beside the unix socket in the state folder; port 0 takes a free one."""
+    """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
-    """Whether `tcp/` may be listened on beyond this machine, where tokens and results can be read on the wire."""
+    """Whether to allow `tcp/` beyond this machine, where tokens and results can be read on the wire."""
     cluster: str | None = None
     allowed_packages: tuple[str, ...] = ()
-    """What workers let policies import beside numpy; told in `/info`."""
+    """Packages that workers let policies import besides numpy; listed in `/info`."""
     unjailed: bool = False
-    """Agents of its runs may read the state folder: they play cases of their own; see `splits.secret_of`."""
+    """Whether agents of its runs may read the state folder. Such runs play cases of their own; see
+    `splits.secret_of`."""
     trust_workers: bool = False
-    """Take whatever environments the workers announce."""
+    """Accept any environment definition that workers announce."""
     core: CoreSettings = CoreSettings()
     metrics: str | None = None
-    """HOST:PORT of `/metrics` and `/healthz`; None for none."""
+    """HOST:PORT of `/metrics` and `/healthz`; None: not served."""
 
 
 async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:
-    """Serves until `stop` is set, then makes all durable and returns.
+    """Serves until `stop` is set, then makes everything durable and returns.
 
     Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
-    TransportError when an endpoint cannot be listened on, PartFailedError when a part of it cannot go on.
+    TransportError when it cannot listen on an endpoint, PartFailedError when a part cannot continue.
     """
     with contextlib.ExitStack() as opened:
         state = StateFolder.open(options.state, options.cluster)
@@ -77,7 +78,8 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         opened.callback(store.close)
         ended = state.root / WORKERS_ENDED
         if ended.exists():
-            # Else the first agent would wait for `silent_bar_s`, as a worker of the last command might still play.
+            # Otherwise the first agent would wait for `silent_bar_s`, as a worker of the last command might still
+            # play.
             store.forget_kernels(host.boot_id())
             ended.unlink()
         blobs = BlobStore(state.root / "blobs")
@@ -102,7 +104,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         serving = contextlib.AsyncExitStack()
         try:
             if options.metrics is not None:
-                # Here, not above: without the option nobody waits for its imports.
+                # Imported here so that a start without the option does not wait for these modules.
                 from evopolicy_coordinator.server.metrics import Meter
                 from evopolicy_coordinator.server.metrics_server import metrics_server
 
@@ -133,7 +135,8 @@ async def _serve(
     on_ready: Callable[[Ready], None],
     note: str,
 ) -> None:
-    """Serves this machine on `listen` until `stop`; other machines are served on `remote` meanwhile."""
+    """Serves this machine on `listen` until `stop` is set. Other machines are served on `remote` by a listener of
+    their own."""
     cluster = state.identity.cluster
     state.write_passwords()
     endpoints = reachable(listen)
@@ -156,12 +159,12 @@ async def _serve(
             log.info("stopping")
         finally:
             credentials.withdraw(endpoints)
-            # While the sessions are still open: what was handled is answered, everyone else is let go.
+            # While the sessions are still open: handled queries get their replies, all others are dropped.
             await service.stop()
 
 
 async def _until(stop: asyncio.Event, service: Service) -> None:
-    """Waits for `stop`; PartFailedError as soon as the service cannot go on."""
+    """Waits for `stop`. Raises PartFailedError as soon as the service cannot continue."""
     waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.failure())]
     try:
         done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
@@ -176,7 +179,7 @@ async def _until(stop: asyncio.Event, service: Service) -> None:
 def _listen(
     state: StateFolder, options: Options, machines: Machines
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Where to listen for this machine (the state folder's socket, always, and what was asked for), and for others."""
+    """Returns the endpoints for this machine (always the state folder's socket) and those for other machines."""
     for endpoint in options.listen:
         _check_listen(endpoint, options.insecure_tcp, machines)
     wanted = resolve_listen(list(options.listen))

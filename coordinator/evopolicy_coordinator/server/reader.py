@@ -1,10 +1,10 @@
-"""Answers that are read from the store or the blob folder, on threads of their own, and sent from there.
+"""Replies that are read from the store or the blob folder on threads of their own, and sent from there.
 
 Rules that this module owns:
-- A gateway's page is made of the train outcomes of its own run and of nothing else; what an `EpisodeOutcome` holds
-  beyond `EpisodeFeedback` (wall times, CPU) does not travel.
-- A page never grows past `MAX_PAGE_BYTES` (unless one episode does), so no reply holds up its lane for long.
-- The chunks of one blob are written by one thread, in order.
+- A gateway's page contains train outcomes of its own run only. Fields of `EpisodeOutcome` that `EpisodeFeedback`
+  lacks (wall times, CPU) are not sent.
+- A page never exceeds `MAX_PAGE_BYTES` (unless one episode does), so that no reply blocks its lane for long.
+- One thread writes the chunks of one blob, in order.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ _BLOB_LANES = 4
 _NO_BYTES = BlobRef(digest=digest_of(b""), size=0, inline=b"")
 
 Answer = Callable[[Message | None], None]
-"""Sends the answer, from any thread; None ends the query without one, so that it is asked again."""
+"""Sends the reply, from any thread; None ends the query without one, so that the client retries."""
 
 
 class ServiceReader:
-    """Reads pages and blobs. Every method returns at once; the answer is given later, from a thread."""
+    """Reads pages and blobs. Every method returns at once; a thread sends the reply later."""
 
     def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
         self._database = database
@@ -71,24 +71,25 @@ class ServiceReader:
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
     def page(self, effect: ReadResults | ReadEvaluation | ReadFinished, answer: Answer) -> None:
-        """Answers a read that the core asked for."""
+        """Replies with a page that the core requested."""
         self._pages.submit(self._answer, lambda: self._page(effect), answer)
 
     def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
-        """Reads and compares recordings, one audit after another; `tell` is called from the thread."""
+        """Reads and compares recordings, one audit after another; calls `tell` from its thread."""
         self._audits.submit(self._audit, effect, tell)
 
     def put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int, answer: Answer) -> None:
-        """Stores one chunk of a blob of at most `max_bytes`. The sender's right to put is the caller's to check.
+        """Stores one chunk of a blob of at most `max_bytes`. The caller must check the sender's right to upload.
 
-        With `run`, whose gateway it is, what others have stored is not told: all bytes are wanted, and noted then.
+        With `run`, the gateway's own, the reply does not reveal which bytes others have stored: all bytes are
+        requested, then recorded.
         """
         self._lane(message.digest).submit(
             self._answer, lambda: self._put(sender, run, message, max_bytes), answer
         )
 
     def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
-        """Sends one chunk of a blob; with `run`, only of one that this run's train feedback names."""
+        """Sends one chunk of a blob; with `run`, only if this run's train feedback names the blob."""
         self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
 
     def recorded(self, message: RecordedRequest, answer: Answer) -> None:
@@ -96,12 +97,15 @@ class ServiceReader:
         self._pages.submit(self._answer, lambda: self._recorded(message), answer)
 
     def published(self, message: JournalRequest | OpeningRequest | SignRequest, answer: Answer) -> None:
-        """Sends what is published of runs whose cases are disclosed, or signs it."""
+        """Sends the published records of runs whose cases are disclosed, or signs a digest."""
         work = {JournalRequest: self._journal, OpeningRequest: self._opening, SignRequest: self._sign}
         self._pages.submit(self._answer, lambda: work[type(message)](message), answer)  # type: ignore[operator]
 
     def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:
-        """The epochs of finished runs that are to be published, each once. Reads the database; RefusedError otherwise."""
+        """The distinct epochs of finished runs that are to be published. Reads the database.
+
+        Raises RefusedError for a run that is unknown, unfinished, or has no commitment.
+        """
         found: dict[str, None] = {}
         for run in runs:
             row = self.finished_run(run)
@@ -119,7 +123,7 @@ class ServiceReader:
     def finished_run(self, run: str) -> RunRow | None:
         """A finished run as it was created; None for any other run. Reads the database.
 
-        RefusedError when the row cannot be read.
+        Raises RefusedError when the row cannot be read.
         """
         try:
             return self._reader.run(run) if run and self._reader.finished(run) is not None else None
@@ -140,7 +144,7 @@ class ServiceReader:
             refused = damaged(error)
             answer(Refused(status=refused.status, message=refused.message))
         except StorageError as error:
-            # Ours to mend: whoever asked asks again.
+            # Our own fault: the client retries.
             log.error("cannot answer from the store", error=str(error))
             answer(None)
         except Exception:
@@ -148,13 +152,13 @@ class ServiceReader:
             answer(None)
 
     def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
-        # With numpy, which a coordinator that audits nothing does without.
+        # Needs numpy, which a coordinator without audits never imports.
         from evopolicy_coordinator.server import auditing
 
         try:
             tell(auditing.carry_out(effect, self._reader, self._blobs))
         except Exception:
-            # The audit stays open, and is given up in time.
+            # The audit stays open until its timeout.
             log.exception("cannot audit", audit=effect.audit)
 
     @property
@@ -181,7 +185,8 @@ class ServiceReader:
             return Refused(
                 status=Refusal.UNKNOWN_SUBMIT, message=f"this run has no submit {effect.submit_index}"
             )
-        # The row may have moved on since the core asked: an end is told with all that belongs before it.
+        # The row may have changed since the core's request. An end is reported with all episodes that belong before
+        # it.
         upto = row.released if effect.upto is None or row.status is not None else effect.upto
         group = records.train_group(effect.run, effect.submit_index)
         page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
@@ -280,7 +285,7 @@ class ServiceReader:
 
 
 def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
-    """What an agent may see of a train episode."""
+    """The part of a train episode's outcome that an agent may see."""
     return EpisodeFeedback(
         index=outcome.index,
         episode_return=outcome.episode_return,
@@ -296,19 +301,19 @@ def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
 
 
 def damaged(error: DamagedStoreError) -> RefusedError:
-    """What whoever asks for a row that cannot be read is told: asking again does not help. The log names the row."""
+    """The refusal for a row that cannot be read: retrying does not help. Logs the row's name."""
     log.error("what is stored cannot be read", error=str(error))
     text = "what the coordinator has stored of this cannot be read; its log names the row and the remedy"
     return RefusedError(Refusal.DAMAGED, text)
 
 
 def lane_of(asker: str) -> int:
-    """Answers to one asker go in order."""
+    """Lane of a client's replies: those to one client are sent in order."""
     return crc32(asker.encode())
 
 
 def answer_bytes(message: Message) -> bytes:
-    """The bytes of an answer; of a refusal where they would be more than can be sent, lest it be asked for again for ever."""
+    """Encodes a reply. One that is too large to send becomes a refusal, or its client would retry for ever."""
     try:
         return codec.encode(message)
     except ProtocolError as error:
@@ -317,7 +322,7 @@ def answer_bytes(message: Message) -> bytes:
 
 
 def answer_to(query: IncomingQuery, asker: str) -> Answer:
-    """Answers the query, or ends it without an answer."""
+    """Returns a function that replies to the query, or ends it without a reply."""
 
     def answer(message: Message | None) -> None:
         if message is None:

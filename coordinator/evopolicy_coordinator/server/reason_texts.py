@@ -1,7 +1,7 @@
-"""The core's reasons in words: what operators, gateways and, through them, agents read.
+"""Texts of the core's reasons for operators, gateways and, through them, agents.
 
-Rule that this module owns: nothing of audits and of hidden results reaches an agent; of what keeps a submit waiting it is told no
-more than that hidden cases of another run do.
+Rule that this module owns: agents learn nothing of audits and of hidden results. Of the reasons why a submit waits,
+an agent learns at most that hidden cases of another run are being scored.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...]) ->
     wanted = f"a worker that offers {env} with sandbox tier {tier}"
     if same_versions:
         wanted += ", of the same versions as the run began with"
-    # Nothing of audits reaches an agent.
+    # Agents must learn nothing of audits.
     states = sorted("out of service" if state == "quarantined" else state for state in away)
     return f"{wanted}: those that do are {' or '.join(states)}" if states else wanted
 
@@ -93,11 +93,11 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "free_slot": FREE_SLOT,
     "audits": "{n} audits of its episodes on other workers",
 }
-"""By code: a text with the names of what the reason is about, or a function of them."""
+"""By code: a text with placeholders for the reason's details, or a function of them."""
 
 
 def words(reason: Reason | None) -> str:
-    """A reason in words; empty for none."""
+    """A reason as text; empty for None."""
     if reason is None:
         return ""
     text = TEXTS[reason.code]
@@ -106,7 +106,7 @@ def words(reason: Reason | None) -> str:
 
 
 def message(effect: Reply | Refuse) -> Message:
-    """What goes to the asker: the effect's message, with its reason in words."""
+    """The reply for the client: the effect's message, with its reason as text."""
     if isinstance(effect, Refuse):
         return Refused(status=effect.status, message=words(effect.reason))
     told = effect.message

@@ -1,4 +1,4 @@
-"""Workers whose registration was refused: remembered for a while, so that `evopolicy status` can tell why one is missing."""
+"""Remembers refused registrations for a while, so that `evopolicy status` can explain why a worker is missing."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from evopolicy_common.messages.worker import Message, Refused, Register
 from evopolicy_common.wire import codec
 
 KEPT = 32
-"""So many names; whoever knows the transport's password could make up any number."""
+"""Maximum number of names: anyone with the transport's password could make up any number of them."""
 KEPT_S = 24 * 3600.0
 _MAX_TEXT = 500
 
 
 class RefusedWorkers:
-    """The last refusals by the worker's name."""
+    """The last refusal of each worker, by name."""
 
     def __init__(self) -> None:
         self._last: OrderedDict[str, tuple[str, str, float]] = OrderedDict()
 
     def answered(self, key: str, payload: bytes, answer: Message, now: float) -> None:
-        """Takes note of the answer to a request, if that was to register; a worker that was taken is forgotten here."""
+        """Records the reply if the request was a registration: stores a refusal, and forgets the worker otherwise."""
         if not key.endswith("/work/register"):
             return
         try:
@@ -39,7 +39,7 @@ class RefusedWorkers:
                 self._last.popitem(last=False)
 
     def told(self, now: float) -> tuple[TurnedAway, ...]:
-        """What is remembered, the oldest first."""
+        """The remembered refusals, oldest first."""
         return tuple(
             TurnedAway(worker=worker, host=host, why=why, ago_s=max(0.0, now - at))
             for worker, (host, why, at) in self._last.items()

@@ -1,12 +1,12 @@
-"""The session that other machines reach over TLS, beside the one for this machine.
+"""The session that other machines reach over TLS, separate from the one for this machine.
 
 Rules:
-- It has its own passwords and access rules: what lets a process of this machine in is worth nothing here, and the other
-  way round.
-- Zenoh reads passwords, rules and certificates when a session is opened. So whenever a machine is issued or revoked, this
-  session is closed, which cuts every link, and opened anew; who may still come in is back by itself within a second. No
-  request is lost by it: all of ours are asked again.
-- A session that cannot be opened again (its port is not free yet) is tried again until it can.
+- It has its own passwords and access rules. Credentials of this machine's processes are not valid here, and vice
+  versa.
+- Zenoh reads passwords, rules and certificates when it opens a session. So when a machine is issued or revoked, this
+  session is closed, which cuts every link, and reopened. Machines that are still admitted reconnect within a second.
+  No request is lost, as our clients retry all of them.
+- If the session cannot be reopened (its port is not free yet), opening is retried until it succeeds.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from evopolicy_coordinator.pki.machines import Machines
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 LOOK_S = 0.5
-"""How often it looks whether a machine was issued or revoked."""
+"""Interval between checks for issued or revoked machines."""
 _PAUSE_S = 0.25
 
 
 def declare_all(server: Server, cluster: str, on_liveliness: Callable[[str, bool], None]) -> None:
-    """What a coordinator's session answers and watches."""
+    """Declares the keys that a coordinator's session answers, and the liveliness tokens that it watches."""
     server.declare((keys.worker_expr(cluster), keys.gateway_expr(cluster), keys.operator_expr(cluster)))
     server.watch_liveliness(keys.liveliness_expr(cluster), on_liveliness)
 
@@ -43,9 +43,9 @@ async def remote_listener(
     on_queries: Callable[[list[IncomingQuery]], None],
     on_liveliness: Callable[[str, bool], None],
 ) -> AsyncIterator[None]:
-    """Listens on these `tls/` endpoints inside the `async with`; on none, it does nothing.
+    """Listens on these `tls/` endpoints inside the `async with`; without endpoints it does nothing.
 
-    Raises ConfigError before `certs init`, TransportError when an endpoint cannot be listened on.
+    Raises ConfigError before `certs init`, TransportError when it cannot listen on an endpoint.
     """
     if not listen:
         yield

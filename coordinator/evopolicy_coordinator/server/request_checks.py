@@ -1,4 +1,4 @@
-"""What is checked of a request on its own, without asking the store or the core: RefusedError where it does not hold."""
+"""Checks of a request by itself, without the store or the core. They raise RefusedError when a check fails."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_COUNT = 2**31 - 1
 MAX_BUDGET = 20_000
 MAX_EPISODES_PER_SUBMIT = 10_000
 MAX_HIDDEN = 10_000
-"""Validation or held-out cases of a run. What is told of a run once it is finished has to fit into one message."""
+"""Validation or held-out cases of a run. The report of a finished run must fit into one message."""
 MAX_JOB_BYTES = 8 << 20
 MAX_AGENT_BYTES = 256 << 10
 _MAX_WAIT_S = 60.0
@@ -28,17 +28,17 @@ _MAX_NAME = 200
 
 
 def finite_wait(seconds: float) -> float:
-    """A long poll's wait, made finite: NaN decodes."""
+    """Bounds a long poll's wait to 0–60 s; NaN, which decodes, becomes 0."""
     return min(seconds, _MAX_WAIT_S) if seconds > 0 else 0.0
 
 
 def finite_cursor(cursor: int) -> int:
-    """A cursor within what can be stored."""
+    """Bounds a cursor to the range that can be stored."""
     return min(max(0, cursor), MAX_COUNT)
 
 
 def check_limits(limits: ResourceLimits) -> None:
-    """Every limit is a finite number above zero, and no larger than can be kept."""
+    """Checks that every limit is a finite number above zero and at most its storable maximum."""
     for name in limits.__struct_fields__:
         value = getattr(limits, name)
         most = LARGEST_LIMITS.get(name, LARGEST_LIMIT)
@@ -49,7 +49,7 @@ def check_limits(limits: ResourceLimits) -> None:
 
 
 def check_counts(budget: int, least: int, most: int, n_validation: int | None, n_heldout: int | None) -> None:
-    """How many episodes a run may have."""
+    """Checks the episode counts of a run."""
     if not 1 <= least <= most:
         raise RefusedError(
             Refusal.INVALID_SETTINGS,
@@ -66,7 +66,7 @@ def check_counts(budget: int, least: int, most: int, n_validation: int | None, n
 
 
 def check_job(cases: Sequence[Case], n: int) -> None:
-    """`n` episodes on these cases fit into one lease, as they have to with policy scope `submit`."""
+    """Checks that `n` episodes on these cases fit into one lease, as policy scope `submit` requires."""
     longest = max((len(msgspec.msgpack.encode(case)) for case in cases), default=0)
     if n * (longest + 200) > MAX_JOB_BYTES:
         raise RefusedError(
@@ -77,7 +77,10 @@ def check_job(cases: Sequence[Case], n: int) -> None:
 
 
 def bounded_agent(agent: dict[str, Any]) -> dict[str, Any]:
-    """What a gateway says of its agent; no more than can be told of a finished run. A run is closed in any case."""
+    """The gateway's description of its agent, replaced by a note when too large for a finished run's message.
+
+    Never refuses: a run must close in any case.
+    """
     size = len(msgspec.msgpack.encode(agent))
     if size <= MAX_AGENT_BYTES:
         return agent
@@ -85,7 +88,7 @@ def bounded_agent(agent: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_token(expected: str, given: str) -> None:
-    """The token is the one expected, compared in constant time."""
+    """Compares the token with the expected one, in constant time."""
     if not hmac.compare_digest(expected.encode(), given.encode()):
         raise RefusedError(
             Refusal.BAD_TOKEN, "wrong token, or one of something that is not here; see the credentials file"
@@ -93,13 +96,13 @@ def check_token(expected: str, given: str) -> None:
 
 
 def check_key(tail: str, expected: str) -> None:
-    """The message came on the key that its kind belongs on."""
+    """Checks that the message came on the key of its kind."""
     if tail != expected:
         raise RefusedError(Refusal.WRONG_KEY, f"this message belongs on {expected!r}, not on {tail!r}")
 
 
 def check_idempotency_key(key: str) -> None:
-    """A key has a bounded length."""
+    """Checks the key's length."""
     if not 1 <= len(key) <= _MAX_NAME:
         raise RefusedError(
             Refusal.BAD_MESSAGE, f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
@@ -107,7 +110,7 @@ def check_idempotency_key(key: str) -> None:
 
 
 def check_registration(message: worker.Register) -> None:
-    """The worker speaks this protocol, under a name that can stand in a key."""
+    """Checks that the worker speaks this protocol, under a name that is valid in a key expression."""
     if message.protocol != codec.WIRE_VERSION:
         raise RefusedError(
             Refusal.WRONG_PROTOCOL,
@@ -125,7 +128,7 @@ def check_registration(message: worker.Register) -> None:
 
 
 def check_place(boot_id: str, machine_id: str, host: str) -> None:
-    """Names of a kernel, a machine and a host have a bounded length."""
+    """Checks the lengths of a boot id, a machine id and a host name."""
     for name, value in (("boot id", boot_id), ("machine id", machine_id), ("host name", host)):
         if len(value) > _MAX_NAME or not value.isprintable():
             raise RefusedError(
@@ -134,7 +137,7 @@ def check_place(boot_id: str, machine_id: str, host: str) -> None:
 
 
 def check_begun(ref: BlobRef | None) -> None:
-    """What a job goes on from is bounded, and fits into a lease."""
+    """Checks that a job's stored start state is bounded and fits into a lease."""
     check_inline(ref)
     if ref is None:
         return
@@ -147,7 +150,7 @@ def check_begun(ref: BlobRef | None) -> None:
 
 
 def check_inline(ref: BlobRef | None) -> None:
-    """Bytes that came inside a message are the blob they are said to be."""
+    """Checks that inline bytes match the blob reference's digest and size."""
     if ref is None or ref.inline is None:
         return
     if len(ref.inline) != ref.size or digest_of(ref.inline) != ref.digest:

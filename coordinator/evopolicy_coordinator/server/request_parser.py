@@ -1,10 +1,10 @@
-"""From bytes on a key to an event for the core, or to a refusal: decoding and the check of every token.
+"""Turns bytes received on a key into an event for the core or a refusal: decodes them and checks every token.
 
 Rules that this module owns:
-- A message is served only on the very key that its kind belongs on (a gateway's only under its own run), so that what
-  Zenoh's access control grants is what is granted.
-- Tokens are compared in constant time. A wrong capability and an unknown run are answered alike.
-- Whatever is refused here has changed nothing.
+- A message is served only on the exact key of its kind (a gateway's only under its own run), so that Zenoh's access
+  control covers all that is served.
+- Tokens are compared in constant time. A wrong capability and an unknown run get the same reply.
+- A request that is refused here has changed nothing.
 """
 
 from __future__ import annotations
@@ -71,24 +71,24 @@ _VERBS: dict[type[Message], str] = {
 
 
 class Rights(Protocol):
-    """What the core knows of who may do what."""
+    """The core's knowledge of access rights."""
 
     def capability(self, run: str) -> str | None:
         """The token of a run's gateway; None for an unknown run."""
 
 
 class Parsed(msgspec.Struct, frozen=True):
-    """A request whose speaker is known and allowed to ask it."""
+    """A request whose sender is authenticated and allowed to make it."""
 
     room: str
     """`work`, `gw`, `ops`."""
     asker: str
-    """The worker's or run's name; `operator`."""
+    """The worker's or the run's name, or `operator`."""
     message: Message
 
 
 class RequestParser:
-    """Reads requests. Holds no state of its own."""
+    """Parses requests. Holds no state of its own."""
 
     def __init__(
         self,
@@ -102,8 +102,8 @@ class RequestParser:
         machines: Machines | None = None,
         definitions: Definitions | None = None,
     ) -> None:
-        """`machines`: those that hold tokens of their own, beside the state folder's; None: no others. `definitions`: which
-        environments are accepted; None: all."""
+        """`machines`: other machines that hold tokens of their own, besides the state folder's; None: no others.
+        `definitions`: the accepted environments; None: all."""
         self.definitions = definitions or Definitions()
         self._identity = identity
         self._blobs = blobs
@@ -115,7 +115,10 @@ class RequestParser:
         self._prefix = keys.worker_key(identity.cluster, "")[: -len("work/")]
 
     def parse(self, key: str, payload: bytes, rights: Rights) -> Parsed:
-        """The request in `payload`; RefusedError for a wrong token or key, ProtocolError for what is no message."""
+        """Decodes the request in `payload` and checks its key and token.
+
+        Raises RefusedError for a wrong token or key, ProtocolError when the payload is not a message.
+        """
         room, _, tail = key.removeprefix(self._prefix).partition("/")
         if room == "work":
             return self._parse_worker(tail, payload)
@@ -135,7 +138,7 @@ class RequestParser:
             check_registration(message)
         else:
             self._check_session(message.token if isinstance(message, BlobPut | BlobGet) else message.session)
-        # Everyone else names a session, which the core knows or refuses.
+        # All other messages name a session, which the core checks.
         name = message.sender if isinstance(message, BlobPut | BlobGet) else message.worker
         return Parsed("work", name, message)
 
@@ -148,7 +151,7 @@ class RequestParser:
         return Parsed("gw", run, message)
 
     def _check_token(self, role: Role, local: str, given: str) -> None:
-        """Whether it is this machine's token for the role, or an admitted other machine's."""
+        """Checks that the token is this machine's for the role, or one of an admitted other machine."""
         if self._machines is None or self._machines.holder(role, given) is None:
             check_token(local, given)
 
@@ -160,11 +163,11 @@ class RequestParser:
             )
 
     def is_gateways(self, key: str) -> bool:
-        """Whether gateways ask on this key: what is answered there, an agent may come to see."""
+        """Whether the key is a gateway's: its agent may see the replies."""
         return key.startswith(f"{self._prefix}gw/")
 
     def asks_for_change(self, key: str, payload: bytes) -> bool:
-        """Whether the request would make something new (a run, a submit, an evaluation); its token is not looked at."""
+        """Whether the request would create something (a run, a submit, an evaluation). Does not check the token."""
         room = key.removeprefix(self._prefix).partition("/")[0]
         try:
             if room == "gw":
@@ -176,15 +179,15 @@ class RequestParser:
 
     @staticmethod
     def reads_files(message: Message) -> bool:
-        """Whether `event` reads splits or blobs for it."""
+        """Whether `event` reads splits or blobs for the message."""
         if isinstance(message, worker.ReportResults):
             return any(result.packed is not None for result in message.results)
         return isinstance(message, operator.CreateRun | operator.Evaluate | operator.Disclose)
 
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
-        """The event that the request is for the core; RefusedError when it cannot be served as it is.
+        """Returns the event that the request is for the core. Raises RefusedError when it cannot be served.
 
-        Not for blob and status requests. What `reads_files` belongs on a thread.
+        Not for blob and status requests. Call it on a thread for messages that `reads_files`.
         """
         message = parsed.message
         if isinstance(message, _WITH_CURSOR):
@@ -229,7 +232,7 @@ class RequestParser:
         return replace(m, results=results)
 
     def _unpacked(self, result: worker.JobResult) -> worker.JobResult:
-        """The result with its outcomes, where these came as a blob."""
+        """Returns the result with its outcomes unpacked when they came as a blob."""
         if result.packed is None:
             return result
         self._check_stored(result.packed)
@@ -323,7 +326,11 @@ class RequestParser:
     def evaluation_requested(
         self, m: operator.Evaluate, request: int, stimulus: str, of: RunRow | None = None
     ) -> AnyEvent:
-        """`of`: the finished run that it plays again: its policy seeds, and its cases where they came from a secret."""
+        """Builds the event of an evaluation.
+
+        `of`: the finished run whose episodes are replayed. It supplies the policy seeds, and the cases if they came
+        from a secret.
+        """
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle)
         check_limits(m.limits)
@@ -372,7 +379,7 @@ class RequestParser:
         return events.EvaluationRequested(stimulus_id=stimulus, request=request, message=m, row=row)
 
     def _check_profile(self, wanted: operator.RunSettings) -> None:
-        """ConfigError where a run of profile `published` has other settings, or would play other than case files."""
+        """Raises ConfigError when a run of profile `published` has other settings, or would not play case files."""
         if wanted.profile == "own":
             return
         if differences := operator.off_profile(wanted):
@@ -392,9 +399,9 @@ class RequestParser:
             )
 
     def split_hashes(self, m: operator.DescribeEnvironment, of: RunRow | None = None) -> dict[str, str]:
-        """SHA-256 of each split of an environment. Reads files; RefusedError where there are no such splits.
+        """SHA-256 of each split of an environment. Reads files; raises RefusedError when the splits are missing.
 
-        `of`: the finished run that is asked about: its own where its cases came from a secret.
+        `of`: the finished run in question, whose own hashes are returned when its cases came from a secret.
         """
         if (run := _derived(of)) is not None:
             return run.split_hashes
@@ -414,7 +421,7 @@ class RequestParser:
     def _counts(
         self, suite: catalogue.Suite, n_validation: int | None, n_heldout: int | None
     ) -> dict[Split, int]:
-        """How many cases of each split a run has: of files all, unless it asks for fewer."""
+        """Number of cases of each split for a run; files supply all of theirs unless the run requests fewer."""
         if min(_or(n_validation, 1), _or(n_heldout, 1)) < 1:
             raise ConfigError("a run needs at least one validation and one held-out case")
         asked: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
@@ -428,7 +435,7 @@ class RequestParser:
         return {split: _or(asked[split], n) for split, n in usual.items()}
 
     def _check_again(self, m: operator.Evaluate, n: int) -> None:
-        """Whether what is to be played again is told without contradiction."""
+        """Checks that a request to replay episodes is consistent, and that its recordings are stored."""
         if m.replays and (m.bundle is not None or len(m.replays) != n):
             raise RefusedError(
                 Refusal.BAD_MESSAGE, f"{len(m.replays)} recordings for {n} cases, or a bundle beside them"
@@ -453,7 +460,7 @@ class RequestParser:
             )
 
     def _check_bundle(self, digest: str | None, run: str | None = None) -> None:
-        """Whether it is stored; with `run`, also whether that run's gateway has brought it."""
+        """Checks that the bundle is stored and, with `run`, that this run's gateway uploaded it."""
         brought = digest is None or run is None or self._uploads.has_sent(run, digest)
         if digest is not None and not (brought and is_digest(digest) and self._blobs.has(digest)):
             raise RefusedError(
@@ -487,17 +494,18 @@ _CHECKS: dict[type[Message], Callable[[RequestParser, Any], Message]] = {
     operator.RepinRun: RequestParser._checked_repin,
     operator.SetWorker: RequestParser._as_it_is,
 }
-"""What is checked of a request before an event carries it."""
+"""Checks of a request before it goes into an event."""
 _EVENTS: dict[type[Message], Callable[[RequestParser, Any, int, str], AnyEvent]] = {
     worker.Register: RequestParser._registered,
     operator.CreateRun: RequestParser._run_created,
     operator.Evaluate: RequestParser.evaluation_requested,
 }
-"""Requests that the shell adds something to: ids, secrets, cases."""
+"""Builders of events to which the shell adds ids, secrets or cases."""
 
 
 def _derived(run: RunRow | None) -> RunRow | None:
-    """The run, where its cases came from a secret: its coordinator may have another now (see `splits.secret_of`)."""
+    """Returns the run if its cases came from a secret; its coordinator may have another one now (see
+    `splits.secret_of`)."""
     return run if run is not None and run.split_hashes.keys() == set(SPLITS) else None
 
 
@@ -506,5 +514,5 @@ def _or(value: int | None, otherwise: int) -> int:
 
 
 def _max_steps(env: str, step_limit: StepLimit) -> int:
-    """Steps after which an episode is cut; 0: only its environment ends it."""
+    """Steps after which an episode is truncated; 0: only the environment ends it."""
     return (catalogue.entry(env).published_steps or 0) if step_limit == "published" else 0

@@ -1,12 +1,13 @@
-"""The configuration of a site's own Zenoh router, `zenohd`: written from the rules that the coordinator itself keeps.
+"""Writes the configuration of a site's own Zenoh router, `zenohd`, from the coordinator's own rules.
 
-A site's machines connect to its router, which connects to the coordinator (or to another router on the way there). Each
-router holds the machines behind it to their roles, as the coordinator does: access rules see only the next neighbour.
+A site's machines connect to its router, which connects to the coordinator (or to another router on the way). Each
+router restricts the machines behind it to their roles, as the coordinator does, because access rules see only the
+next neighbour.
 
     FOLDER/                      the router's folder, from `evopolicy-coordinator certs issue router NAME --out FOLDER`
       ca.pem, cert.pem, key.pem
-      zenohd.json                what `zenohd --config` is given; holds the router's own password
-      passwords                  of the machines that may connect to it, and of nobody else
+      zenohd.json                the file for `zenohd --config`; holds the router's own password
+      passwords                  of the machines that may connect to it, and of no others
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ def write_router_config(
     admit: tuple[str, ...] = (),
     installed_at: Path | None = None,
 ) -> tuple[Machine, ...]:
-    """Writes `zenohd.json` and `passwords` into the folder of `router/NAME`, and returns whom it lets in.
+    """Writes `zenohd.json` and `passwords` into the folder of `router/NAME`, and returns the machines it admits.
 
-    `uplink` is what stands in the certificate of what it connects to. `admit` are identities, such as `worker/gpu-7`; none
-    named: every worker, gateway and operator that the coordinator admits now. `installed_at` is the folder's path on the
-    router's host, where it is not the same. ConfigError for a name that was not issued, or is revoked.
+    `uplink` is the name in the certificate of the peer that it connects to. `admit` lists identities, such as
+    `worker/gpu-7`; empty: every worker, gateway and operator that the coordinator admits now. `installed_at` is the
+    folder's path on the router's host, if it differs. Raises ConfigError for a name that was not issued, or is
+    revoked.
     """
     known = {machine.identity: machine for machine in Machines(state).admitted()}
     own = known.get(f"router/{name}")
@@ -82,7 +84,7 @@ def write_router_config(
         own.password,
     )
     lines = [f"{machine.identity}:{machine.password}\n" for machine in admitted]
-    # Never an empty file: that would let in whoever names no user.
+    # Never an empty file: that would admit clients that name no user.
     lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
     write_atomically(folder / "passwords", "".join(lines).encode(), mode=0o600)
     write_atomically(
@@ -92,7 +94,7 @@ def write_router_config(
 
 
 def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by key, such as `listen/endpoints`, as the tree that a configuration file holds."""
+    """Converts settings by key, such as `listen/endpoints`, to the tree of a configuration file."""
     tree: dict[str, Any] = {}
     for key, value in settings.items():
         *above, last = key.split("/")

@@ -1,18 +1,19 @@
-"""The coordinator's shell: queries in, effects out, around the pure core.
+"""The coordinator's shell around the pure core: it turns queries into events and carries out effects.
 
 Rules that this module owns:
-- The event loop never waits for a disk, a socket or a lock: the database has the writer's thread, pages and blobs have
-  theirs, answers are sent by the transport's.
-- Every batch of queries is one tick: all its events are handled, then its effects go to the outbox, so that one fsync
-  serves them all.
-- When the store refuses, the core and everything not yet told is dropped, and a new core is loaded from disk as soon as
-  the disk allows. Meanwhile requests that would change something are refused with the reason, others end unanswered and
-  are asked again. The same follows a bug of the core, or a row that the store does not take, but only a few times in a row.
-- What the service does not know how to go on from (a store that cannot be loaded for another reason, a failure that comes back
-  after each load, a failure in its own machinery) ends the process with the reason: whoever keeps it up starts it again, on what
-  is on disk. See `failure`.
-- `now` is Unix time at the start, and not before what is on disk, advanced by the monotonic clock: a wall clock that is
-  set changes nothing.
+- The event loop never waits for a disk, a socket or a lock. The database has the writer's thread, pages and blobs
+  have the reader's threads, and the transport's threads send replies.
+- Every batch of queries is one tick: all its events are handled, then their effects go to the outbox, so that one
+  fsync serves them all.
+- When the store refuses to write, the service drops the core and all undelivered effects, and loads a new core from
+  disk as soon as the disk allows. Meanwhile it refuses requests that would change something, with the reason, and
+  ends all others without a reply, so that the clients retry. It does the same after a bug in the core, or a row that
+  the store does not accept, but only a few times in a row.
+- A failure that the service cannot recover from (a store that cannot be loaded for another reason, a failure that
+  recurs after each load, a failure of the service itself) ends the process with the reason. Its supervisor restarts
+  it from the state on disk. See `failure`.
+- `now` is Unix time at the start, but no earlier than the latest time on disk, advanced by the monotonic clock. A
+  change of the wall clock has no effect.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYT
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
 _LOADS_MAX = 5
-"""How often a core is loaded anew after a failure that is not the disk's, each soon after the one before."""
+"""Maximum number of reloads after consecutive failures that are not the disk's, each within `_SOON_S` of the one
+before."""
 _SOON_S = 60.0
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
@@ -80,7 +82,7 @@ _STALLS_TOLD = 5
 
 
 class Service:
-    """One coordinator's life on an event loop: `start`, then `on_queries` for each batch, at last `stop`."""
+    """One coordinator on an event loop: call `start`, then `on_queries` for each batch, finally `stop`."""
 
     def __init__(
         self,
@@ -90,7 +92,8 @@ class Service:
         parser: RequestParser,
         settings: CoreSettings,
     ) -> None:
-        """To be made on the event loop. The store is the service's from now on; `stop` does not close it."""
+        """Must be constructed on the event loop. The service uses the store from now on, but `stop` does not close
+        it."""
         self._cluster = cluster
         self._reader = reader
         self._parser = parser
@@ -108,7 +111,7 @@ class Service:
         self._tasks: set[asyncio.Task[None]] = set()
         self._reload_pause_s = _FIRST_PAUSE_S
         self._n_failures = 0
-        """Of the core, each within `_SOON_S` of the one before."""
+        """Failures of the core, each within `_SOON_S` of the one before."""
         self._failed_at = 0.0
         self._storage_error = ""
         self._stopping = False
@@ -119,11 +122,14 @@ class Service:
         self._sweeper: asyncio.TimerHandle | None = None
         self.n_events = 0
         self.meter: Meter | None = None
-        """Is shown the effects of every step, where there is one."""
+        """If set, observes the effects of every step."""
 
     async def start(self) -> None:
-        """Loads the core from the store. StorageError when that cannot be read or counted up; PartFailedError when it can be
-        read and no core comes of it."""
+        """Loads the core from the store.
+
+        Raises StorageError when the store cannot be read or its incarnation cannot be incremented, and
+        PartFailedError when the store can be read but no core can be built from it.
+        """
         try:
             await self._load()
         except StorageError:
@@ -134,9 +140,9 @@ class Service:
         self._sweep()
 
     async def stop(self) -> None:
-        """Takes nothing more, makes durable what was handled, answers it, and ends every other query.
+        """Accepts no more queries, makes the handled ones durable, replies to them, and drops all others.
 
-        Stopping again does nothing.
+        A second call does nothing.
         """
         if self._stopping:
             return
@@ -148,7 +154,7 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         while self._outbox is not None and not self._outbox.idle:
-            # Comes back after everything that was submitted before it, and what that set going is next.
+            # Returns after all work submitted before it, including the flush that this work triggers.
             await self._writer.call(lambda store: None)
         self._pending.let_go()
         await self._writer.close()
@@ -157,21 +163,21 @@ class Service:
             self._watchdog.close()
 
     async def failure(self) -> None:
-        """Waits for ever, but for a part of the service that cannot go on: PartFailedError with the reason then."""
+        """Never returns. Raises PartFailedError with the reason when a part of the service cannot continue."""
         await asyncio.shield(self._failed)
 
     def _fail(self, part: str, error: BaseException) -> PartFailedError:
-        """Serves nothing more: the process is to end. What is on disk stays, and is where the next one begins."""
+        """Stops serving, as the process must end. The state on disk stays, and the next process starts from it."""
         log.error("a part of the coordinator cannot go on", part=part, exc_info=error)
         failed = PartFailedError(f"{part} failed: {type(error).__name__}: {error}")
         if not self._failed.done():
             self._failed.set_exception(failed)
-            self._failed.exception()  # seen: nobody may wait for it, as at the start
+            self._failed.exception()  # mark as retrieved: nothing may await it, as during the start
         self._forget_core()
         return failed
 
     def now(self) -> float:
-        """Unix time that never goes back, seconds."""
+        """Unix time in seconds; never goes back."""
         return self._unix_offset + self._loop.time()
 
     # Queries in.
@@ -187,7 +193,7 @@ class Service:
         self._flush()
 
     def on_liveliness(self, key: str, alive: bool) -> None:
-        """A worker's token came or went."""
+        """Handles the appearance or loss of a worker's liveliness token."""
         worker = key.rsplit("/", 2)[-2]
         log.debug("liveliness", worker=worker, alive=alive)
         if not alive and self._core is not None and not self._stopping:
@@ -207,7 +213,7 @@ class Service:
         except ProtocolError as error:
             self._refuse(query, RefusedError(Refusal.BAD_MESSAGE, str(error)))
         except Exception:
-            # A bug of ours must not take the service down with it; the asker hears at once and may ask again.
+            # A bug of ours must not stop the service. The client is notified at once and may retry.
             log.exception("request failed", key=query.key)
             query.drop()
 
@@ -255,10 +261,10 @@ class Service:
             self._handle(event)
 
     def _pinned(self, core: Core, parsed: Parsed) -> Parsed:
-        """The request with the definition in which its environment is played."""
+        """Returns the request with the environment definition that its episodes are played in."""
         message, workers = parsed.message, core.state.workers.values()
         if isinstance(message, operator.CreateRun):
-            if message.key in core.state.run_keys:  # made before, in the definition of then
+            if message.key in core.state.run_keys:  # created before; keeps its definition
                 return parsed
             wanted = message.settings
             pin = self._parser.definitions.pin(wanted.env, wanted.definition, workers)
@@ -280,7 +286,7 @@ class Service:
             log.error("request failed", exc_info=error)
 
     async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
-        """For requests whose event is made from files."""
+        """Serves requests whose event is built from files."""
         request = self._pending.admit(query, parsed.asker)
         stimulus = self._stimulus_of(parsed.message)
         try:
@@ -294,7 +300,7 @@ class Service:
             self._pending.take(request)
             query.drop()
             return
-        if request in self._pending:  # else the core was dropped meanwhile, and the query with it
+        if request in self._pending:  # otherwise the core was dropped meanwhile, and the query with it
             self._handle(event)
             self._flush()
 
@@ -314,7 +320,7 @@ class Service:
         message: operator.DescribeEnvironment,
         fingerprints: tuple[Fingerprint, ...],
     ) -> None:
-        """What is here for playing a run's episodes again."""
+        """Replies with the split hashes and the fingerprints that matter for replaying a run's episodes."""
         try:
             row = await asyncio.to_thread(self._reader.finished_run, message.run)
             hashes = await asyncio.to_thread(self._parser.split_hashes, message, row)
@@ -330,7 +336,7 @@ class Service:
             query.reply(answer_bytes(known))
 
     async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
-        """Claims are beside the core: what they decide changes no run."""
+        """Serves a claim without the core: claims change no run."""
         try:
             answer: Message = await self._claims.ask(message, self.now())
         except RefusedError as error:
@@ -377,7 +383,7 @@ class Service:
         return self._core is not None and not self._stopping
 
     def status(self) -> operator.StatusReply | None:
-        """What operators are told now; None while no core is loaded."""
+        """The current status for operators; None while no core is loaded."""
         return None if self._core is None else self._status(self._core)
 
     def _status(self, core: Core) -> operator.StatusReply:
@@ -398,12 +404,12 @@ class Service:
         query.reply(answer_bytes(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
-        """Without a core nothing can be served; who would change something is told why."""
+        """Without a core, refuses requests that would change something, with the reason, and drops all others."""
         if self._storage_error and self._parser.asks_for_change(query.key, query.payload):
             why = "the coordinator cannot write its store and takes nothing new until it can"
             if not self._parser.is_gateways(
                 query.key
-            ):  # the reason names paths, which no agent needs to know
+            ):  # the reason contains paths, which agents must not see
                 why += f": {self._storage_error}"
             query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
         else:
@@ -428,7 +434,7 @@ class Service:
         try:
             effects = step(core)
         except Exception as error:
-            # A bug. What the core holds may be half changed, what is on disk is not.
+            # A bug. The core's state in memory may be half changed; the state on disk is not.
             self._core_failed(error)
             return
         if self.meter is not None:
@@ -436,7 +442,7 @@ class Service:
         outbox.put(effects)
 
     def _core_failed(self, error: Exception) -> None:
-        """Loads the core anew, unless that has not helped the last times."""
+        """Reloads the core, unless the last reloads did not help."""
         now = self._loop.time()
         self._n_failures = self._n_failures + 1 if now - self._failed_at < _SOON_S else 1
         self._failed_at = now
@@ -462,7 +468,8 @@ class Service:
         at = deadline - self._unix_offset
         if self._timer is not None:
             if self._timer_at <= at:
-                # It fires early, finds nothing due, and is set anew: cheaper than setting it for each event.
+                # The old timer fires early, finds nothing due and is set again: cheaper than resetting it for each
+                # event.
                 return
             self._timer.cancel()
         self._timer_at = at
@@ -475,14 +482,14 @@ class Service:
 
     def _on_timer(self) -> None:
         self._timer = None
-        # Too early it does nothing, and is set anew.
+        # If it fires too early, it only sets itself again.
         self._advance(lambda core: core.handle_deadline(self.now()) if _is_due(core, self.now()) else [])
         self._flush()
 
     async def _load(self) -> None:
         snapshot = await self._writer.call(Store.load)
         self._incarnation = snapshot.incarnation
-        # A clock that was set back while no coordinator ran must not make anything end before it began.
+        # The clock may have been set back while no coordinator ran. Nothing may end before it started.
         self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self._core, effects = Core.load(self._settings, snapshot, self.now())
         if self.meter is not None:
@@ -505,7 +512,7 @@ class Service:
         log.error("the store refused to write; nothing is taken until it does", error=str(error))
 
     def _drop_core(self) -> None:
-        """Forgets all that is not on disk, and begins to load what is."""
+        """Drops all state that is not on disk and starts reloading."""
         if self._outbox is not None and self._outbox.commits:
             self._reload_pause_s = _FIRST_PAUSE_S
         self._forget_core()
@@ -545,7 +552,7 @@ class Service:
         try:
             self._carried_out(effect)
         except Exception:
-            # Of one asker, who asks again; those behind it are answered.
+            # Only one client is affected and it retries; the replies queued behind this one must still go out.
             log.exception("cannot carry out", effect=type(effect).__name__)
 
     def _carried_out(self, effect: Effect) -> None:
@@ -565,7 +572,8 @@ class Service:
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 
     def _told_of_audit(self, incarnation: int) -> Callable[[AuditEvent], None]:
-        """Hands what an audit came to to the core that asked; a later one asks anew for what it needs."""
+        """Returns a callback that passes an audit's result to the core that requested it. A later core requests its
+        own."""
 
         def arrived(event: AuditEvent) -> None:
             if incarnation == self._incarnation and not self._stopping:
@@ -573,25 +581,25 @@ class Service:
                 self._flush()
 
         def tell(event: AuditEvent) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
                 self._loop.call_soon_threadsafe(arrived, event)
 
         return tell
 
     def _sweep(self) -> None:
-        """Lets go of queries that nobody waits for any more: those of lost workers are never answered."""
+        """Periodically drops queries without a waiter: queries of lost workers are never answered."""
         self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
         self._pending.let_go(_FORGET_S)
         self._tell_stalls()
 
     def _tell_stalls(self) -> None:
-        """Names in the log what waits longer than it should, as `evopolicy status` does."""
+        """Logs jobs and groups that wait too long, as `evopolicy status` shows them."""
         stalls = () if self._core is None else self._stalls(self._core.status(self.now(), words).stalls)
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_TOLD])
 
     def _stalls(self, of_core: tuple[str, ...]) -> tuple[str, ...]:
-        """What waits longer than it should, and for what: for the disk, and in the core."""
+        """Descriptions of waits longer than `stall_s`, for the disk and in the core."""
         writing_s = 0.0 if self._outbox is None else self._outbox.writing_s
         if writing_s <= self._settings.stall_s:
             return of_core
@@ -624,7 +632,8 @@ _PAGE_BYTES = 4 << 20
 
 
 def _page(found: list[operator.OfferedEnvironment], cursor: int) -> operator.EnvironmentsReply:
-    """The offered environments from `cursor` on, as many as fit well into a message."""
+    """Returns the offered environments from `cursor` on, in a page of at most `_PAGE_BYTES` unless one alone is
+    larger."""
     page: list[operator.OfferedEnvironment] = []
     size = 0
     for each in found[max(0, cursor) :]:

@@ -1,8 +1,9 @@
-"""Which bundles a run's gateway has itself brought: only these may it submit.
+"""Bundles that each run's gateway has uploaded itself: it may submit only these.
 
-The blobs of all runs lie in one folder, by digest. A digest is no secret (reports print those of bundles), and whether a
-blob is there tells of others' runs and of hidden recordings. So a gateway's upload counts only when it has sent every byte
-in this coordinator's lifetime, and is not told what was here before. What is forgotten is asked for and sent again.
+The blobs of all runs share one folder, by digest. A digest is not secret (reports print those of bundles), and the
+presence of a blob would reveal other runs and hidden recordings. So an upload counts only when the gateway has sent
+every byte during this coordinator's lifetime, and the gateway is not told which bytes were stored before. A forgotten
+upload is requested and sent again.
 """
 
 from __future__ import annotations
@@ -11,19 +12,20 @@ import threading
 from collections import OrderedDict
 
 MAX_RUNS = 10_000
-"""The longest unused are forgotten beyond that; a run has to be open to be noted, so no gateway can crowd out others."""
+"""The least recently used runs are forgotten beyond this number. Only open runs are recorded, so no gateway can crowd
+out others."""
 MAX_OF_A_RUN = 64
 
 
 class Uploads:
-    """For several threads."""
+    """Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._runs: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
 
     def note(self, run: str, digest: str) -> None:
-        """The run's gateway has sent all of the blob."""
+        """Records that the run's gateway has sent the whole blob."""
         with self._lock:
             digests = self._runs.setdefault(run, OrderedDict())
             self._runs.move_to_end(run)

@@ -1,7 +1,7 @@
-"""Tells when the event loop stands still, and where.
+"""Logs stalls of the event loop, with the stack.
 
-A coordinator whose loop stands hears no heartbeats; the core then lets nothing expire, but whoever wrote the code that
-stood still should know.
+A coordinator whose loop is blocked receives no heartbeats. The core then lets nothing expire, but developers need to
+find the code that blocked.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _BEAT_S = 0.25
 
 
 class LoopWatchdog:
-    """A thread that watches the running event loop; made on that loop, stopped by `close`."""
+    """A thread that watches the running event loop. Construct it on that loop; stop it with `close`."""
 
     def __init__(self, gap_s: float = GAP_S) -> None:
         self._gap_s = gap_s
@@ -55,10 +55,10 @@ class LoopWatchdog:
                 log.warning("the event loop stands still", stack=self._stack())
 
     def _stack(self) -> str:
-        """Where the loop's thread is; empty where it moves on too fast to tell."""
+        """The stack of the loop's thread; empty when it moves on too fast to be read."""
         try:
             frame = sys._current_frames().get(self._loop_thread)
             return "" if frame is None else "".join(traceback.format_stack(frame, limit=12))
         except Exception:
-            # Frames and source lines are read while they change. To watch on matters more.
+            # Frames and source lines may change while they are read. The watch itself must go on.
             return ""
