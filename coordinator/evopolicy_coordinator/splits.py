@@ -1,12 +1,12 @@
-"""Which cases are train, validation and held-out: read from files, or derived from the coordinator's secret.
+"""The train, validation and held-out cases: read from files, or derived from the coordinator's secret.
 
 Rules that this module owns:
 - The three splits of an environment share no case (seed and options), and none repeats a case.
-- Derived seeds are HMAC-SHA256(secret, suite | environment | split | index | draw), cut to 31 bits, with further draws
-  where a seed is already taken. Seeds are drawn index by index over all three splits, so a case does not change when
-  any split is made longer or shorter.
-- `secret` tells whether hidden cases can be guessed: true for splits derived from a 256-bit secret, false for those made
-  from a public seed, and for files that do not say of themselves that they are secret.
+- Derived seeds are HMAC-SHA256(secret, suite | environment | split | index | draw), truncated to 31 bits, with
+  further draws when a seed is already taken. Seeds are drawn index by index over all three splits, so a case does not
+  change when any split becomes longer or shorter.
+- `secret` states whether hidden cases are unpredictable: true for splits derived from a 256-bit secret, and for files
+  that declare it; false for splits made from a public seed, and for all other files.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 FILE_STEMS: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}
 SECRET_BYTES = 32
 SECRET, UNJAILED_SECRET = "secret", "secret-unjailed"
-"""Files of the state folder: what splits derive from, for runs with jailed and with unjailed agents."""
+"""Files of the state folder with the secrets for runs with jailed and with unjailed agents."""
 _SEED_LIMIT = 2**31
 
 
 class SplitFile(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One `train.json`, `valid.json` or `heldout.json`."""
+    """Content of a `train.json`, `valid.json` or `heldout.json`."""
 
     env: str
     split: str
     """`train`, `valid` (or `validation`), `heldout`."""
     cases: tuple[Case, ...]
     secret: bool | None = None
-    """False when made from a public seed; None where the file does not say."""
+    """False when made from a public seed; None when the file does not declare it."""
 
 
 class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,7 +57,7 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
     secret: bool
     """Whether the hidden cases cannot be guessed from public facts."""
     epoch: str = ""
-    """Public name of what the cases come from: the secret, or the files."""
+    """Public name of the cases' origin: the secret, or the files."""
     files: dict[str, str] = {}
     """SHA-256 (hex) of the bytes of the files that the cases come from, by file name."""
 
@@ -66,23 +66,23 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
         return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 (hex) of each split's cases by split name, and of the files that they come from by file name."""
+        """SHA-256 (hex) of each split's cases by split name, and of their files by file name."""
         return {split: cases_hash(self.cases(split)) for split in SPLITS} | self.files
 
 
 def folder_name(env: str) -> str:
-    """The folder that `data make` writes the split files of `env` to."""
+    """The folder to which `data make` writes the split files of `env`."""
     return env.replace("/", "_")
 
 
 def folder_of(root: Path, env: str) -> Path:
-    """Where the split files of `env` are below `root`: in `gym_acrobot/`, or as published in `gym/acrobot/`."""
+    """Folder of the split files of `env` below `root`: `gym_acrobot/`, or as published `gym/acrobot/`."""
     published = root / env
     return published if holds_splits(published) else root / folder_name(env)
 
 
 def folders_below(root: Path) -> list[Path]:
-    """The folders of both forms that hold split files, in order; `root` alone where it is such a folder itself."""
+    """Folders of both forms that hold split files, in order; only `root` if it is such a folder itself."""
     if holds_splits(root):
         return [root]
     return sorted(folder for pattern in ("*", "*/*") for folder in root.glob(pattern) if holds_splits(folder))
@@ -94,7 +94,7 @@ def holds_splits(folder: Path) -> bool:
 
 
 def cases_hash(cases: Iterable[Case]) -> str:
-    """SHA-256 (hex) of the cases as canonical JSON: sorted keys, no spaces, `options` only where there are some."""
+    """SHA-256 (hex) of the cases as canonical JSON: sorted keys, no spaces, `options` only if present."""
     plain = [_plain(case) for case in cases]
     text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
@@ -105,14 +105,14 @@ def _plain(case: Case) -> dict[str, Any]:
 
 
 def _identity(case: Case) -> tuple[int, str]:
-    """What makes two cases the same: an environment cannot tell no options from empty ones."""
+    """Key for comparing two cases: an environment cannot distinguish missing options from empty ones."""
     return case.seed, json.dumps(case.options or None, sort_keys=True)
 
 
 def derive(
     secret: bytes, suite: str, env: str, counts: dict[Split, int], taken: Iterable[int] = ()
 ) -> dict[Split, tuple[Case, ...]]:
-    """`counts[split]` cases of each split, none with a seed that is `taken`; the same for the same arguments."""
+    """Derives `counts[split]` cases of each split, none with a seed in `taken`; deterministic in its arguments."""
     taken = set(taken)
     drawn: dict[Split, list[Case]] = {split: [] for split in SPLITS}
     for index in range(max(counts.values(), default=0)):
@@ -135,16 +135,17 @@ def _draw(secret: bytes, suite: str, env: str, split: Split, index: int, taken: 
 
 
 def public_secret(seed: int) -> bytes:
-    """The key that splits of a public seed are derived from: anyone who knows the number knows the cases."""
+    """The key for splits of a public seed: anyone who knows the number knows the cases."""
     return hashlib.sha256(f"evopolicy public split seed {seed}".encode()).digest()
 
 
 def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
-    """The 256-bit secret that new runs' splits derive from, and a note where it is not the one before.
+    """The 256-bit secret for new runs' splits, and a note when it differs from the one before.
 
-    An agent without a full jail is the user who owns the state: it can read everything there. So runs with `unjailed` agents
-    have a secret of their own, and the other one is removed before any such agent is alive: the next run with jailed agents
-    gets a new one. Runs keep their cases in the database, so earlier ones can still be verified.
+    An agent without a full jail runs as the user who owns the state and can read everything there. So runs with
+    `unjailed` agents have a secret of their own, and the other one is removed before any such agent starts. The next
+    run with jailed agents gets a new one. Runs keep their cases in the database, so earlier runs can still be
+    verified.
     """
     usual, own = state / SECRET, state / UNJAILED_SECRET
     if unjailed:
@@ -166,9 +167,9 @@ def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
 
 
 def renew_secrets(state: Path) -> str:
-    """Gives the runs to come a new secret, and removes the old ones for good; the new epoch's public name.
+    """Replaces the secrets by a new one, for good, and returns the new epoch's public name.
 
-    Runs keep their cases in the database, so unfinished ones go on, and finished ones can still be verified.
+    Runs keep their cases in the database, so unfinished runs continue, and finished ones can still be verified.
     """
     for name in (SECRET, UNJAILED_SECRET):
         (state / name).unlink(missing_ok=True)
@@ -176,7 +177,10 @@ def renew_secrets(state: Path) -> str:
 
 
 def load_or_create_secret(path: Path) -> bytes:
-    """The 256 bits in the file (mode 0600), made on first use. ConfigError when it is not 32 bytes, or others may read it."""
+    """Returns the 256 bits in the file (mode 0600), creating it on first use.
+
+    Raises ConfigError when it is not 32 bytes long, or others may read it.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -210,7 +214,7 @@ def _create_secret(path: Path) -> bytes:
 
 
 def read_split_file(path: Path) -> tuple[SplitFile, str]:
-    """The file's content and the SHA-256 (hex) of its bytes; ConfigError naming the file and what is wrong in it."""
+    """Returns the file's content and the SHA-256 (hex) of its bytes. Raises ConfigError with the file and its fault."""
     try:
         data = path.read_bytes()
         content = msgspec.json.decode(data, type=SplitFile)
@@ -225,7 +229,7 @@ def read_split_file(path: Path) -> tuple[SplitFile, str]:
 
 
 def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
-    """The splits in one environment's folder, and what is wrong with them (None when they cannot be read at all)."""
+    """Returns the splits in one environment's folder (None when unreadable) and descriptions of their faults."""
     findings: list[str] = []
     contents: dict[Split, SplitFile] = {}
     hashes: dict[str, str] = {}
@@ -268,7 +272,7 @@ def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> 
 
 
 def overlaps(cases: dict[Split, tuple[Case, ...]]) -> list[str]:
-    """Each case that stands twice in a split or in more than one, in words."""
+    """Describes each case that occurs more than once, in one split or in several."""
     findings: list[str] = []
     first_seen: dict[tuple[int, str], tuple[Split, int]] = {}
     for split, members in cases.items():
@@ -283,10 +287,10 @@ def overlaps(cases: dict[Split, tuple[Case, ...]]) -> list[str]:
 
 
 class SplitSource:
-    """Where a coordinator takes its splits from: a data folder, or its secret."""
+    """A coordinator's source of splits: a data folder, or its secret."""
 
     def __init__(self, *, data: Path | None, secret: bytes) -> None:
-        """`data` None: derive everything from `secret`. ConfigError when `data` is no folder."""
+        """`data` None: derive all splits from `secret`. Raises ConfigError when `data` is not a folder."""
         if data is not None and not data.is_dir():
             raise ConfigError(f"--data {data} is not a folder")
         self._data = data
@@ -294,15 +298,16 @@ class SplitSource:
 
     @property
     def from_files(self) -> bool:
-        """Whether splits are read from files; else they are derived."""
+        """Whether splits are read from files; otherwise they are derived."""
         return self._data is not None
 
     def splits(self, suite: str, env: str, counts: dict[Split, int], own: str = "") -> EnvironmentSplits:
-        """The splits of `env`; derived ones have exactly `counts`, those from files are cut to `counts` where set.
+        """Returns the splits of `env`; derived ones have exactly `counts`, those from files are cut to `counts` where
+        set.
 
-        `counts` of a split from files may be left out (all of the file's cases). `own` names a run that has hidden cases
-        of its own, which no other run has. ConfigError when files are missing, wrong, have fewer cases than asked for, or
-        hidden cases of its own are asked for where cases come from files.
+        `counts` may leave out a split from files (all of the file's cases). `own` names a run with hidden cases of
+        its own, which no other run has. Raises ConfigError when files are missing, invalid, or have fewer cases than
+        requested, and when `own` is set but cases come from files.
         """
         if self._data is None:
             cases = derive(self._secret, suite, env, counts)

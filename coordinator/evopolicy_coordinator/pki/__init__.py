@@ -1,1 +1,1 @@
-"""Certificates: a cluster's own authority, and the machines that it has let in."""
+"""Certificates: a cluster's own authority, and the machines that it has admitted."""

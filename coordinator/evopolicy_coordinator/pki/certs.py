@@ -1,11 +1,12 @@
-"""X.509 for a cluster: its own authority, the coordinator's certificate, and one for each machine that joins.
+"""X.509 certificates for a cluster: its own authority, the coordinator's certificate, and one for each machine that
+joins.
 
 Rules:
-- Bytes in, bytes out: no file, no clock. `machines.py` keeps what is made here.
-- An identity is a certificate's common name: `coordinator`, or `ROLE/NAME` of a machine. Zenoh's access rules name it.
-- Only who listens may show its certificate as a server (the extended key usage), so that a worker's or a gateway's cannot
-  stand in for the coordinator's; a server is known by the names and addresses that its clients dial.
-- The authority signs leaves only. It is this cluster's and nobody else's: no name in it is looked up anywhere.
+- Bytes in, bytes out: no file, no clock. `machines.py` stores the results.
+- An identity is a certificate's common name: `coordinator`, or `ROLE/NAME` of a machine. Zenoh's access rules use it.
+- Only listeners may present their certificate as a server (the extended key usage), so that a worker or a gateway
+  cannot impersonate the coordinator. Clients check a server's names and addresses.
+- The authority signs leaves only. It belongs to this cluster alone: none of its names are looked up anywhere.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ COORDINATOR = "coordinator"
 """The common name of the coordinator's own certificate."""
 AUTHORITY_DAYS = 3650
 CLOCK_SKEW = dt.timedelta(hours=1)
-"""Certificates are valid from before they are made: machines' clocks differ."""
+"""How long before their issue certificates become valid: machines' clocks differ."""
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)(\.(?!-)[A-Za-z0-9_-]{1,63}(?<!-))*")
 
 
@@ -39,20 +40,20 @@ class Pair(msgspec.Struct, frozen=True):
 
 
 class Described(msgspec.Struct, frozen=True, kw_only=True):
-    """What a certificate says."""
+    """The fields of a certificate that we use."""
 
     common_name: str
     serial: str
     """Hexadecimal."""
     expires: dt.datetime
     hosts: tuple[str, ...]
-    """DNS names and addresses that it may be dialled at, as given."""
+    """DNS names and addresses that clients may dial, as given."""
     serves: bool
-    """Whether it may be shown by the side that listens."""
+    """Whether a listener may present it."""
 
 
 def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
-    """A new authority. Its name holds a random part, so that no two of one cluster's are taken for each other."""
+    """Creates an authority. Its name has a random part, so that two authorities of one cluster are never confused."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"evopolicy {cluster[:24]} {x509.random_serial_number():x}"[:64])
     certificate = (
@@ -68,10 +69,10 @@ def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -
 def issue(
     authority: Pair, common_name: str, now: dt.datetime, days: int, *, hosts: Sequence[str] = (), serves: bool
 ) -> Pair:
-    """A certificate with a new key, signed by `authority`.
+    """Issues a certificate with a new key, signed by `authority`.
 
-    `hosts`: DNS names and IP addresses that others dial it at; needed when it `serves`. ConfigError for what is no such
-    name, or a life that outlasts the authority's.
+    `hosts`: DNS names and IP addresses that clients dial; required when it `serves`. Raises ConfigError for an
+    invalid name, or a validity beyond the authority's own.
     """
     parent = x509.load_pem_x509_certificate(authority.certificate)
     if now + dt.timedelta(days=days) > parent.not_valid_after_utc:
@@ -103,7 +104,7 @@ def issue(
 
 
 def describe(certificate: bytes) -> Described:
-    """What a PEM certificate says; ConfigError when it is none."""
+    """Parses a PEM certificate. Raises ConfigError when it is not one."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
         names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
@@ -120,7 +121,7 @@ def describe(certificate: bytes) -> Described:
 
 
 def check_hosts(hosts: Sequence[str]) -> None:
-    """ConfigError naming the first that is neither a DNS name nor an address."""
+    """Raises ConfigError that names the first entry that is neither a DNS name nor an address."""
     for host in hosts:
         _general_name(host)
 

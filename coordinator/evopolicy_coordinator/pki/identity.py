@@ -1,6 +1,6 @@
-"""The coordinator's identity towards the world: an Ed25519 key that signs what is published.
+"""The coordinator's public identity: an Ed25519 key that signs published results.
 
-It has nothing to do with the certificates of `certs`, which machines of one cluster show each other.
+It is unrelated to the certificates of `certs`, which machines of one cluster present to each other.
 """
 
 from __future__ import annotations
@@ -16,16 +16,19 @@ from evopolicy_coordinator.splits import load_or_create_secret
 SIGNING_KEY = "signing-key"
 """File of the state folder: 32 random bytes, mode 0600."""
 MANIFEST, HEAD = b"evopolicy manifest 1\0", b"evopolicy head 1\0"
-"""What is signed: a signature of one kind is none of another."""
+"""Prefixes of the signed bytes: a signature of one kind is not valid for the other."""
 
 
 def public_key(state: Path) -> str:
-    """64 hex digits. The key is made on first use; ConfigError when its file is damaged, or others may read it."""
+    """The public key, 64 hex digits. Creates the key on first use.
+
+    Raises ConfigError when the key's file is damaged, or others may read it.
+    """
     return _public(_private(state))
 
 
 def sign(state: Path, digest: str, kind: bytes = MANIFEST) -> tuple[str, str]:
-    """The public key (64 hex digits) and the signature (128) of a SHA-256 (hex)."""
+    """Signs a SHA-256 (hex). Returns the public key (64 hex digits) and the signature (128)."""
     key = _private(state)
     return _public(key), key.sign(kind + bytes.fromhex(digest)).hex()
 

@@ -1,18 +1,18 @@
-"""Which machines belong to a cluster: `STATE/certs`, and the folders that are handed out from it.
+"""The machines of a cluster: `STATE/certs`, and the folders issued from it.
 
     STATE/certs/
       ca.pem, ca-key.pem                  the cluster's authority
       coordinator.pem, coordinator-key.pem
-      machines.json                       every machine issued: its user name's password, its token, its certificate's serial
-      passwords                           the passwords of those that may come in, for Zenoh's router
+      machines.json                       every machine issued: password, token, and its certificate's serial number
+      passwords                           the passwords of admitted machines, for Zenoh's router
 
 Rules:
-- A machine is `ROLE/NAME`: its certificate's common name and its user name. Its password and token are its own, so that
-  any one machine can be shut out alone.
-- Who is revoked is in no list that the coordinator listens with: not in the passwords, not in the access rules; and its
-  token, and sessions got with it, are refused (which also holds where a router stands between).
-- Issuing a name again voids what was issued before it.
-- `machines.json` is read anew whenever it changes, so that `certs issue` and `certs revoke` need no restart.
+- A machine is `ROLE/NAME`: its certificate's common name and its user name. It has its own password and token, so
+  that each machine can be revoked by itself.
+- A revoked machine is in none of the coordinator's lists: neither in the passwords nor in the access rules. Its
+  token, and sessions opened with it, are refused (also when a router stands between).
+- Issuing a name again invalidates its earlier certificate and credentials.
+- `machines.json` is reloaded whenever it changes, so that `certs issue` and `certs revoke` need no restart.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from evopolicy_coordinator.pki import certs
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 BESIDE: dict[MachineRole, tuple[Role, ...]] = {"operator": ("gateway",)}
-"""Roles that are issued in one folder: an operator's machine starts gateways, which get rights of their own."""
+"""Roles issued in the same folder: an operator's machine starts gateways, which get rights of their own."""
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -48,21 +48,21 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     name: str
     password: str
     token: str
-    """What its worker joins with, or its operator asks with; a gateway has its run's capability instead."""
+    """Token of a worker or an operator; empty for a gateway, which has its run's capability instead."""
     serial: str
-    """Of its certificate; no two are alike, so it also tells one issue of a name from the next."""
+    """The certificate's serial number: unique, so it also distinguishes successive issues of a name."""
     issued: dt.datetime
     expires: dt.datetime
     revoked: dt.datetime | None = None
 
     @property
     def identity(self) -> str:
-        """As it stands in the machine's certificate, and as its user name."""
+        """The common name in the machine's certificate, and its user name."""
         return f"{self.role}/{self.name}"
 
 
 class Machines:
-    """The machines of a state folder, as they are now. Cheap to ask: reads the file only when it has changed."""
+    """The current machines of a state folder. Cheap to query: reads the file only when it has changed."""
 
     def __init__(self, state: Path) -> None:
         self.folder = state / "certs"
@@ -86,26 +86,26 @@ class Machines:
         return self.folder / "passwords"
 
     def all(self) -> tuple[Machine, ...]:
-        """Every machine, revoked ones too, by identity."""
+        """Every machine, including revoked ones, sorted by identity."""
         self._refresh()
         return tuple(self._all[identity] for identity in sorted(self._all))
 
     def admitted(self) -> tuple[Machine, ...]:
-        """Those that may come in. Expiry is not looked at: TLS does."""
+        """Machines that are not revoked. Expiry is left to TLS."""
         return tuple(machine for machine in self.all() if machine.revoked is None)
 
     def stamp(self) -> tuple[int, ...]:
-        """Changes whenever a machine is issued or revoked, or the coordinator's certificate is renewed."""
+        """A value that changes whenever a machine is issued or revoked, or the coordinator's certificate is renewed."""
         return (*_stat(self.folder / "machines.json"), *_stat(self.folder / "coordinator.pem"))
 
     def write_passwords(self) -> None:
-        """Writes the file that Zenoh's router reads. Never an empty one: that would let in whoever names no user."""
+        """Writes the file that Zenoh's router reads. Never an empty one: that would admit clients that name no user."""
         lines = [f"{machine.identity}:{machine.password}\n" for machine in self.admitted()]
         lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
         write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
 
     def holder(self, role: Role, token: str) -> Machine | None:
-        """The admitted machine of this role whose token it is; compared in constant time."""
+        """The admitted machine of this role with this token; compared in constant time."""
         found = None
         for machine in self.admitted():
             if (
@@ -117,13 +117,13 @@ class Machines:
         return found
 
     def session_for(self, token: str) -> str:
-        """A new session for a worker that registers; it tells which machine it is of, if its token is one's."""
+        """A new session for a worker that registers; it names the machine's certificate if the token is a machine's."""
         machine = self.holder("worker", token)
         made = secrets.token_urlsafe(16)
         return made if machine is None else f"{machine.serial}:{made}"
 
     def is_shut_out(self, session: str) -> bool:
-        """Whether the session is of a machine that has been revoked, or issued again, since."""
+        """Whether the session's machine has since been revoked, or issued again."""
         serial, colon, _ = session.partition(":")
         if not colon:
             return False
@@ -141,7 +141,7 @@ class Machines:
         except ConfigError as error:
             if not self._stamp:
                 raise
-            # A coordinator that runs goes on with whom it knew.
+            # A running coordinator continues with the machines that it knew.
             log.error("the list of machines cannot be read", why=str(error))
         self._serials = {machine.serial: machine for machine in self._all.values()}
         self._stamp = stamp
@@ -150,9 +150,9 @@ class Machines:
 def init(
     state: Path, cluster: str, hosts: tuple[str, ...], now: dt.datetime, days: int, *, anew: bool
 ) -> None:
-    """Makes the authority, unless there is one and not `anew`, and the coordinator's certificate.
+    """Creates the coordinator's certificate, and the authority if it is missing or `anew`.
 
-    A new authority voids every machine of the old one, which are forgotten.
+    A new authority invalidates and removes all machines of the old one.
     """
     with _changing(state) as folder:
         kept = not anew and (folder / "ca-key.pem").exists()
@@ -163,7 +163,7 @@ def init(
             _write(folder / "ca-key.pem", authority.private_key)
             _write(folder / "ca.pem", authority.certificate)
         _write(folder / "coordinator-key.pem", own.private_key)
-        # Last: it is what a running coordinator looks at.
+        # Last: a running coordinator watches this file.
         _write(folder / "coordinator.pem", own.certificate)
 
 
@@ -180,10 +180,10 @@ def issue(
     hosts: tuple[str, ...] = (),
     again: bool = False,
 ) -> tuple[Machine, ...]:
-    """Writes the folder `out` for a machine and lists it as admitted; whatever else was issued to it is void.
+    """Writes the folder `out` for a machine and admits it; everything issued to it before becomes invalid.
 
-    Raises ConfigError for a wrong name, a name that was issued already unless `again`, a folder that is not empty, or
-    before `init`.
+    Raises ConfigError for an invalid name, a name that was already issued unless `again`, a folder that is not empty,
+    or before `init`.
     """
     if not keys.valid_name(name):
         raise ConfigError(f"NAME {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
@@ -209,7 +209,7 @@ def issue(
 
 
 def revoke(state: Path, name: str, now: dt.datetime) -> tuple[Machine, ...]:
-    """Shuts out the machine `ROLE/NAME`, or all roles of `NAME`. ConfigError when there is no such machine."""
+    """Revokes the machine `ROLE/NAME`, or all roles of `NAME`. Raises ConfigError when there is no such machine."""
     with _changing(state) as folder:
         listed = {machine.identity: machine for machine in _read(folder / "machines.json")}
         meant = [machine for machine in listed.values() if name in (machine.name, machine.identity)]
@@ -224,7 +224,7 @@ def revoke(state: Path, name: str, now: dt.datetime) -> tuple[Machine, ...]:
 
 
 def coordinators_certificate(state: Path) -> certs.Described | None:
-    """What the coordinator's own certificate says; None before `init`."""
+    """The coordinator's own certificate; None before `init`."""
     try:
         return certs.describe((state / "certs" / "coordinator.pem").read_bytes())
     except FileNotFoundError:
@@ -256,7 +256,7 @@ def _write_folder(
 ) -> None:
     _write(out / f"{prefix}cert.pem", pair.certificate)
     _write(out / f"{prefix}key.pem", pair.private_key)
-    if machine.role == "router":  # its password goes into its zenohd's configuration: `router_config.py`
+    if machine.role == "router":  # `router_config.py` writes its password into its zenohd's configuration
         return
     credentials.write(
         Credentials(
@@ -284,7 +284,7 @@ def _make_folder(out: Path, again: bool) -> None:
 
 @contextlib.contextmanager
 def _changing(state: Path) -> Iterator[Path]:
-    """The folder of certificates, for one command at a time."""
+    """The folder of certificates, locked for one command at a time."""
     folder = state / "certs"
     folder.mkdir(mode=0o700, exist_ok=True)
     fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -1,1 +1,1 @@
-"""The state folder: database, blobs, backups, and the disk space that they take."""
+"""The state folder: database, blobs, backups, and the disk space that they use."""

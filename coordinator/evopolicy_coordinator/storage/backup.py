@@ -1,11 +1,12 @@
 """Backups of a state folder, also of one whose coordinator is running.
 
 Rules:
-- The database is copied first, as of one instant (SQLite's online backup), the blobs after it: a blob is durable before
-  any row names it, so none that the copy names can be missing.
-- A backup is built beside its place and renamed at the end: one that is there is whole, durable and checked.
-- A backup is a state folder. Restoring is copying it to where the state was and starting a coordinator on it: workers and
-  gateways find the same passwords and tokens, and go on; what came after the backup is played again.
+- The database is copied first, as of one instant (SQLite's online backup), the blobs after it. A blob is durable
+  before any row names it, so the copy contains every blob that its rows name.
+- A backup is built under a temporary name and renamed at the end, so an existing backup is complete, durable and
+  checked.
+- A backup is a state folder. To restore it, copy it to the old state's path and start a coordinator on it. Workers
+  and gateways find the same passwords and tokens and continue; work done after the backup is played again.
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ KEPT_FILES = (
         for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
     ),
 )
-"""What makes the cluster itself, beside its database and blobs; everything else is made again at a start."""
+"""The cluster's identity, besides its database and blobs. A start creates everything else again."""
 DATABASE = "coordinator.sqlite"
 
 
 class Backup(msgspec.Struct, frozen=True, kw_only=True):
-    """What was copied."""
+    """A finished backup."""
 
     path: str
     blobs: int
     bytes: int
-    """Of the database and the blobs."""
+    """Size of the database and the blobs."""
 
 
 def back_up(state: Path, target: Path) -> Backup:
-    """Copies the state folder to `target`, which must not exist yet or be empty.
+    """Copies the state folder to `target`, which must be missing or empty.
 
-    ConfigError when there is no state or no place for the copy, StorageError when the disk refuses or the copy is damaged;
-    then nothing is left at `target`.
+    Raises ConfigError when there is no state or no place for the copy, StorageError when the disk refuses or the copy
+    is damaged; nothing is then left at `target`.
     """
     if not (state / DATABASE).is_file():
         raise ConfigError(f"{state} is no coordinator's state folder: it holds no {DATABASE}")
@@ -76,7 +77,7 @@ def _copy(state: Path, folder: Path) -> Backup:
     for name in KEPT_FILES:
         with contextlib.suppress(
             FileNotFoundError
-        ):  # splits from files need no secret, one machine no certificates
+        ):  # splits from files need no secret, a single machine no certificates
             data = (state / name).read_bytes()
             (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
             write_atomically(folder / name, data, mode=0o600)
@@ -92,14 +93,14 @@ def _copy(state: Path, folder: Path) -> Backup:
 
 
 def _copy_database(source: Path, target: Path) -> None:
-    """A consistent copy while others write; readable by its owner alone, durable, checked."""
+    """Makes a consistent copy while others write: readable by its owner only, durable, checked."""
     try:
         with (
             contextlib.closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reader,
             contextlib.closing(sqlite3.connect(target, isolation_level=None)) as writer,
         ):
             target.chmod(0o600)
-            # In one step: a copy in several would start anew at every write of the coordinator's.
+            # In one step: a copy in several steps would restart at every write of the coordinator.
             reader.backup(writer)
             writer.execute("PRAGMA journal_mode=DELETE")
             (said,) = writer.execute("PRAGMA integrity_check").fetchone()

@@ -1,11 +1,11 @@
-"""What a state folder's disk space goes to, what of it may go, and what a sweep will need.
+"""Disk use of a state folder: its breakdown, its garbage collection, and an estimate for a sweep.
 
 Rules:
-- Of a finished run everything an operator needs is in its run directory. The coordinator keeps its outcome for good, and
-  its episodes and bundles until they are collected.
-- A blob goes when no row names it any more and it is older than `UNNAMED_S`: it may just have been uploaded for a row that
-  is about to be written. Uploading it again makes it young.
-- All this is safe beside a running coordinator; only the database file's own shrinking waits until none runs.
+- An operator finds everything about a finished run in its run directory. The coordinator keeps the run's outcome for
+  good, and its episodes and bundles until they are collected.
+- A blob is deleted when no row names it and it is older than `UNNAMED_S`, since it may have been uploaded for a row
+  that is about to be written. Uploading it again resets its age.
+- Collection is safe beside a running coordinator; only shrinking the database file waits until none runs.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from evopolicy_coordinator.core.records import (
 from evopolicy_coordinator.storage.store import rows, stored_blobs, told
 
 Bounds = tuple[str, str]
-"""Group ids from the first on, before the second."""
+"""Group ids from the first (inclusive) to the second (exclusive)."""
 
 DATABASE = "coordinator.sqlite"
 UNNAMED_S = 24 * 3600.0
 BUSY_TIMEOUT_S = 30.0
 GUESS_BYTES = 1 << 20
-"""Taken for an episode of an environment of which nothing is stored, when nothing at all is."""
+"""Bytes assumed for an episode when nothing is stored of any environment."""
 
 
 class Collected(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,35 +53,35 @@ class Collected(msgspec.Struct, frozen=True, kw_only=True):
     episodes: int
     blobs: int
     bytes: int
-    """Of the episodes' rows and the blobs."""
+    """Size of the episodes' rows and the blobs."""
     shrunk: bool
-    """Whether the database file gave its space back; else later rows use it."""
+    """Whether the database file was shrunk; otherwise later rows reuse its free space."""
     free_bytes: int
-    """On the disk, afterwards."""
+    """Free on the disk afterwards."""
 
 
 class EnvironmentUse(msgspec.Struct, frozen=True, kw_only=True):
-    """What the stored runs of one environment take."""
+    """Disk use of the stored runs of one environment."""
 
     env: str
     runs: int
     train_episodes: int
     bytes: int
-    """Rows and blobs, hidden episodes too."""
+    """Rows and blobs, including hidden episodes."""
 
     @property
     def bytes_per_episode(self) -> float:
-        """Bytes for each train episode, with its part of the hidden ones."""
+        """Bytes per train episode, including its share of the hidden ones."""
         return self.bytes / self.train_episodes
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """What a sweep will take of the coordinator's disk."""
+    """Estimated disk use of a sweep on the coordinator."""
 
     bytes: int
     free_bytes: int
     guessed: tuple[str, ...]
-    """Environments of which nothing is stored: taken to be like the largest that is known."""
+    """Environments without stored episodes: assumed to be like the largest known one."""
 
     @property
     def fits(self) -> bool:
@@ -91,9 +91,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
 def collect(
     state: Path, older_than_s: float, *, dry_run: bool = False, now: float | None = None
 ) -> Collected:
-    """Removes episodes and bundles of what finished over `older_than_s` seconds ago, then blobs that nothing names.
+    """Removes episodes and bundles of runs and evaluations older than `older_than_s` seconds, then unnamed blobs.
 
-    `now`: Unix time. ConfigError when `state` is no state folder, StorageError when the database refuses.
+    The age of a run counts from its end, that of a finished evaluation from its creation. `now`: Unix time. Raises
+    ConfigError when `state` is no state folder, StorageError when the database refuses.
     """
     now = time.time() if now is None else now
     with _database(state) as db:
@@ -136,7 +137,7 @@ def collect(
 
 
 def use(state: Path) -> list[EnvironmentUse]:
-    """What the stored runs take, by environment, largest first; runs whose episodes were collected are left out."""
+    """Disk use of the stored runs by environment, largest first; runs whose episodes were collected are left out."""
     found: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
         blobs = BlobStore(state / "blobs")
@@ -162,7 +163,7 @@ def use(state: Path) -> list[EnvironmentUse]:
 
 
 def estimate(state: Path, planned: dict[str, int]) -> Estimate:
-    """What `planned` train episodes by environment will take, going by what is stored of each."""
+    """Estimates the disk use of `planned` train episodes by environment, from the stored episodes of each."""
     known = {each.env: each.bytes_per_episode for each in use(state)}
     guess = max(known.values(), default=float(GUESS_BYTES))
     return Estimate(
@@ -188,7 +189,7 @@ def _database(state: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _of_run(run: str) -> Bounds:
-    return f"{run}/", f"{run}0"  # "0" follows "/"
+    return f"{run}/", f"{run}0"  # "0" is the character after "/"
 
 
 def _of_evaluation(evaluation: str) -> Bounds:
@@ -204,7 +205,8 @@ def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
 
 
 def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
-    """One short transaction for each run, so that a running coordinator waits for none for long."""
+    """Deletes a run's or an evaluation's rows in one short transaction, so that a running coordinator never waits
+    long."""
     db.execute("BEGIN IMMEDIATE")
     for table in ("outcomes", "strikes", "begun"):
         db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
@@ -212,7 +214,7 @@ def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
 
 
 def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
-    """Digests of all blobs that rows name which stay."""
+    """Digests of all blobs that the remaining rows name."""
     named = {row.bundle for row in rows(db, SubmitRow) if row.bundle is not None and row.run not in old_runs}
     named |= {
         row.bundle
@@ -245,7 +247,8 @@ def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
 
 
 def _shrink(state: Path, db: sqlite3.Connection) -> bool:
-    """Gives the file's free pages back to the disk, if no coordinator has the folder: it would wait meanwhile."""
+    """Returns the file's free pages to the disk, unless a coordinator has the folder: it would have to wait
+    meanwhile."""
     lock = os.open(state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""The coordinator's state folder: who may open it, what is in it, and the credentials it hands out.
+"""The coordinator's state folder: its lock, its contents, and the credentials written from it.
 
     STATE/                        mode 0700, one coordinator at a time (`lock`)
       secret                      the 256 bits that hidden splits are derived from
@@ -6,12 +6,13 @@
       identity.json               the cluster's name, and each role's password and token
       certs/                      the certificates of other machines: see machines.py
       passwords                   the same passwords, for Zenoh's router
-      credentials/<role>.json     what workers, gateways and operators of this machine connect with
-      coordinator.sqlite          everything that must be true
+      credentials/<role>.json     the credentials of workers, gateways and operators on this machine
+      coordinator.sqlite          the authoritative state
       blobs/                      trajectories, videos and policy bundles
-      coordinator.sock            where processes of this machine connect
+      coordinator.sock            the socket for processes of this machine
 
-All that grants anything is made once, has mode 0600, and survives restarts, so that workers reconnect by themselves.
+All passwords, tokens and keys are made once, have mode 0600, and survive restarts, so that workers reconnect by
+themselves.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ from evopolicy_common.wire.credentials import Credentials, Role
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
 _SOCKET_PATH_LIMIT = 100
-"""Linux allows 107 bytes for a unix socket's path; Zenoh puts a `.lock` beside it."""
+"""Bytes. Linux allows 107 for a unix socket's path, and Zenoh puts a `.lock` beside it."""
 
 
 class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What makes this cluster itself, kept through restarts."""
+    """The cluster's identity, kept across restarts."""
 
     cluster: str
     passwords: dict[Role, str]
     worker_token: str
-    """Join token: who has it may offer slots."""
+    """Join token: a client that holds it may offer slots."""
     operator_token: str
 
 
@@ -60,10 +61,10 @@ class StateFolder:
 
     @classmethod
     def open(cls, root: Path, cluster: str | None = None) -> StateFolder:
-        """Makes the folder if need be, locks it and reads its identity.
+        """Creates the folder if it is missing, locks it and reads its identity.
 
-        `cluster` None: the folder's own, `local` for a new one. ConfigError when another coordinator has it, others
-        may enter it, or it belongs to another cluster.
+        `cluster` None: the folder's own name, `local` for a new folder. Raises ConfigError when another coordinator
+        holds the lock, others may enter the folder, or it belongs to another cluster.
         """
         if cluster is not None and not keys.valid_name(cluster):
             raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
@@ -78,7 +79,7 @@ class StateFolder:
 
     @property
     def database(self) -> Path:
-        """See `store.py`."""
+        """Path of the database; see `store.py`."""
         return self.root / "coordinator.sqlite"
 
     @property
@@ -88,14 +89,14 @@ class StateFolder:
 
     @property
     def credentials(self) -> Path:
-        """Folder of this machine's credentials, a file a role."""
+        """Folder of this machine's credentials, one file per role."""
         return self.root / "credentials"
 
     @property
     def socket_endpoint(self) -> str:
-        """The Zenoh endpoint inside the folder, by a link to it where its own path is too long for a unix socket.
+        """The Zenoh endpoint inside the folder, through a link when its own path is too long for a unix socket.
 
-        The same after every restart. ConfigError when there is no place for a link.
+        The same after every restart. Raises ConfigError when there is no place for a link.
         """
         folder = self.root
         if not _fits(folder):
@@ -107,7 +108,7 @@ class StateFolder:
     ) -> dict[Role, Path]:
         """Writes the three roles' files for `endpoints` and returns their paths.
 
-        `insecure_tcp`: whether who holds them may speak plain `tcp/` beyond this machine.
+        `insecure_tcp`: whether holders of these credentials may use plain `tcp/` beyond this machine.
         """
         tokens = {"worker": self.identity.worker_token, "operator": self.identity.operator_token}
         paths: dict[Role, Path] = {}
@@ -128,12 +129,12 @@ class StateFolder:
         return paths
 
     def write_passwords(self) -> None:
-        """Write the file that Zenoh's router reads."""
+        """Writes the file that Zenoh's router reads."""
         lines = [f"{role}:{self.identity.passwords[role]}\n" for role in ROLES]
         write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
 
     def close(self) -> None:
-        """Lets another coordinator have the folder."""
+        """Releases the folder for another coordinator."""
         if self._link is not None:
             with contextlib.suppress(OSError):
                 self._link.unlink()
@@ -141,9 +142,10 @@ class StateFolder:
 
 
 def cluster_of(root: Path, cluster: str | None) -> str:
-    """The name of a state folder's cluster, also while its coordinator runs; a new folder is made, and named `cluster`.
+    """Returns the name of a state folder's cluster, also while its coordinator runs.
 
-    ConfigError as `StateFolder.open` says.
+    Creates a missing folder, with the name `cluster`. Raises ConfigError in the same cases as `StateFolder.open`,
+    except for the lock.
     """
     if cluster is not None and not keys.valid_name(cluster):
         raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
@@ -152,7 +154,7 @@ def cluster_of(root: Path, cluster: str | None) -> str:
 
 
 def _make_private(root: Path) -> None:
-    # A coordinator that comes back to a full disk waits for room.
+    # A coordinator that restarts on a full disk waits for space.
     check_writable(root, "--state", may_be_full=(root / "identity.json").exists())
     try:
         root.mkdir(parents=True, mode=0o700, exist_ok=True)
@@ -205,7 +207,7 @@ def _fits(folder: Path) -> bool:
 
 
 def _linked(root: Path) -> Path:
-    """A short link to `root`, always the same one, in a folder that nobody but this user can change."""
+    """Returns a short link to `root`, always the same path, in a folder that only this user can change."""
     name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
     for folder in (credentials.state_home() / "sockets", Path("/tmp") / f"evopolicy-{os.getuid()}"):
         link = folder / name
@@ -214,7 +216,7 @@ def _linked(root: Path) -> Path:
                 folder.mkdir(parents=True, mode=0o700, exist_ok=True)
                 found = folder.lstat()
                 if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
-                    for left in folder.iterdir():  # of states that are gone
+                    for left in folder.iterdir():  # of deleted state folders
                         if left.is_symlink() and not left.exists():
                             left.unlink(missing_ok=True)
                     new = folder / f"{name}.{os.getpid()}"
@@ -228,7 +230,7 @@ def _linked(root: Path) -> Path:
 
 
 def resolve_listen(endpoints: list[str]) -> tuple[str, ...]:
-    """The endpoints with a free port in place of port 0, which Zenoh could not be asked for afterwards."""
+    """The endpoints with port 0 replaced by a free port: Zenoh does not report the port that it picks."""
     resolved = []
     for endpoint in endpoints:
         protocol, slash, address = endpoint.partition("/")
@@ -258,7 +260,7 @@ def _free_port(endpoint: str, host: str) -> int:
 
 
 def reachable(endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """What processes of this machine connect to: a wildcard address is not one that can be dialled."""
+    """The endpoints that processes of this machine can connect to: wildcard addresses become loopback addresses."""
     wildcards = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
     dialled = []
     for endpoint in endpoints:

@@ -1,13 +1,14 @@
 """The database: every row that the core persists, and nothing else.
 
 Rules that this module owns:
-- WAL with synchronous=FULL: when `write` returns, its rows survive a power cut; when it raises, none of them are there.
-- One connection writes (`Store`, from one thread); any number read (`Reader`, a connection a thread).
-- A row is its msgpack bytes plus the columns it is found by. The schema's version is in `user_version`; an older file
-  is migrated when opened, a newer one is refused.
-- A disk that refuses may take it later (StorageError); a row that cannot be read stays so (DamagedStoreError).
-- What a gateway may fetch by digest is written down with the outcome that names it (`train_blobs`), in the same
-  transaction.
+- WAL with synchronous=FULL: when `write` returns, its rows survive a power cut; when it raises, none of them are
+  stored.
+- One connection writes (`Store`, from one thread at a time); any number read (`Reader`, one connection per thread).
+- A row is its msgpack bytes plus its lookup columns. The schema's version is in `user_version`. An older file is
+  migrated when opened; a newer one is refused.
+- A disk that refuses may accept a write later (StorageError); an unreadable row stays unreadable (DamagedStoreError).
+- The digests that a gateway may fetch (`train_blobs`) are stored in the same transaction as the outcome that names
+  them.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from evopolicy_coordinator.core.records import (
 T = TypeVar("T")
 
 BUSY_TIMEOUT_S = 10.0
-"""How long another's transaction on the database is waited for: `evopolicy gc` runs beside a coordinator."""
+"""How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
 _MIGRATIONS: tuple[str, ...] = (
     """
@@ -117,19 +118,19 @@ _PLACES: dict[type[Any], tuple[str, str, str]] = {
     JournalRow: ("journal", "seq", "data"),
     DocumentRow: ("documents", "run, kind", "data"),
 }
-"""Where the rows of a kind are: their table, its key, and the column of their bytes."""
+"""Location of each kind of row: table, key columns, and the column of its bytes."""
 _DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in _PLACES
 }
 
 
 class Store:
-    """The writing connection. Not to be shared by threads at the same time."""
+    """The writing connection. Threads must not use it at the same time."""
 
     def __init__(self, path: Path) -> None:
-        """Opens or makes the database, migrating an older one.
+        """Opens or creates the database, and migrates an older one.
 
-        ConfigError when the file is of a newer version or no database, StorageError when the disk refuses.
+        Raises ConfigError when the file is of a newer version or not a database, StorageError when the disk refuses.
         """
         self._path = path
         self._db = _connect(path)
@@ -152,7 +153,7 @@ class Store:
             self._db.executescript(script)
 
     def write(self, changed: Iterable[Row]) -> None:
-        """Writes all rows in one durable transaction; StorageError when it could not, and then none of them."""
+        """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
         _guard(self._path, lambda: self._write(changed))
 
     def _write(self, changed: Iterable[Row]) -> None:
@@ -162,7 +163,7 @@ class Store:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Durable at the end of the `with`; undone when it ends with an error."""
+        """A transaction that is durable at the end of the `with` and rolled back on an error."""
         try:
             self._db.execute("BEGIN IMMEDIATE")
             yield
@@ -173,7 +174,7 @@ class Store:
             raise
 
     def forget_kernels(self, boot_id: str) -> None:
-        """Forgets, durably, which workers were on that kernel: they are known to have ended."""
+        """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""
 
         def forget() -> None:
             with self._transaction():
@@ -184,15 +185,15 @@ class Store:
         _guard(self._path, forget)
 
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
-        """Keeps a sweep's claim, durably; StorageError when it could not."""
+        """Stores a sweep's claim durably. Raises StorageError when it fails."""
         _guard(self._path, lambda: self._db.execute(_CLAIM, (suite, name, data)))
 
     def claims(self) -> list[tuple[str, str, bytes]]:
-        """All claims of sweeps, as they were written."""
+        """All claims of sweeps: suite, name and stored bytes."""
         return _guard(self._path, lambda: self._db.execute("SELECT suite, name, data FROM claims").fetchall())
 
     def load(self) -> Snapshot:
-        """Counts one more incarnation, durably, and reads what a core starts from."""
+        """Durably increments the incarnation, then reads the state that a core starts from."""
         return _guard(self._path, self._load)
 
     def _load(self) -> Snapshot:
@@ -242,11 +243,11 @@ class Store:
         )
 
     def close(self) -> None:
-        """Folds the write-ahead log into the database where it can, and closes."""
+        """Checkpoints the write-ahead log into the database if possible, and closes."""
         try:
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         except sqlite3.Error:
-            # All is durable in the log; the next start folds it in.
+            # Everything is durable in the log; the next start checkpoints it.
             pass
         self._db.close()
 
@@ -256,18 +257,18 @@ class OutcomePage(msgspec.Struct, frozen=True):
 
     rows: tuple[OutcomeRow, ...]
     cursor: int
-    """One past the last row's `seq`; what was asked from where there is none."""
+    """One past the last row's `seq`; the requested cursor when there are no rows."""
 
 
 class Reader:
-    """A reading connection, for one thread; sees what is durable."""
+    """A reading connection for one thread; it sees durable rows."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._db = _connect(path, read_only=True)
 
     def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> OutcomePage:
-        """Outcomes with cursor ≤ seq < upto, from the first on, up to `max_bytes` of rows but at least one."""
+        """Outcomes with cursor ≤ seq < upto in order of `seq`, up to `max_bytes` of rows but at least one."""
 
         def read() -> OutcomePage:
             page: list[OutcomeRow] = []
@@ -283,15 +284,15 @@ class Reader:
         return _guard(self._path, read)
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
-        """The outcome at that place of its group; None when there is none."""
+        """The outcome at `index` of its group; None when it is missing."""
         return self._one(OutcomeRow, "WHERE grp = ? AND idx = ?", (group, index))
 
     def submit(self, run: str, submit_index: int) -> SubmitRow | None:
-        """The submit's row as it is now; None when there is none."""
+        """The submit's current row; None when it is missing."""
         return self._one(SubmitRow, "WHERE run = ? AND submit_index = ?", (run, submit_index))
 
     def finished(self, run: str) -> RunFinished | None:
-        """What came of a run; None while it is not finished."""
+        """The result of a run; None while it is not finished."""
         row = self._one(FinishedRow, "WHERE run = ?", (run,))
         return None if row is None else row.result
 
@@ -300,7 +301,7 @@ class Reader:
         return self._one(RunRow, "WHERE run = ?", (run,))
 
     def journal(self, cursor: int, max_bytes: int) -> tuple[JournalRow, ...]:
-        """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty behind the last."""
+        """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty past the last entry."""
 
         def read() -> tuple[JournalRow, ...]:
             page: list[JournalRow] = []
@@ -315,11 +316,11 @@ class Reader:
         return _guard(self._path, read)
 
     def revealed(self) -> frozenset[str]:
-        """Epochs that are no secret any more."""
+        """Epochs whose secret is revealed."""
         return _guard(self._path, lambda: frozenset(revealed(self._db)))
 
     def document(self, run: str, kind: str) -> bytes | None:
-        """What an entry of the journal holds the hash of; None when there is none."""
+        """The document whose hash an entry of the journal holds; None when it is missing."""
         row = self._one(DocumentRow, "WHERE run = ? AND kind = ?", (run, kind))
         return None if row is None else row.data
 
@@ -336,7 +337,7 @@ class Reader:
         return _guard(self._path, lambda: next(rows(self._db, kind, where, args), None))
 
     def close(self) -> None:
-        """Close the connection."""
+        """Closes the connection."""
         self._db.close()
 
 
@@ -347,7 +348,7 @@ def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
             uri=True,
             timeout=BUSY_TIMEOUT_S,
             isolation_level=None,
-            # A connection is used by one thread at a time, but may be opened by another.
+            # One thread uses a connection at a time, but another may have opened it.
             check_same_thread=False,
         )
     except sqlite3.Error as error:
@@ -359,13 +360,13 @@ def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
 
 @contextlib.contextmanager
 def told(path: Path) -> Iterator[None]:
-    """SQLite's errors, and rows that cannot be read, as ours with the database's path."""
+    """Translates SQLite's errors into ours, and adds the database's path to DamagedStoreError."""
     try:
         yield
     except sqlite3.DatabaseError as error:
         if isinstance(error, sqlite3.IntegrityError):
             raise DamagedStoreError(f"{path} refuses a row that contradicts another: {error}") from error
-        # An operational error is the machine's (full, locked, I/O), but for statements that do not fit the tables.
+        # Operational errors are the machine's (full, locked, I/O), except for statements that do not fit the tables.
         if (
             isinstance(error, sqlite3.OperationalError)
             and error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_ERROR
@@ -382,7 +383,7 @@ def _guard(path: Path, work: Callable[[], T]) -> T:
 
 
 def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
-    """The rows of a kind. DamagedStoreError names the one that cannot be read; `told` adds the database's path."""
+    """Yields the rows of a kind. DamagedStoreError names the unreadable row; `told` adds the database's path."""
     for row, _ in _sized_rows(db, kind, where, args):
         yield row
 
@@ -390,7 +391,7 @@ def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any
 def _sized_rows(
     db: sqlite3.Connection, kind: type[T], where: str, args: tuple[Any, ...]
 ) -> Iterator[tuple[T, int]]:
-    """Rows, each with its number of bytes."""
+    """Yields each row with its size in bytes."""
     table, key, column = _PLACES[kind]
     decode = _DECODERS[kind].decode
     for *place, data in db.execute(f"SELECT {key}, {column} FROM {table} {where}", args):
@@ -404,12 +405,12 @@ def _sized_rows(
 
 
 def revealed(db: sqlite3.Connection) -> Iterator[str]:
-    """Epochs that the journal says were revealed."""
+    """Epochs that the journal records as revealed."""
     return (epoch for (epoch,) in db.execute("SELECT reveals FROM journal WHERE reveals != ''"))
 
 
 def unreadable(error: Exception) -> str:
-    """What is wrong with a row's bytes, and the remedy."""
+    """Describes the damage of a row's bytes, and the remedy."""
     return (
         f"this row cannot be read: {error}. Restore a backup of the state folder; if a newer version wrote the row,"
         " use that version"
@@ -417,7 +418,7 @@ def unreadable(error: Exception) -> str:
 
 
 def _upsert(table: str, columns: str, key: str) -> str:
-    """An insert that replaces the row of the same key, and fails where another unique column clashes."""
+    """An insert that replaces the row of the same key, and fails when another unique column clashes."""
     names = columns.split(", ")
     changed = ", ".join(f"{name} = excluded.{name}" for name in names if name not in key.split(", "))
     marks = ", ".join("?" for _ in names)
@@ -520,5 +521,5 @@ def train_run(group: str) -> str | None:
 
 
 def stored_blobs(outcome: EpisodeOutcome) -> tuple[BlobRef, ...]:
-    """The blobs that the outcome names without carrying them."""
+    """The blobs that the outcome names without carrying their bytes."""
     return tuple(ref for ref in (outcome.trajectory, outcome.video) if ref is not None and ref.inline is None)

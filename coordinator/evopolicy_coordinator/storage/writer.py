@@ -1,10 +1,10 @@
-"""The thread that writes the database, so that no fsync ever stands in the event loop's way.
+"""The thread that writes the database, so that no fsync blocks the event loop.
 
 Rules that this module owns:
-- Work is done in the order in which it was given; its outcome is told on the event loop, in that order too.
-- Group commit: `Outbox` hands over everything that waits as one transaction, and meanwhile collects the next.
-- Effects leave the outbox in the order in which they came in, none before every `Persist` ahead of it is durable.
-- Any exception of the work is told like its outcome: the thread never ends before it is closed.
+- Work runs in the order of its submission; its results are reported on the event loop, in the same order.
+- Group commit: `Outbox` submits all waiting rows as one transaction and meanwhile collects the next.
+- Effects leave the outbox in the order of their arrival, and none before every `Persist` ahead of it is durable.
+- Any exception of the work is reported like a result: the thread does not end before it is closed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class _Work(Generic[T]):
-    """One thing to do with the store, and whom to tell."""
+    """One operation on the store, and its callbacks."""
 
     do: Callable[[Store], T]
     succeeded: Callable[[T], None]
     failed: Callable[[BaseException], None]
 
     def run(self, store: Store) -> Callable[[], None]:
-        """Does it; returns what is to be called on the event loop."""
+        """Runs the operation; returns the callback for the event loop."""
         try:
             value = self.do(store)
         except BaseException as error:
@@ -45,7 +45,7 @@ class _Work(Generic[T]):
 
 
 class Writer:
-    """Runs work on a store in a thread of its own. To be made on the event loop that is told of its ends."""
+    """Runs work on a store in a thread of its own. Construct it on the event loop that receives the results."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -60,11 +60,11 @@ class Writer:
         succeeded: Callable[[T], None],
         failed: Callable[[BaseException], None],
     ) -> None:
-        """Does `do(store)` after all that was submitted before, then calls back on the event loop."""
+        """Runs `do(store)` after all work submitted before, then calls back on the event loop."""
         self._work.put(_Work(do, succeeded, failed))  # type: ignore[arg-type]
 
     async def call(self, do: Callable[[Store], T]) -> T:
-        """`do(store)` after all that was submitted before; raises what it raises."""
+        """Returns `do(store)`, run after all work submitted before; raises its exceptions."""
         future: asyncio.Future[T] = self._loop.create_future()
 
         def settle(value: T) -> None:
@@ -86,13 +86,13 @@ class Writer:
     def _run(self) -> None:
         while (work := self._work.get()) is not None:
             tell = work.run(self._store)
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
                 self._loop.call_soon_threadsafe(tell)
             del work, tell
 
 
 class Outbox:
-    """Effects on their way out, in order, with one transaction in flight at a time."""
+    """Outgoing effects in order, with at most one transaction in flight."""
 
     def __init__(
         self,
@@ -100,9 +100,10 @@ class Outbox:
         carry_out: Callable[[Effect], None],
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """`carry_out` is given every effect but `Persist`; `on_failure` is called once, and then the outbox is dead.
+        """`carry_out` receives every effect except `Persist`. `on_failure` is called once; the outbox then drops
+        everything.
 
-        It is told a StorageError when the store refuses, anything else for a bug.
+        `on_failure` receives a StorageError when the store refuses, any other exception for a bug.
         """
         self._writer = writer
         self._carry_out = carry_out
@@ -110,16 +111,16 @@ class Outbox:
         self._effects: deque[Effect] = deque()
         self._rows: list[Row] = []
         self._n_waiting = 0
-        """Persists whose rows are in `_rows`."""
+        """Number of persists whose rows are in `_rows`."""
         self._n_in_flight = 0
         self._n_durable = 0
-        """Persists that are durable and still stand in `_effects`."""
+        """Number of persists that are durable and still in `_effects`."""
         self._dead = False
         self._writing_since = 0.0
         self.commits = 0
 
     def put(self, effects: list[Effect]) -> None:
-        """Takes effects; `flush` sets them going."""
+        """Appends effects; `flush` processes them."""
         for effect in effects:
             if isinstance(effect, Persist):
                 self._rows.extend(effect.rows)
@@ -127,7 +128,8 @@ class Outbox:
             self._effects.append(effect)
 
     def flush(self) -> None:
-        """Carries out what may be, and writes what waits if nothing is being written."""
+        """Carries out the effects that no persist holds back, and submits waiting rows if no transaction is in
+        flight."""
         if self._dead:
             return
         self._drain()
@@ -139,19 +141,19 @@ class Outbox:
         self._writer.submit(lambda store: store.write(rows), self._written, self._failed)
 
     def discard(self) -> None:
-        """Nothing that waits is carried out any more."""
+        """Drops all waiting effects and rows for good."""
         self._dead = True
         self._effects.clear()
         self._rows.clear()
 
     @property
     def writing_s(self) -> float:
-        """For how long the transaction in flight has been, seconds; 0.0 when there is none."""
+        """Age of the transaction in flight, seconds; 0.0 when there is none."""
         return time.monotonic() - self._writing_since if self._n_in_flight else 0.0
 
     @property
     def idle(self) -> bool:
-        """Whether everything is carried out and durable."""
+        """Whether all effects are carried out and durable."""
         return not self._effects and not self._n_in_flight
 
     def _written(self, _: None) -> None:

@@ -1,1 +1,1 @@
-"""`evopolicy verify`: finished episodes played again and compared."""
+"""`evopolicy verify`: replays finished episodes and compares the results."""

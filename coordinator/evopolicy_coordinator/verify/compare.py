@@ -1,11 +1,12 @@
-"""Whether two records of an episode are the same, bit for bit: two trajectories, or a trajectory and feedback files.
+"""Compares two records of an episode bit for bit: two trajectories, or a trajectory and feedback files.
 
 Rules that this module owns:
-- Floats are compared by their bits, arrays also by dtype and shape; of JSON, which has no dtypes, each number is read as
-  the dtype of what it stands for. The texts `"NaN"`, `"Inf"` and `"-Inf"` are numbers wherever one belongs.
-- An action is what was played, not part of what came of it: of two trajectories only the answers to it are compared.
-- The mark `policy_failed` in an info is of the policy, not of the environment, and is left out.
-- Runs from before `info.steps` was recorded have the parts of `info.rewards` in `info` itself; they are read as such.
+- Floats are compared by their bits, arrays also by dtype and shape. JSON has no dtypes, so each of its numbers is
+  read as the dtype of the value that it represents. The texts `"NaN"`, `"Inf"` and `"-Inf"` are read as numbers
+  wherever a number belongs.
+- An action is an input, not a result: of two trajectories only the results are compared.
+- The flag `policy_failed` in an info describes the policy, not the environment, and is ignored.
+- Runs from before `info.steps` was recorded have the parts of `info.rewards` in `info` itself, and are read as such.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _MARKS = frozenset({"policy_failed"})
 
 
 def recorded_actions(recording: Trajectory) -> bytes:
-    """The actions of a recording and nothing that came of them: what is given to who plays the episode again."""
+    """The actions of a recording without their results, for a replay of the episode."""
     return action_log(recording.actions)
 
 
@@ -46,15 +47,16 @@ def action_log(actions: Iterable[Any]) -> bytes:
 def episode_difference(
     ours: EpisodeOutcome, recorded: Trajectory, theirs: EpisodeOutcome, replayed: Trajectory
 ) -> str | None:
-    """Where two outcomes of the same actions and their trajectories part, in words; None when they never do."""
+    """Describes the first difference of two outcomes of the same actions and their trajectories; None when they are
+    equal."""
     return first_difference(recorded, replayed) or outcome_difference(ours, theirs)
 
 
 def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
-    """Where two trajectories part, as `step 3: reward 1.0 and 2.0`; None when they never do.
+    """Describes the first difference of two trajectories, as `step 3: reward 1.0 and 2.0`; None when they are equal.
 
-    Observations and infos are compared only where both have them; as they are spelled in feedback files where one of the two
-    has been rendered as such. A number of one dtype is spelled in one way.
+    Observations and infos are compared only when both have them. If one of the two has been rendered, they are
+    compared in the spelling of feedback files, which is unique for a number of a given dtype.
     """
     whole = recorded.record == "full" and replayed.record == "full"
     rendered = bool(recorded.files or replayed.files)
@@ -77,7 +79,7 @@ def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
 
 
 def _rendered_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
-    """Where observations or infos part, of which at least one has been rendered."""
+    """Describes a difference of observations or infos when at least one side has been rendered."""
     storage: ObsStorage = "inline"
     if OBSERVATIONS in recorded.files or OBSERVATIONS in replayed.files:
         storage = "npz"
@@ -104,7 +106,7 @@ def _arrays(file: bytes | None) -> dict[str, Any]:
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
-    """Which of an episode's own numbers differ, as `length 3 and 4`; the policy's side (failure, output, times) is left out."""
+    """Describes a difference of an episode's own numbers, as `length 3 and 4`; ignores failure, output and times."""
     for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
         one, other = getattr(ours, name), getattr(theirs, name)
         if not same(one, other):
@@ -113,7 +115,7 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | No
 
 
 def same(left: Any, right: Any) -> bool:
-    """Whether two values are of one type and the same bits; dicts whatever the order of their keys."""
+    """Whether two values have the same type and bits; dicts regardless of the order of their keys."""
     if isinstance(left, np.ndarray | np.generic):
         return (
             isinstance(right, np.ndarray | np.generic)
@@ -136,7 +138,7 @@ def same(left: Any, right: Any) -> bool:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of an episode's `trajectory.jsonl`. ValueError or OSError when it cannot be read."""
+    """The rows of an episode's `trajectory.jsonl`. Raises ValueError or OSError when it cannot be read."""
     try:
         rows = [json.loads(line) for line in (folder / "trajectory.jsonl").read_bytes().splitlines()]
     except RecursionError:
@@ -147,16 +149,17 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def actions_of(rows: list[dict[str, Any]]) -> list[Any]:
-    """The actions of feedback rows, as near to what the policy returned as JSON can be."""
+    """The actions of feedback rows, as close to the policy's actions as JSON allows."""
     return [_action(row["action"]) for row in rows]
 
 
 def files_difference(
     folder: Path, rows: list[dict[str, Any]], episode: Trajectory, *, actions: bool
 ) -> str | None:
-    """Where an episode's feedback files part from `episode`; None when they say the same.
+    """Describes the first difference of an episode's feedback files from `episode`; None when they are equal.
 
-    `rows` are those of its `trajectory.jsonl`; `actions`: whether `episode` has the very actions that were returned.
+    `rows` are those of its `trajectory.jsonl`. `actions`: whether `episode` has the exact actions that the policy
+    returned.
     """
     if episode.files:
         return _written_difference(folder, rows, episode, actions=actions)
@@ -185,7 +188,7 @@ def files_difference(
 def _written_difference(
     folder: Path, rows: list[dict[str, Any]], episode: Trajectory, *, actions: bool
 ) -> str | None:
-    """`files_difference` of an episode that was rendered: its files by their bytes, then by what they say."""
+    """`files_difference` for a rendered episode: compares its files' bytes first, then their content."""
     lines = episode.files[ROWS].splitlines()
     if (folder / ROWS).read_bytes() != episode.files[ROWS]:
         for t, (told, line) in enumerate(zip(rows, lines, strict=False)):
@@ -209,7 +212,7 @@ def _written_difference(
 
 
 def reads_as(told: Any, value: Any) -> bool:
-    """Whether the JSON value `told` is how feedback files say `value`."""
+    """Whether the JSON value `told` is the spelling of `value` in feedback files."""
     if isinstance(value, np.ndarray) and value.ndim:
         return (
             isinstance(told, list)
@@ -251,7 +254,7 @@ def reads_as(told: Any, value: Any) -> bool:
 
 
 def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Trajectory) -> str | None:
-    """Of observations that are stored beside the rows."""
+    """Describes a difference of observations that are stored beside the rows."""
     if episode.obs is None or not rows or rows[0].get("obs") is not None:
         return None
     columns = dict(leaves(episode.obs))
@@ -278,7 +281,7 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
 
 
 def _comparable(recorded: dict[str, Any], replayed: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Both infos without marks, the replayed one in the recorded one's form."""
+    """Both infos without ignored keys, the replayed one in the form of the recorded one."""
     left_out = _MARKS
     if "steps" in replayed and "steps" not in recorded:
         left_out = _MARKS | {"steps", "rewards"}

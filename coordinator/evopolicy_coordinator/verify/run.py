@@ -1,11 +1,12 @@
-"""Plays a finished run's episodes again and tells where anything differs.
+"""Replays a finished run's episodes and reports every difference.
 
 Rules that this module owns:
-- The exact check: recorded actions are played in the environment, with no policy. They are the coordinator's stored ones
-  where it still has them, else those of the feedback files. What comes of them must equal, bit for bit, the stored record,
-  the feedback files, and the returns that `summary.json` and `run.json` tell.
-- The advisory check: the checkpoint's policy plays the same cases again. It may read clocks, so it proves nothing.
-- The cases must be the run's: split hashes are compared before anything is played.
+- The exact check replays recorded actions in the environment, without a policy. The actions are the coordinator's
+  stored ones if it still has them, otherwise those of the feedback files. The results must equal, bit for bit, the
+  stored record, the feedback files, and the returns in `summary.json` and `run.json`.
+- The advisory check: the checkpoint's policy plays the same cases again. A policy may read clocks, so this proves
+  nothing.
+- The cases must be the run's: split hashes are compared before any episode is played.
 """
 
 from __future__ import annotations
@@ -39,26 +40,26 @@ from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
 _SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 
 Tell = Callable[[int, str], None]
-"""Is told each time how many episodes have come, and what the cluster waits for (empty: nothing)."""
+"""Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
-    """One episode, or one list of them, that is not what the run says."""
+    """One episode, or one list of episodes, that differs from the run's record."""
 
     episode: str
     difference: str
 
 
 class Report(msgspec.Struct, kw_only=True):
-    """What a verification came to; grows while it goes on."""
+    """The result of a verification; updated while it runs."""
 
     run_directory: str
     env: str
     identical: bool = True
     episodes: int = 0
-    """Played again from their recorded actions."""
+    """Replayed from their recorded actions."""
     from_files: int = 0
-    """Those of them whose actions came from feedback files, as the coordinator no longer has them."""
+    """Of these, episodes whose actions came from feedback files, as the coordinator no longer stores them."""
     differences: list[Finding] = []
     not_checked: list[Finding] = []
     policy_episodes: int = 0
@@ -74,15 +75,15 @@ class Report(msgspec.Struct, kw_only=True):
 
 
 class _Recording(msgspec.Struct, kw_only=True):
-    """What is known of one episode before it is played again."""
+    """The data of one episode before its replay."""
 
     index: int
     actions: bytes
-    """Trajectory bytes with the actions that are played."""
+    """Trajectory bytes with the actions to replay."""
     outcome: EpisodeOutcome | None
-    """As the coordinator stored it."""
+    """As stored by the coordinator."""
     stored: bytes | None
-    """Its trajectory, packed: unpacked only while it is compared, as a submit's together may be gigabytes."""
+    """Its packed trajectory, unpacked only for the comparison: a submit's trajectories together may be gigabytes."""
     files: bool
     """Whether there are feedback files to compare with."""
 
@@ -99,11 +100,12 @@ class Verifier:
         self._knows_run = False
         self._came = 0
         self._kept: dict[int, _Recording] = {}
-        """Of the list that was played again last, by index."""
+        """Recordings of the list that was replayed last, by index."""
         self.report = Report(run_directory=str(run.root), env=run.record.env)
 
     async def check_cases(self) -> bool:
-        """Whether the coordinator still knows the run. ConfigError when its cases are not the run's."""
+        """Whether the coordinator still has the run. Raises ConfigError when the coordinator's cases are not the
+        run's."""
         state = await self._describe()
         record, versions = self._run.record, self._run.record.versions
         if record.experiment_dimensions.hidden_cases == "per_run" and not state.knows_run:
@@ -127,7 +129,7 @@ class Verifier:
         return self._knows_run
 
     async def replay(self, played: Played, indexes: Sequence[int]) -> None:
-        """The exact check of these episodes of a list."""
+        """Makes the exact check of these episodes of a list."""
         recordings = await self._recordings(played, indexes)
         if not recordings:
             return
@@ -152,7 +154,8 @@ class Verifier:
             )
 
     async def play_policy(self, played: Played, indexes: Sequence[int]) -> None:
-        """The advisory check: these train episodes of a submit, by its checkpoint's policy; right after their `replay`."""
+        """Makes the advisory check of these train episodes with their checkpoint's policy. Call it right after their
+        `replay`."""
         dimensions = self._run.record.experiment_dimensions
         name = f"submit {played.submit_index}"
         if dimensions.policy_scope == "submit" and len(indexes) < len(played.env_instances):
@@ -186,7 +189,8 @@ class Verifier:
                 )
 
     async def check_fingerprint(self) -> None:
-        """Compares the library versions of the connected workers with the run's; call it when workers have worked."""
+        """Compares the library versions of the connected workers with the run's. Call it after workers have played
+        episodes."""
         known = self._run.record.versions.fingerprint
         found: dict[str, None] = {}
         for fingerprint in (await self._describe()).fingerprints if known else ():
@@ -197,7 +201,7 @@ class Verifier:
                     found[f"{name}: {ours} in the run, {theirs} on the workers"] = None
         self.report.fingerprint_differences = list(found)
 
-    # What was recorded.
+    # Recordings.
 
     async def _recordings(self, played: Played, indexes: Sequence[int]) -> list[_Recording]:
         known = await self._stored(played) if self._knows_run else {}
@@ -254,7 +258,7 @@ class Verifier:
         )
         return {outcome.index: outcome async for outcome in found}
 
-    # What comes of it now.
+    # Comparison.
 
     async def _compare(self, played: Played, recording: _Recording, outcome: EpisodeOutcome) -> None:
         self.report.episodes += 1
@@ -295,7 +299,7 @@ class Verifier:
             return verify_compare.first_difference(decode(recording.stored), again)
         return _of_files(played, recording.index, again, actions=True)
 
-    # The cluster.
+    # Requests to the cluster.
 
     async def _describe(self) -> EnvironmentState:
         record = self._run.record
@@ -339,13 +343,13 @@ class Verifier:
                 modulo=played.modulo,
                 remaining_budget_after=played.remaining_budget_after,
                 policy_scope=dimensions.policy_scope,
-                # Random actions had no policy to give lists to, and are recorded as arrays.
+                # Random actions had no policy that could receive lists, and are recorded as arrays.
                 observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
             ),
         )
 
     async def _outcomes(self, message: Evaluate) -> AsyncIterator[EpisodeOutcome]:
-        """Outcomes as they come."""
+        """Yields outcomes as they arrive."""
         async with contextlib.aclosing(self._ask.evaluate(message)) as told:
             async for outcome, _, waits_for in told:
                 self._came += outcome is not None
@@ -355,7 +359,7 @@ class Verifier:
 
 
 def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:
-    """Where an episode's feedback files part from `episode`."""
+    """Describes the first difference of an episode's feedback files from `episode`."""
     folder = played.folders[index]
     try:
         rows = verify_compare.read_rows(folder)

@@ -1,7 +1,7 @@
-"""What a finished run directory says was played: the lists of episodes that can be played again, and their files.
+"""Reads from a finished run directory which episodes can be replayed, and where their files are.
 
-Rules: nothing here is trusted to be what the run left; what cannot be read is told by name. An episode that left no
-trajectory (its submit was not `ok`) is not in any list.
+Rules: no content is trusted to be the run's own; unreadable files are reported by name. An episode without a
+trajectory (its submit was not `ok`) is not listed.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
     env_instances: tuple[int, ...]
     """Ids in the split, in order."""
     modulo: int
-    """Episodes of the policy's own submit."""
+    """Number of episodes of the policy's own submit."""
     remaining_budget_after: int
     returns: tuple[float, ...] | None
-    """As the run directory tells them; None where it tells only `mean`."""
+    """As recorded in the run directory; None when it records only `mean`."""
     lengths: tuple[int, ...] | None = None
     mean: float | None = None
     folders: tuple[Path, ...] = ()
@@ -43,24 +43,24 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
     checkpoint: Path | None = None
     """`checkpoints/submit_NNN` of the policy; None for the random reference."""
     digest: str = ""
-    """Of the policy's bundle, as the checkpoint tells it."""
+    """Digest of the policy's bundle, from the checkpoint's metadata."""
 
     def name(self, index: int) -> str:
-        """How an episode is called in what is told of it."""
+        """An episode's name in reports."""
         if self.folders:
             return f"submit {self.submit_index}, {self.folders[index].name}"
         policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"
         return f"{policy}, {self.split} episode {index}"
 
     def mean_differs(self, returns: dict[int, float]) -> bool:
-        """Whether all returns are there and their mean is not the one that the run directory tells."""
+        """Whether all returns are present and their mean differs from the one in the run directory."""
         if self.mean is None or len(returns) < len(self.env_instances):
             return False
         return math.fsum(returns.values()) / len(returns) != self.mean
 
 
 class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
-    """A run directory."""
+    """A finished run directory and its replayable episodes."""
 
     root: Path
     record: RunRecord
@@ -69,7 +69,8 @@ class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_run(root: Path) -> RunUnderTest:
-    """What was played in a run. ConfigError when `root` is no finished run's directory, or a file of it is damaged."""
+    """Reads a run directory. Raises ConfigError when `root` is no finished run's directory, or one of its files is
+    damaged."""
     path = root / "run.json"
     try:
         record = decode_run_record(path.read_bytes())
@@ -91,7 +92,7 @@ def read_run(root: Path) -> RunUnderTest:
 
 
 def _train(root: Path, record: RunRecord, folder: Path) -> Played | None:
-    """An ok submit; None for any other."""
+    """The episodes of an `ok` submit; None for any other."""
     summary = _summary(folder)
     if summary is None or summary.env_instances is None or summary.first_global_episode is None:
         return None
@@ -176,7 +177,7 @@ def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
 
 
 def sample(lists: list[Played], n: int | None, seed: int) -> list[tuple[Played, tuple[int, ...]]]:
-    """`n` episodes of all lists drawn without repetition (None: all), as indexes of each list that has some."""
+    """Draws `n` episodes of all lists without replacement (None: all), as indexes of each list that has some."""
     everything = [(k, index) for k, played in enumerate(lists) for index in range(len(played.env_instances))]
     chosen = everything if n is None or n >= len(everything) else random.Random(seed).sample(everything, n)
     by_list: dict[int, list[int]] = {}
