@@ -1,19 +1,19 @@
-"""Post-hoc analysis of runs: every table and figure of the paper, and the diagnostics beyond it.
+"""Post-hoc analysis of runs: the tables and figures of the paper, and further diagnostics.
 
 From a notebook:
 
     from evopolicy_coordinator.analysis import rows, study
 
-    found = study(["runs"])                     # reads every run below; what is damaged is in found.left_out
+    found = study(["runs"])                     # reads every run below; damaged runs are in found.left_out
     core16 = found.suites[0]
     for row in core16.board.standings:          # typed records
         print(row.entry, row.score, row.wins)
-    core16.statistics.pairs                     # how sure they are; see `statistics`
-    rows(found.evolutions)                      # a list of dicts: pandas.DataFrame(rows(...)) takes it
+    core16.statistics.pairs                     # pairwise comparisons with intervals and tests; see `statistics`
+    rows(found.evolutions)                      # a list of dicts for pandas.DataFrame
 
-`study` refuses runs that are no fair comparison (MixedRunsError) unless `allow_mixed=True`. `write_report` writes the
-pages that `evopolicy report` writes; `figures_of` draws the figures one by one; `heldout_returns` is the paper's own
-table of scores. Nothing here runs a policy or needs a simulator; matplotlib is imported when a figure is drawn.
+`study` raises MixedRunsError for runs that are not a fair comparison, unless `allow_mixed=True`. `write_report`
+writes the pages of `evopolicy report`; `figures_of` draws the figures one by one; `heldout_returns` is the paper's
+own table of scores. Nothing here runs a policy or needs a simulator. Matplotlib is imported when a figure is drawn.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ __all__ = [
 
 
 def figures_of(found: Study) -> Iterator[Plot]:
-    """The report's figures, drawn one after another; see `figures.figures_of`."""
+    """Draws the report's figures one by one; see `figures.figures_of`."""
     from evopolicy_coordinator.analysis.figures import figures_of as draw
 
     return draw(found)

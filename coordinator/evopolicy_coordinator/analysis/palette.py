@@ -1,7 +1,7 @@
-"""An agent's identity in every figure and page: colour, marker and dash; and the colours of edit types.
+"""An agent's look in every figure and page (colour, marker and dash), and the colours of edit types.
 
 An agent has the same look in every figure of a report, given by its place among the agents' names. Colours are Okabe
-and Ito's colour-blind-safe set (yellow and black left out, each too weak on one of the two backgrounds), then three of
+and Ito's colour-blind-safe set (without yellow and black, each too weak on one of the two backgrounds), then three of
 Tol's; after nine agents colours repeat with another dash. The random reference is always grey and dashed.
 """
 
@@ -22,7 +22,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
 
 EDIT_COLOURS = {"first": "#b9bec6", "synthesis": "#7b6fd0", "parametric": "#c9a227", "data": "#5f9e98"}
-"""Bands of the timelines; not used by any agent."""
+"""Colours of the timelines' bands; no agent uses them."""
 
 MARKER_PATHS = {
     "o": "M8 2a6 6 0 1 0 .01 0z",
@@ -36,11 +36,11 @@ MARKER_PATHS = {
     ">": "M14.5 8 2 1v14z",
     "|": "M6.5 1h3v14h-3z",
 }
-"""The markers as SVG paths in a box of 16 by 16, for pages."""
+"""The markers as SVG paths in a 16 × 16 box, for pages."""
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """An agent's identity in figures."""
+    """An agent's appearance in figures."""
 
     colour: str
     marker: str
@@ -48,12 +48,13 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def path(self) -> str:
-        """The marker as an SVG path, see `MARKER_PATHS`."""
+        """The marker as an SVG path; see `MARKER_PATHS`."""
         return MARKER_PATHS[self.marker]
 
 
 def looks(agents: Sequence[str], reference: str | None) -> dict[str, Look]:
-    """Agent to look, by the place of its name among all agents of the report; the reference grey and dashed."""
+    """Assigns each agent a look by the place of its name among all agents of the report; the reference is grey and
+    dashed."""
     out: dict[str, Look] = {}
     for place, agent in enumerate(sorted(agents, key=lambda name: (name.casefold(), name))):
         lap = place // len(COLOURS)

@@ -1,4 +1,4 @@
-"""Everything a report says about a set of runs, as one typed record: the notebook's entry point."""
+"""All results of a report on a set of runs, as one typed record: the notebook's entry point."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ class Timeline(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Study(msgspec.Struct, frozen=True, kw_only=True):
-    """All metrics of a set of runs. Every list of records turns into a data frame by `records.rows`."""
+    """All metrics of a set of runs. `records.rows` turns each list of records into rows for a data frame."""
 
     runs: tuple[Run, ...]
     left_out: tuple[LeftOut, ...]
     mixtures: tuple[Mixture, ...]
-    """What the runs differ in that a comparison holds fixed; empty unless mixing was allowed."""
+    """Differences between runs in settings that a comparison holds fixed; empty unless mixing was allowed."""
     suites: tuple[Suite, ...]
     evolutions: tuple[Evolution, ...]
     edit_rates: tuple[EditRates, ...]
@@ -75,13 +75,13 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def entries(self) -> list[str]:
-        """Every agent by name, without the random reference."""
+        """All agents by name, without the random reference."""
         found = {entry for suite in self.suites for entry in suite.table.agents}
         return sorted(found, key=lambda entry: (entry.casefold(), entry))
 
     @property
     def reference(self) -> str | None:
-        """Entry that is the uniform-random reference; None when there is none."""
+        """The entry of the uniform-random reference; None when it is missing."""
         return next(
             (suite.table.reference for suite in self.suites if suite.table.reference is not None), None
         )
@@ -96,12 +96,13 @@ def study_of(
     scores: ScoreTable | None = None,
     resamples: int = RESAMPLES,
 ) -> Study:
-    """Computes every metric. MixedRunsError when runs are no one comparison and `allow_mixed` is false.
+    """Computes every metric. Raises MixedRunsError when the runs are not one comparison and `allow_mixed` is false.
 
-    `allow_unknown` allows runs that do not tell their hidden isolation beside runs that do; `allow_mixed` alone does not.
+    `allow_unknown` allows runs without a record of their hidden isolation beside runs with one; `allow_mixed` alone
+    does not.
 
-    `scores` adds a table of scores without run directories (such as the paper's): it has no submits, so it shows in
-    the leaderboard and normalised performance only. It may not name an entry that the runs name too.
+    `scores` adds a table of scores without run directories (such as the paper's). It has no submits, so it appears
+    only in the leaderboard and normalised performance. Its entries must differ from those of the runs.
     """
     mixed = mixtures(runs)
     table = score_table(runs)
@@ -175,7 +176,7 @@ def _reference_of(table: ScoreTable) -> dict[str, float]:
 
 
 def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:
-    """Both tables in one, and the mixture that this is where both have scores on an environment."""
+    """Merges both tables, and returns the mixtures of environments on which both have scores."""
     twice = set(table.agents) & set(scores.agents)
     if twice:
         raise MixedRunsError(

@@ -1,12 +1,12 @@
 """Writes a report folder: pages, figures, tables, data. The only part of the analysis that writes files.
 
-    index.html                self-contained: figures, styles and scripts are in it
+    index.html                self-contained: includes figures, styles and scripts
     report.json               every table and every figure's data
     figures/*.svg, *.png      tables/*.csv, *.md, *.tex
-    traces/*.html             one page a run, images beside it
-    replays/*.html            one page an environment that has recordings, videos beside it
+    traces/*.html             one page per run, images beside it
+    replays/*.html            one page per environment with recordings, videos beside it
 
-Files of an earlier report in the same folder are overwritten; a folder that holds anything else is refused.
+Files of an earlier report in the same folder are overwritten. A folder with any other content is refused.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from evopolicy_coordinator.analysis.tables.table import Table, to_csv, to_markdo
 REPORT_SCHEMA_VERSION = 1
 _OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
 _POINTS_PER_REM = 11.0
-"""Figures are shown a little larger than printed: a rem of the page for that many points."""
+"""Points per rem of the page: figures are shown slightly larger than printed."""
 
 _WRITTEN = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 Progress = Callable[[str, int, int], None]
-"""Told (what, done, total)."""
+"""Called with (what, done, total)."""
 
 
 def write_report(
@@ -60,10 +60,10 @@ def write_report(
     traces: bool = True,
     progress: Progress | None = None,
 ) -> Path:
-    """Writes the report of `study` into the folder `out` (made when absent) and returns its `index.html`.
+    """Writes the report of `study` into the folder `out` (created if missing) and returns its `index.html`.
 
-    ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of single runs
-    are left out, which is most of the time and space of a large report.
+    Raises ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of
+    single runs are left out, which saves most of the time and space of a large report.
     """
     tell = progress if progress is not None else lambda what, done, total: None
     _prepare(out)
@@ -82,7 +82,7 @@ def write_report(
                 _write_trace(found, out, look, _beside(run, by_env[run.env]))
                 submits += submits_of(found)
             except Exception as error:
-                # What an agent wrote into its log or sources spoils its own page at most.
+                # A bad log or source that an agent wrote must spoil at most its own page.
                 page = failed_page(run, f"{type(error).__name__}: {error}")
                 path = out / "traces" / f"{slug(run)}.html"
                 path.write_text(page, encoding="utf-8", errors="replace")
@@ -109,7 +109,7 @@ def write_report(
 
 
 def slug(run: Run) -> str:
-    """A file name for the run's page: readable, and unique by a hash of its name."""
+    """A file name for the run's page: readable, and unique by a hash of the run's name."""
     text = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{run.env}-{run.entry}-{run.record.exp_id}").strip("-.")[:90]
     return f"{text}-{hashlib.sha256(run.name.encode()).hexdigest()[:8]}"
 
@@ -130,7 +130,7 @@ def _prepare(out: Path) -> None:
 
 
 def _write_figures(study: Study, out: Path, tell: Progress) -> tuple[list[FigureView], dict[str, Any]]:
-    from evopolicy_coordinator.analysis.figures import figures_of  # matplotlib: only when figures are wanted
+    from evopolicy_coordinator.analysis.figures import figures_of  # imports matplotlib
     from evopolicy_coordinator.analysis.figures.style import inline_svg, png_bytes, svg_text
 
     views: list[FigureView] = []
@@ -165,7 +165,7 @@ class _Html(str):
 
 
 def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
-    """A run of each other agent among those of its environment, of the same repeat where there is one."""
+    """One run of each other agent on the same environment, with the same repeat number if there is one."""
     found: dict[str, Run] = {}
     for other in runs:
         if other.entry != run.entry:
@@ -199,7 +199,7 @@ def _write_trace(found: Trace, out: Path, looks: Mapping[str, Look], beside: Seq
 
 
 def _copy(path: Path, target: Path) -> bool:
-    """Copies a file; False when it is not there, or a link."""
+    """Copies a file; returns False when it is missing or a link."""
     if not path.is_file() or path.is_symlink():
         return False
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -236,7 +236,8 @@ def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[st
 
 
 def _copied(run: Run, path: str, folder: Path, stem: str) -> str | None:
-    """Copies a run's file into the report; None when it is missing or would lead out of the run directory."""
+    """Copies a run's file into the report; returns None when it is missing, outside the run directory, or no image or
+    video."""
     source = (run.path / path).resolve()
     if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in (
         ".mp4",

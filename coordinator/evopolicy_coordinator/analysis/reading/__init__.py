@@ -1,1 +1,1 @@
-"""Run directories in, typed records out."""
+"""Reads run directories into typed records."""

@@ -1,17 +1,16 @@
-"""What an agent's own log tells of each submit: its messages, the feedback it read, the images it made.
+"""Reads from an agent's own log what preceded each submit: its messages, the feedback it read, the images it made.
 
-`logs/agent.jsonl` holds a harness's raw stream, one JSON value a line. Three forms are known: Claude Code's
-`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and what command
-agents give: the turn protocol (`{"turn", "text", "stop"}`) and plain lines (`{"type": "stdout", "text"}`). Lines in any other
-form, and lines that are no JSON, are passed over.
+`logs/agent.jsonl` holds a harness's raw stream, one JSON value per line. Three forms are known: Claude Code's
+`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and the
+output of command agents: the turn protocol (`{"turn", "text", "stop"}`) and plain lines (`{"type": "stdout",
+"text"}`). Lines in any other form, and invalid JSON, are skipped.
 
-A submit's place in the stream is where its answer (`submit_id`, or its summary) first shows in a tool's output, or a plain
-line begins with its name. Where
-the log never shows answers but stamps its lines, times decide. Where it does neither, nothing is attributed: messages
-are then listed apart rather than guessed into place.
+A submit's position in the stream is the first tool output with its answer (`submit_id`, or its summary), or the first
+plain line that begins with its name. If the log never shows answers but has timestamps, these decide. If it has
+neither, nothing is attributed: messages are listed separately rather than guessed into place.
 
-A log is an agent's to write as it likes. So each rule here takes time in proportion to its length, and there are bounds for
-what is kept of it.
+An agent may write anything into its log. So each rule here takes time linear in its length, and the amount of data
+that is kept is bounded.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_coordinator.analysis.reading.records import Submit
 
 MAX_LOG_BYTES = 64 << 20
-"""A log is read up to here; what comes later is not attributed."""
+"""Later bytes of a log are not read."""
 MAX_MESSAGE_CHARS = 6000
 MAX_EVENTS = 200_000
-"""A log is read up to here, too."""
+"""Later events of a log are not read."""
 MAX_PATHS = 1000
-"""Feedback paths, and images, that are kept for one submit."""
+"""Maximum number of feedback paths, and of images, per submit."""
 _MAX_PATH_CHARS = 4096
 
 _FEEDBACK = re.compile(r"feedback/[\w./*?\[\]{},-]*")
@@ -49,7 +48,7 @@ _MAX_STAMP_CHARS = 64
 
 
 class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing that the log tells, in the stream's order."""
+    """One event of the log, in the order of the stream."""
 
     message: str = ""
     """Text that the agent wrote, not a tool's."""
@@ -58,18 +57,19 @@ class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
     images: tuple[str, ...] = ()
     """Image files that a tool call names."""
     answers: tuple[int, ...] = ()
-    """Submit indices that a tool's output answers."""
+    """Indices of the submits that a tool's output answers."""
     at: float | None = None
-    """Unix time, seconds; None when the line has no stamp."""
+    """Unix time, seconds; None when the line has no timestamp."""
 
 
 class Evidence(msgspec.Struct, frozen=True, kw_only=True):
-    """What the log tells of the time between the previous submit and this one."""
+    """The log's events between the previous submit and this one."""
 
     read: tuple[str, ...] = ()
     """Feedback paths that the agent's tool calls name, in order, without repeats."""
     messages: tuple[str, ...] = ()
-    """The agent's own messages; the last is the nearest to the submit, and its attribution where it gives one."""
+    """The agent's own messages; the last is the closest to the submit, and its attribution of the result if it gives
+    one."""
     images: tuple[str, ...] = ()
 
     @property
@@ -78,15 +78,15 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LogReading(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole log, as far as it tells."""
+    """The attributed events of a whole log."""
 
     by_submit: dict[int, Evidence] = {}
     unplaced: tuple[str, ...] = ()
-    """Messages of a log that does not tell where submits are, or that came after the last."""
+    """Messages from a log that shows no submits, or after the last submit."""
 
 
 def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
-    """Reads the log beside a run; empty when there is none. Raises nothing for damaged content."""
+    """Reads a run's log; empty when it is missing. Never raises for damaged content."""
     try:
         events = list(itertools.islice(_events(_lines(path)), MAX_EVENTS))
     except OSError:
@@ -95,7 +95,7 @@ def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
 
 
 def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
-    """Assigns events to the submit that they precede."""
+    """Assigns each event to the submit that it precedes."""
     expected = [submit.index for submit in submits]
     groups = _by_answers(events, expected)
     if groups is None:
@@ -132,7 +132,7 @@ def _by_times(
     ]
     if not starts or not any(event.at is not None for event in events):
         return None
-    # A submit before which a later start stands gets no event: the first that starts late enough does.
+    # An event goes to the first submit that starts late enough, so a submit listed after a later start gets none.
     latest = list(itertools.accumulate((started for started, _ in starts), max))
     placed: dict[int, list[LogEvent]] = {}
     rest: list[LogEvent] = []
@@ -244,7 +244,7 @@ def _call(texts: Sequence[str], at: float | None) -> LogEvent:
 
 
 def _images(text: str) -> Iterator[str]:
-    """Every run of a path's characters that holds an image's suffix, up to the last one in it."""
+    """Every run of path characters that holds an image suffix, cut after its last one."""
     for run in _PATH.findall(text):
         ends = [found.end() for found in _IMAGE_SUFFIX.finditer(run)]
         if ends:

@@ -1,10 +1,11 @@
-"""What must not be mixed in one comparison: budgets, policy scopes, splits, fingerprints, how agents were confined, whether
-hidden episodes and agents shared a kernel, and results that an audit has put in question with any others.
+"""Settings that must agree within one comparison: budgets, policy scopes, splits, fingerprints, the agents'
+confinement, and whether hidden episodes and agents shared a kernel. Results that an audit disputes must not be mixed
+with others.
 
-Budget, scope, observation form, finish rule, profile, jail, hidden isolation and hidden cases must agree over all runs of a suite; splits (by
-hash), library fingerprint, environment version, how large a submit may be, a policy's limits, and whether feedback has
-videos over the runs of one environment, since environments differ in them anyway. Runs that played hidden cases of their
-own differ in these splits by design.
+These must agree over all runs of a suite: budget, scope, observation form, simulation rule, finish rule, profile,
+jail, hidden isolation and hidden cases. These must agree over the runs of one environment, since environments differ
+in them anyway: splits (by hash), library fingerprint, environment version, bounds of a submit, a policy's limits,
+step limit, and videos in feedback. Runs with hidden cases of their own differ in these splits by design.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, 
 
 
 class Mixture(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing in which runs that are compared differ."""
+    """One setting in which compared runs differ."""
 
     what: str
     """`episode budget`, `policy scope`, `train split`, …"""
     where: str
     """Suite or environment."""
     values: dict[str, int]
-    """Each value as text, to the number of runs that have it."""
+    """Each value as text, to the number of runs with it."""
 
     def __str__(self) -> str:
         found = ", ".join(f"{value} ({n} run{'s' * (n != 1)})" for value, n in self.values.items())
@@ -37,7 +38,7 @@ class Mixture(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MixedRunsError(EvopolicyError):
-    """Runs that are no fair comparison; `mixtures` tells in what."""
+    """The runs are not a fair comparison; `mixtures` lists the differences."""
 
     def __init__(self, mixtures: Sequence[Mixture]) -> None:
         super().__init__(
@@ -48,7 +49,7 @@ class MixedRunsError(EvopolicyError):
 
 IN_QUESTION = "results in dispute, or of a forger,"
 UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
-"""Runs from before it was recorded beside runs that tell it: compared only where that is allowed by name."""
+"""Older runs without this record beside runs with it; their comparison needs an option of its own."""
 
 _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "episode budget": lambda run: str(run.budget),
@@ -88,7 +89,7 @@ REMEDIES = {
     "step limit": "the same --step-limit",
     "videos in feedback": "the same --video",
 }
-"""How runs are to be played that agree in a thing, by `Mixture.what`."""
+"""By `Mixture.what`: how to play runs that agree in it."""
 
 
 def _split(run: Run, split: Split) -> str:
@@ -98,21 +99,20 @@ def _split(run: Run, split: Split) -> str:
 
 
 def _step_limit(run: Run) -> str:
-    """Empty where the environment has one limit only."""
+    """Empty if the environment has only one limit."""
     entry = catalogue.entries().get(run.env)
     both = entry is not None and entry.published_steps is not None
     return run.record.experiment_dimensions.step_limit if both else ""
 
 
 def _limits(run: Run) -> str:
-    """As `name=value` words; empty where the run does not tell."""
+    """As `name=value` words; empty if the run has no record of them."""
     limits = run.record.experiment_dimensions.limits
     return "" if limits is None else " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(limits).items())
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:
-    """Everything in which runs of one suite or environment differ, and runs that are in question; empty for a fair
-    comparison."""
+    """Every difference between runs of one suite or environment, and disputed runs; empty for a fair comparison."""
     by_env: dict[str, list[Run]] = {}
     for run in runs:
         by_env.setdefault(run.env, []).append(run)
@@ -129,7 +129,8 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
 
 
 def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
-    """What of a run's fingerprint is not the same in all of `runs`, as `name=version` words, and how an operator changed it."""
+    """Returns a function for the parts of a run's fingerprint that differ among `runs`, and its overrides by the
+    operator."""
     compared = comparable([run.record.versions.fingerprint for run in runs])
     items = {id(run): set(parts.items()) for run, parts in zip(runs, compared, strict=True)}
     common = set.intersection(*items.values())
@@ -143,7 +144,7 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
 
 
 def _isolation(suite: str, runs: list[Run]) -> list[Mixture]:
-    """Differences among the runs that tell it, and runs that do not tell it beside them."""
+    """Differences among runs with a record of their isolation, and runs without one beside them."""
     told = {"hidden isolation": lambda run: run.record.hidden_isolation}
     known = [run for run in runs if run.record.hidden_isolation != "unknown"]
     found = _differences(told, suite, known)
@@ -153,7 +154,7 @@ def _isolation(suite: str, runs: list[Run]) -> list[Mixture]:
 
 
 def _in_question(env: str, runs: list[Run]) -> list[Mixture]:
-    """Runs whose numbers may be forged, by the word of their own audits."""
+    """Runs whose results may be forged, according to their own audits."""
     names = [run.name for run in runs if run.record.audit is not None and run.record.audit.in_question]
     return [Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(names, 1))] if names else []
 

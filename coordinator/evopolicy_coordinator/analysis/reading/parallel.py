@@ -1,7 +1,7 @@
-"""A function over many items, in several processes: plain children with pipes.
+"""Applies a function to many items in several child processes, connected by pipes.
 
-Nothing that they use has a name, so nothing is left when whoever started them is killed; they end with it. An item over which
-a process ends costs that item alone.
+The pipes have no names, so nothing is left behind when the parent is killed, and the children end with it. If a child
+ends while it processes an item, only that item is lost.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _AT_ONCE = 8
-"""Items that a process is given at a time."""
+"""Number of items that a process receives at a time."""
 
 
 def in_processes(
@@ -31,9 +31,10 @@ def in_processes(
     jobs: int,
     when_lost: Callable[[Item, str], Result],
 ) -> Iterator[Result]:
-    """`function` of each item, in order; where its process ended over an item, `when_lost` of it and why.
+    """Yields `function` of each item, in order; for an item whose process ended, `when_lost` of the item and the
+    reason.
 
-    The children find `function` by its name; items and results are pickled. Call it on the main thread.
+    The children import `function` by its name; items and results are pickled. Call it on the main thread.
     """
     children = [_Child(function) for _ in range(jobs)]
     idle: queue.SimpleQueue[_Child] = queue.SimpleQueue()
@@ -53,14 +54,14 @@ def in_processes(
             yield from results
     finally:
         for each in children:
-            each.end()  # nobody wants what is not done yet
+            each.end()  # unfinished items are not needed
         pool.shutdown(cancel_futures=True)
         for each in children:
-            each.end()  # who was just being started again
+            each.end()  # children that were just being restarted
 
 
 class _Child:
-    """A process that is given items. Threads may use it one after another."""
+    """A child process for items. Several threads may use it, one at a time."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self._function = function
@@ -80,11 +81,11 @@ class _Child:
             self._process = self._started()
         if len(items) == 1:
             return [when_lost(items[0], why)]
-        # Which of them it ended over shows one by one.
+        # Items sent one by one show which of them ends the process.
         return [result for item in items for result in self.results([item], when_lost)]
 
     def end(self) -> None:
-        """Kills it for good. Nothing when it has ended."""
+        """Kills the process for good; does nothing if it has ended."""
         self._over = True
         self._kill()
 
@@ -97,7 +98,7 @@ class _Child:
                     pipe.close()
 
     def _started(self) -> subprocess.Popen[bytes]:
-        # A session of its own, so that Ctrl-C reaches the command alone.
+        # A session of its own, so that Ctrl-C reaches only the command.
         return subprocess.Popen(
             ending_with_parent([sys.executable, "-P", "-m", __name__], signal.SIGKILL),
             stdin=subprocess.PIPE,
@@ -116,7 +117,7 @@ class _Child:
 
 
 def main() -> None:
-    """A child: works on what comes on stdin until that ends."""
+    """Main loop of a child: processes items from stdin until it is closed."""
     results = sys.stdout.buffer
     sys.stdout = sys.stderr
     while True:

@@ -1,8 +1,8 @@
-"""Run directories of the published software, read as ours: what they do not tell is left unknown, never guessed.
+"""Reads run directories of the published software as our records; missing information stays unknown, never guessed.
 
-`run.json` there has `schema_version` 0.1 and no `record_version`. Only fields that the published protocol names are relied
-on, and each may be missing: names come from the path then, the budget from the first checkpoint, the selected submit from
-`code_metrics_best`. What holds for every published run is stamped: one policy for all episodes of a submit, list
+Its `run.json` has `schema_version` 0.1 and no `record_version`. Only fields named by the published protocol are used,
+and each may be missing: names then come from the path, the budget from the first checkpoint, the selected submit from
+`code_metrics_best`. Properties of every published run are filled in: one policy for all episodes of a submit, list
 observations, no simulation outside submits, its step limits, no early finish, public cases.
 """
 
@@ -38,7 +38,7 @@ _ARTIFACTS = ("workspace", "feedback", "checkpoints", "logs_harness", "logs_agen
 
 
 class PublishedSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What a report takes from a `summary.json` of the published software; each field may be missing."""
+    """The fields of a published `summary.json` that a report uses; each may be missing."""
 
     status: str = ""
     env: str = ""
@@ -60,7 +60,7 @@ _summary = msgspec.json.Decoder(PublishedSummary)
 
 
 def is_published(told: Any) -> bool:
-    """Whether a `run.json`, decoded, is the published software's."""
+    """Whether a decoded `run.json` is the published software's."""
     return (
         isinstance(told, dict)
         and told.get("schema_version") == PUBLISHED_SCHEMA
@@ -69,7 +69,7 @@ def is_published(told: Any) -> bool:
 
 
 def read_summary(path: Path) -> PublishedSummary | None:
-    """A submit's summary; None where there is none. ProtocolError when it is damaged."""
+    """A submit's summary; None when it is missing. Raises ProtocolError when it is damaged."""
     try:
         return _summary.decode(path.read_bytes())
     except FileNotFoundError:
@@ -79,7 +79,7 @@ def read_summary(path: Path) -> PublishedSummary | None:
 
 
 def read_record(folder: Path, told: dict[str, Any]) -> RunRecord:
-    """`run.json` of the published software, decoded, as a record of ours. ProtocolError where it is damaged."""
+    """Converts a decoded `run.json` of the published software to our record. Raises ProtocolError when damaged."""
     outcome, timing, versions = (_object(told, name) for name in ("outcome", "timing", "versions"))
     artifacts = {name: place for name, place in _object(told, "artifacts").items() if name in _ARTIFACTS}
     feedback = folder / str(artifacts.get("feedback", "workspace/feedback"))
@@ -145,7 +145,8 @@ def _object(told: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _names(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary]) -> tuple[str, str]:
-    """Model and environment: as told, or from `runs/<model>/<env>/<exp-id>`, where a `/` of the environment may be a `_`."""
+    """Model and environment: as recorded, or from `runs/<model>/<env>/<exp-id>`, where `_` may replace an
+    environment's `/`."""
     above = folder.parent
     by_path = {env: above.parent.name for env in catalogue.entries() if env.replace("/", "_") == above.name}
     by_path |= {
@@ -159,7 +160,7 @@ def _names(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary]
 
 
 def _budget(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary]) -> int:
-    """The episode budget: as told, or what was left before the first submit."""
+    """The episode budget: as recorded, or the remaining budget before the first submit."""
     budget = _object(told, "experiment_dimensions").get("episode_budget")
     if isinstance(budget, int):
         return budget
@@ -173,7 +174,7 @@ def _budget(folder: Path, told: dict[str, Any], summaries: list[PublishedSummary
 
 
 def _best(outcome: dict[str, Any]) -> int | None:
-    """The selected submit: as told, or the last one whose code metrics are those of the best checkpoint."""
+    """The selected submit: as recorded, or the best-scored one with the code metrics of the best checkpoint."""
     best = outcome.get("best_submit_index")
     if best is not None:
         return int(best)
@@ -191,7 +192,7 @@ def _number(value: Any) -> float:
 
 
 def decode(data: bytes) -> Any:
-    """`run.json` as plain values; None when it is no JSON."""
+    """`run.json` as plain values; None when it is not JSON."""
     try:
         return json.loads(data)
     except (ValueError, RecursionError):

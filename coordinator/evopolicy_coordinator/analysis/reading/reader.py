@@ -1,7 +1,8 @@
-"""Run directories in, typed runs out. A damaged or half-finished run is listed with its reason, never a crash.
+"""Reads run directories as typed runs. A damaged or unfinished run is listed with its reason; it never causes a
+crash.
 
-A run is complete when its `run.json` can be read and says `completed` or `no_ok_submit`. Everything else in the folder
-is read from what the agent saw (`summary.json`) and from the immutable checkpoints; `run.json` alone brings the hidden
+A run is complete when its `run.json` is readable and has status `completed` or `no_ok_submit`. All other data come
+from the files that the agent saw (`summary.json`) and from the immutable checkpoints; only `run.json` has the hidden
 scores. Policies are parsed, never run. Runs of the published software are read too (`published`).
 """
 
@@ -33,25 +34,25 @@ Files = Mapping[str, bytes]
 
 _MAX_REASON_CHARS = 1000
 _PARALLEL_FROM = 40
-"""Runs from which reading in several processes pays for starting them."""
+"""Number of runs from which parallel reading outweighs the start of its processes."""
 _MAX_RUN_JSON_BYTES = 64 << 20
 _LARGEST = 1e100
-"""No number of a run is larger: sums of squares over many runs stay finite."""
+"""Bound on every number of a run, so that sums of squares over many runs stay finite."""
 
 
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
-    """What `load_runs` found, both in order of path."""
+    """The results of `load_runs`, both in order of path."""
 
     runs: tuple[Run, ...]
     left_out: tuple[LeftOut, ...]
 
 
 class UnreadableRunError(Exception):
-    """Why a folder is not a complete run; the message is the reason shown."""
+    """A folder is not a complete run; the message is the reason shown."""
 
 
 def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
-    """As `run_folders`; paths under which there is no run directory with the reason."""
+    """As `run_folders`; paths without a run directory are returned with the reason."""
     found, without = run_folders(paths)
     return found, [
         LeftOut(path=path, reason="no run directory here" if path.is_dir() else "no such folder")
@@ -62,10 +63,10 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
 def load_runs(
     paths: Iterable[Path], *, jobs: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> Loaded:
-    """All complete runs at or under `paths`, and what is left out with the reason.
+    """Reads all complete runs at or under `paths`, and lists what is left out with the reason.
 
-    `jobs` processes read in parallel once there is enough to read; `progress` is told (done, total). A run that
-    repeats the entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
+    `jobs` processes read in parallel once there are enough runs; `progress` is called with (done, total). A run with
+    the entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
     """
     folders, left_out = find_run_dirs(paths)
     runs: list[Run] = []
@@ -92,18 +93,18 @@ def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
 
 
 def read_or_explain(folder: Path) -> Run | LeftOut:
-    """The run in `folder`, or why it is left out."""
+    """The run in `folder`, or the reason why it is left out."""
     try:
         return read_run(folder)
     except UnreadableRunError as error:
         return LeftOut(path=folder, reason=str(error))
     except Exception as error:
-        # Whatever an agent has left behind, the other runs are read.
+        # The other runs are read regardless of an agent's leftovers.
         return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}"[:_MAX_REASON_CHARS])
 
 
 def read_run(folder: Path) -> Run:
-    """The complete run in `folder`; UnreadableRunError with the reason when it is none."""
+    """Reads the complete run in `folder`. Raises UnreadableRunError with the reason when there is none."""
     record = _read_record(folder)
     outcome = record.outcome
     if outcome.status == "error":
@@ -142,7 +143,7 @@ def _simulators(run: Run) -> tuple[Flag, ...]:
 
 
 def _check_numbers(told: Any) -> None:
-    """UnreadableRunError where a number is too large for means over runs: JSON has numbers of any size."""
+    """Raises UnreadableRunError for a number too large for means over runs: JSON allows any size."""
     queue: list[tuple[str, Any]] = [("", msgspec.to_builtins(told))]
     while queue:
         name, value = queue.pop()
@@ -244,9 +245,10 @@ def _read_source(checkpoint: Path) -> tuple[Files | None, Source | None]:
 
 
 def describe_files(files: Files) -> tuple[Files, Source | None]:
-    """The reachable source files of a bundle's Python files, and what is kept of them; None without a `policy.py`.
+    """Returns the reachable source files of a bundle's Python files, and their description; None without a
+    `policy.py`.
 
-    Remembers recent bundles: retests and policies that several runs share are parsed once.
+    Caches recent bundles: retests and policies shared by several runs are parsed once.
     """
     modules = reachable_modules(files)
     reached = {module.path: module.source for module in modules.values()}
@@ -265,7 +267,7 @@ def describe_files(files: Files) -> tuple[Files, Source | None]:
 
 
 def count_changed_lines(before: Files, after: Files) -> int:
-    """Lines removed plus lines added between two source bundles, file by file; a renamed file counts as both."""
+    """Lines removed plus lines added between two source bundles, file by file; a renamed file counts twice."""
     changed = 0
     for path in sorted({*before, *after}):
         old, new = before.get(path, b""), after.get(path, b"")

@@ -1,7 +1,7 @@
-"""The analysis's nouns: a run read from its directory, its submits, and what was left out.
+"""The analysis's records: a run read from its directory, its submits, and the paths left out.
 
-Typed, immutable, free of policy sources (those stay on disk, `Run.checkpoint` says where), so that a thousand runs fit
-in memory. `rows` turns any list of records into dicts, ready for a data frame.
+Typed, immutable, without policy sources (those stay on disk, at `Run.checkpoint`), so that a thousand runs fit in
+memory. `rows` turns any list of records into dicts for a data frame.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from evopolicy_coordinator.analysis.reading.published import PUBLISHED
 from evopolicy_coordinator.analysis.simulators.look import Flag
 
 EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "data"]
-"""What a score-bearing submit is to the score-bearing submit before it; see `edits`."""
+"""Relation of a score-bearing submit to the one before it; see `edits`."""
 
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
-    """What is kept of one checkpoint's policy source bundle (`policy.py` and reachable local modules)."""
+    """Description of one checkpoint's policy source bundle (`policy.py` and reachable local modules)."""
 
     digest: str
     """SHA-256 of its paths and bytes."""
     topology: str
-    """Hash of the AST with numeric constants stripped; see `topology`."""
+    """Hash of the AST without numeric constants; see `topology`."""
     features: Features
     files: tuple[str, ...]
     """Paths of the bundle's files under `system/`."""
@@ -44,7 +44,7 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     consumed_before: int
     """Budget spent before it, episodes."""
     consumed: int
-    """Budget spent after it."""
+    """Budget spent after it, episodes."""
     mean_return: float | None = None
     """Visible train mean; None when not ok."""
     std_return: float | None = None
@@ -56,15 +56,16 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     completed_at: str = ""
     wall_s: float = 0.0
     bundle_digest: str = ""
-    """Of the whole `system/`, data files included; empty when unknown."""
+    """Digest of the whole `system/`, including data files; empty when unknown."""
     source: Source | None = None
     """None when there is no readable checkpoint."""
     changed_lines: int | None = None
-    """Lines added plus lines removed in the source bundle since the previous ok submit; None for the first, or unknown."""
+    """Lines added plus lines removed in the source bundle since the previous ok submit; None for the first, or if
+    unknown."""
 
     @property
     def label(self) -> str:
-        """`s00k`, as the paper labels submits."""
+        """`s00k`, the paper's label of a submit."""
         return f"s{self.index:03d}"
 
     @property
@@ -81,7 +82,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     submits: tuple[Submit, ...]
     """In order of their index."""
     simulator_flags: tuple[Flag, ...] = ()
-    """Code that looks like a simulator; empty where the run's rules allow simulation, as then nobody looked."""
+    """Code that looks like a simulator; empty when the run's rules allow simulation, as no search is made then."""
 
     @property
     def simulation_allowed(self) -> bool:
@@ -89,7 +90,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def entry(self) -> str:
-        """Leaderboard entry: model and harness, or the operator's name for it."""
+        """Leaderboard entry: the model, or the operator's name for the agent."""
         return self.record.agent.entry or self.record.model
 
     @property
@@ -102,17 +103,17 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def budget(self) -> int:
-        """Train episodes that the run could spend."""
+        """Budget of train episodes."""
         return self.record.experiment_dimensions.episode_budget
 
     @property
     def is_published(self) -> bool:
-        """The published software wrote it: it tells less (`published`)."""
+        """Whether the published software wrote the run, which records less (`published`)."""
         return self.record.record_version == PUBLISHED
 
     @property
     def submit_size(self) -> str:
-        """Fewest and most train episodes of a submit, such as `1 to 128`; empty where unknown."""
+        """Minimum and maximum train episodes of a submit, such as `1 to 128`; empty if unknown."""
         if self.is_published:
             return ""
         dimensions = self.record.experiment_dimensions
@@ -120,7 +121,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def score(self) -> float | None:
-        """Held-out mean return of the selected checkpoint; None with no ok submit."""
+        """Held-out mean return of the selected checkpoint; None without an ok submit."""
         return self.record.outcome.score
 
     @property
@@ -135,24 +136,24 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def name(self) -> str:
-        """`entry / env / exp-id`, with the repeat where it is not the first: unique within a report."""
+        """`entry / env / exp-id`, plus the repeat number unless it is 0: unique within a report."""
         repeat = f" #{self.record.repeat}" if self.record.repeat else ""
         return f"{self.entry} / {self.env} / {self.record.exp_id}{repeat}"
 
     def checkpoint(self, index: int) -> Path:
-        """Folder of a submit's checkpoint, whether or not it is there."""
+        """Folder of a submit's checkpoint, whether or not it exists."""
         return checkpoint_folder(self.path, self.record.artifacts.checkpoints or "checkpoints", index)
 
 
 class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
-    """A path that looked like a run and is not in the analysis."""
+    """A path that looked like a run and is not part of the analysis."""
 
     path: Path
     reason: str
 
 
 def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
-    """`checkpoints/submit_NNN`: NNN is padded to at least three digits, more where the budget has more."""
+    """`checkpoints/submit_NNN`: NNN has at least three digits, more if the budget has more."""
     for width in (3, 4, 5, 6, 7):
         found = run / folder / f"submit_{index:0{width}d}"
         if found.is_dir():
@@ -161,10 +162,10 @@ def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
 
 
 def path_text(path: Path) -> str:
-    """The path as text that can be written, also where it is no UTF-8."""
+    """The path as writable text, also when it is not UTF-8."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def rows(records: Iterable[Any]) -> list[dict[str, Any]]:
-    """The records as dicts of plain values, one each, fields in declared order: what `pandas.DataFrame` takes."""
+    """The records as dicts of plain values, fields in declared order: input for `pandas.DataFrame`."""
     return [msgspec.to_builtins(record, enc_hook=str) for record in records]

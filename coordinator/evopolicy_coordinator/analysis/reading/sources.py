@@ -1,8 +1,8 @@
 """The policy source bundle: `policy.py` and the local modules that it can reach by imports.
 
-This is the boundary that the paper's code diagnostics use (mechanism section, Table "Realized computational
-structure"): modules that nothing imports, data files and learned weights are outside it. Files are read as bytes and
-never imported or executed; whatever cannot be parsed is kept as opaque bytes.
+This is the boundary of the paper's code diagnostics (mechanism section, Table "Realized computational structure"): it
+excludes modules that nothing imports, data files and learned weights. Files are read as bytes and never imported or
+executed; unparseable files are kept as opaque bytes.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from pathlib import Path
 from evopolicy_common.records.code_metrics import parse
 
 MAX_FILE_BYTES = 1 << 20
-"""Python files above this are not parsed: they are data in disguise, and would stall a report."""
+"""Larger Python files are not parsed: they are data in disguise, and would stall a report."""
 
 MAX_FILES = 400
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
-    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks are not followed.
+    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks are not
+    followed.
 
-    At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`; OSError when the folder cannot be read.
+    At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`. Raises OSError when the folder cannot be read.
     """
     found: dict[str, bytes] = {}
     if not system_dir.is_dir():
@@ -42,7 +43,7 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
 
 
 class Module:
-    """One reachable module: its path, bytes, tree (None when unparseable) and the local modules it names."""
+    """One reachable module: its path, bytes, tree (None when unparseable) and the local modules that it imports."""
 
     __slots__ = ("imports", "locals", "name", "path", "source", "tree")
 
@@ -59,8 +60,8 @@ class Module:
 def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
     """Modules reachable from `policy.py` by any import statement, also inside functions, by dotted name.
 
-    `import_module("x")` and `__import__("x")` with a literal count. A package brings its `__init__`. Empty when there
-    is no `policy.py`.
+    Literal `import_module("x")` and `__import__("x")` count. A package includes its `__init__`. Empty without a
+    `policy.py`.
     """
     by_name = {_module_name(path): path for path in files}
     depth = 1 + max((name.count(".") for name in by_name), default=0)
@@ -83,7 +84,7 @@ def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
 
 
 def source_digest(modules: Mapping[str, Module]) -> str:
-    """SHA-256 over the paths and bytes of the reachable modules: equal means a byte-identical source bundle."""
+    """SHA-256 over the paths and bytes of the reachable modules: equal digests mean a byte-identical source bundle."""
     digest = hashlib.sha256()
     for module in modules.values():
         for part in (module.path.encode(), module.source):
@@ -100,13 +101,13 @@ def _module_name(path: str) -> str:
 
 
 def _prefixes(dotted: str, depth: int) -> list[str]:
-    """The names of at most `depth` parts that it begins with: `import a.a.a…` may have any number."""
+    """The prefixes of a dotted name with at most `depth` parts: `import a.a.a…` may have any number."""
     parts = dotted.split(".", depth)[:depth]
     return [".".join(parts[: i + 1]) for i in range(len(parts))]
 
 
 def import_statements(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """Every import statement, also inside functions; looks at statements only, which is most of the speed."""
+    """Every import statement, also inside functions. Visiting only statements makes this fast."""
     found: list[ast.Import | ast.ImportFrom] = []
     queue: list[ast.AST] = [tree]
     while queue:
@@ -152,7 +153,7 @@ def _imported_by_call(tree: ast.Module) -> set[str]:
 
 
 def absolute_import(node: ast.ImportFrom, name: str, is_package: bool) -> str:
-    """The dotted module that a `from … import` in module `name` means; empty for the top level itself."""
+    """The dotted module that a `from … import` in module `name` refers to; empty for the top level itself."""
     if not node.level:
         return node.module or ""
     package = name.split(".") if is_package else name.split(".")[:-1]

@@ -1,8 +1,9 @@
-"""Score evolution: the best hidden-validation score so far over the consumed budget (paper, "Post-hoc score trajectories").
+"""Score evolution: the best hidden-validation score so far over the consumed budget (paper, "Post-hoc score
+trajectories").
 
-A step function of the episodes consumed: it holds from the end of the submit that reached it. Agents never see it.
-Scales are per environment: 0 is the random reference of the report's tables (held-out cases, the only ones it is played on;
-without it the lowest first score of any run), 1 the best validation score of any run.
+The curve is a step function of the consumed episodes; each level starts at the end of the submit that reached it.
+Agents never see it. Scales are per environment: 0 is the random reference of the report's tables (on held-out cases,
+the only ones it plays; without it the lowest first score of any run), 1 the best validation score of any run.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     val_mean: float
     best: float
     improved: bool
-    """It raised the best; the first always does."""
+    """Whether it raised the best score; always true for the first."""
 
 
 class Evolution(msgspec.Struct, frozen=True, kw_only=True):
-    """One run's curve and what it says about efficiency."""
+    """One run's curve and its efficiency measures."""
 
     run: str
     entry: str
@@ -37,17 +38,17 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     budget: int
     steps: tuple[Step, ...]
     n_improvements: int
-    """Rises after the first score."""
+    """Number of rises after the first score."""
     area: float | None
-    """Mean over the budget of the curve on the environment's scale, clipped to [0, 1]; 0 before the first score.
-    None without a scale (nothing beats random)."""
+    """Mean of the curve over the budget on the environment's scale, clipped to [0, 1]; 0 before the first score. None
+    without a scale (no score beats random)."""
     to_50: int | None
-    """Episodes consumed when the curve first reaches half of the scale; None when it never does."""
+    """Episodes consumed when the curve first reaches half of the scale; None if it never does."""
     to_80: int | None
 
 
 def curve(run: Run) -> tuple[Step, ...]:
-    """The run's steps, one for each score-bearing submit."""
+    """The run's steps, one per score-bearing submit."""
     return tuple(
         Step(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
         for t in classify(run.submits)
@@ -57,7 +58,7 @@ def curve(run: Run) -> tuple[Step, ...]:
 def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evolution]:
     """Every run's curve, environments in catalogue order, then by entry and run.
 
-    `references`: environment to the random reference's mean return, where there is one.
+    `references`: by environment, the mean return of the random reference, if known.
     """
     by_env: dict[str, list[tuple[Run, tuple[Step, ...]]]] = {}
     for run in runs:
@@ -84,7 +85,7 @@ def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evo
 
 
 def scale(curves: Iterable[Sequence[Step]], reference: float | None) -> tuple[float | None, float | None]:
-    """The environment's 0 and 1; both None when no run has a score."""
+    """The returns at 0 and 1 of the environment's scale; both None when no run has a score."""
     scored = [steps for steps in curves if steps]
     if not scored:
         return None, None
@@ -93,7 +94,7 @@ def scale(curves: Iterable[Sequence[Step]], reference: float | None) -> tuple[fl
 
 
 def area(steps: Sequence[Step], budget: int, base: float | None, top: float | None) -> float | None:
-    """Time-averaged normalised best so far: the integral over episodes 0 … budget, divided by the budget."""
+    """Time-averaged normalised best score: the integral over episodes 0 … budget, divided by the budget."""
     if base is None or top is None or top <= base or budget <= 0:
         return None
     total = 0.0
@@ -105,7 +106,7 @@ def area(steps: Sequence[Step], budget: int, base: float | None, top: float | No
 
 
 def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: float | None) -> int | None:
-    """Episodes consumed when the best so far first reaches `base + share · (top − base)`; None when never."""
+    """Episodes consumed when the best score first reaches `base + share · (top − base)`; None if it never does."""
     if base is None or top is None or top <= base:
         return None
     goal = base + share * (top - base)
@@ -113,7 +114,7 @@ def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: fl
 
 
 def best_at(steps: Sequence[Step], consumed: int) -> float:
-    """The curve's value at `consumed` episodes; ValueError before its first score."""
+    """The curve's value at `consumed` episodes. Raises ValueError before its first score."""
     reached = [step.best for step in steps if step.consumed <= consumed]
     if not reached:
         raise ValueError(

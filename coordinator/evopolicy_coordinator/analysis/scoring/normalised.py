@@ -1,8 +1,8 @@
 """Held-out performance on the random-to-best scale (paper, mechanism section, formula of `norm`).
 
-`norm = clip((R − R_random)/(R_best − R_random), 0, 1)`, where `R_best` is the best agent on that environment: the
-random reference itself is never the best. Where no agent beats random, or there is no reference, there is no scale and
-the value is None. A diagnostic scale, apart from the rank-based score.
+`norm = clip((R − R_random)/(R_best − R_random), 0, 1)`, where `R_best` is the best agent on that environment, never
+the random reference itself. If no agent beats random, or the reference is missing, there is no scale and the value is
+None. A diagnostic scale, separate from the rank-based score.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class GroupMean(msgspec.Struct, frozen=True, kw_only=True):
     demand: str
     value: float | None
     n_environments: int
-    """Environments that have a value, and are averaged."""
+    """Number of averaged environments: those with a value."""
 
 
 class Normalised(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,7 +52,7 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def scales_of(table: ScoreTable) -> dict[str, Scale]:
-    """By environment, in the table's order; those without a scale are absent."""
+    """Scales by environment, in the table's order; environments without a scale are absent."""
     out: dict[str, Scale] = {}
     for env in table.environments:
         column = table.column(env)
@@ -64,14 +64,14 @@ def scales_of(table: ScoreTable) -> dict[str, Scale]:
 
 
 def normalise(score: float | None, random: float | None, best: float | None) -> float | None:
-    """The formula; None when a value is missing or `best ≤ random`."""
+    """Applies the formula; returns None when a value is missing or `best ≤ random`."""
     if score is None or random is None or best is None or best <= random:
         return None
     return min(1.0, max(0.0, (score - random) / (best - random)))
 
 
 def normalised(table: ScoreTable) -> Normalised:
-    """Every agent of `table` on every environment that it played, and the means of the two demand groups."""
+    """Normalises every agent of `table` on every environment that it played, and averages over both demand groups."""
     cells: dict[tuple[str, str], NormalisedCell] = {}
     scales = scales_of(table)
     for env in table.environments:

@@ -1,4 +1,4 @@
-"""The paper's own tables, as package data: what the scoring is tested against. `data/SOURCE.md` names each source."""
+"""The paper's own tables, as package data to test the scoring against. `data/SOURCE.md` names the source of each."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def text(name: str) -> str:
 
 
 def heldout_returns() -> ScoreTable:
-    """The paper's table of held-out returns: four agents and the random reference on Core16, one run a cell."""
+    """The paper's table of held-out returns: four agents and the random reference on Core16, one run per cell."""
     return read_score_csv(text("table1_heldout_returns"), source="table1_heldout_returns.csv")
 
 
 def rows(name: str) -> list[dict[str, str]]:
-    """One of `TABLES` as it is printed, a dict a row."""
+    """One of `TABLES` as printed, one dict per row."""
     return list(csv.DictReader(io.StringIO(text(name))))

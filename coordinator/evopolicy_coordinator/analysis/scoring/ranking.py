@@ -1,8 +1,8 @@
-"""Ranks, rank scores and wins (paper, appendix on scoring); `statistics` tells how sure they are.
+"""Ranks, rank scores and wins (paper, appendix on scoring); `statistics` has their uncertainty.
 
-Within an environment entries are ranked by held-out mean, descending; equal means share the better rank. With N entries
-on it, `s = 1 − (rank − 1)/(N − 1)`. A family's score is the mean of `s` over its environments, a suite's over all of
-its environments. Wins count rank 1, top-2 rank ≤ 2. Only the order of means matters, never their size.
+Within an environment entries are ranked by held-out mean, descending; equal means share the better rank. With N
+entries on it, `s = 1 − (rank − 1)/(N − 1)`. A family's score is the mean of `s` over its environments, a suite's over
+all of its environments. Wins count rank 1, top-2 rank ≤ 2. Only the order of means matters, never their size.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class CellResult(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     n_runs: int
     mean: float | None
-    """Held-out mean return over runs; None with no ok submit."""
+    """Held-out mean return over runs; None without an ok submit."""
     rank: int
     """1 is best."""
     score: float | None
@@ -36,16 +36,16 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     harness: str
     is_reference: bool
     families: dict[str, float | None]
-    """Family key to the mean rank score over its environments that the entry has played."""
+    """By family key, the mean rank score over the family's environments that the entry has played."""
     score: float | None
     """Mean rank score over the suite's environments that the entry has played."""
     wins: int
     top2: int
     n_environments: int
-    """How many environments that is; compare scores only where it is all."""
+    """Number of environments played; compare scores only if it is the whole suite."""
     n_runs: int
     rank: int
-    """By `score`, ties share the better rank."""
+    """Rank by `score`; ties share the better rank."""
 
 
 class Leaderboard(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,7 +57,7 @@ class Leaderboard(msgspec.Struct, frozen=True, kw_only=True):
     """By (entry, env)."""
 
     def marks(self, env: str) -> dict[str, int]:
-        """Entry to 1 or 2 for the best and second-best of `env`; ties share a mark, others are absent."""
+        """Entry to 1 for the best and 2 for the second-best of `env`; ties share a mark, others are absent."""
         ranks = {
             entry: cell.rank for (entry, e), cell in self.cells.items() if e == env and cell.mean is not None
         }
@@ -78,7 +78,7 @@ def _above(other: float | None, value: float | None) -> bool:
 
 
 def rank_score(rank: int, n: int) -> float | None:
-    """`1 − (rank − 1)/(n − 1)`; None for n = 1, where there is no order."""
+    """`1 − (rank − 1)/(n − 1)`; None for n = 1, which has no order."""
     return 1.0 - (rank - 1) / (n - 1) if n > 1 else None
 
 
@@ -114,7 +114,7 @@ def _scores(cells: Mapping[tuple[str, str], CellResult], table: ScoreTable, entr
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """Rounded where floats of equal rank sums differ, so that equal standings stay ties."""
+    """The mean, rounded to remove float differences of equal rank sums, so that equal standings stay ties."""
     known = [value for value in values if value is not None]
     return round(fmean(known), 12) if known else None
 

@@ -1,8 +1,8 @@
-"""Held-out scores by entry and environment: the table that ranking and normalisation start from.
+"""Held-out scores by entry and environment: the input of ranking and normalisation.
 
 A *cell* is one entry on one environment with the score of each of its runs. The uniform-random reference is an entry
-like the others, marked as such: it is ranked, and it is no agent (paper, appendix on scoring). A cell whose runs had no
-ok submit has the score None and ranks below every number; a cell that was never run is absent.
+with a mark: it is ranked, but it is no agent (paper, appendix on scoring). A cell whose runs had no ok submit has the
+score None and ranks below every number; a cell that was never run is absent.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     entry: str
     env: str
     scores: tuple[float | None, ...]
-    """Held-out mean return of each run; None for a run with no ok submit."""
+    """Held-out mean return of each run; None for a run without an ok submit."""
 
     @property
     def mean(self) -> float | None:
-        """Mean over runs; None when any run of it had no ok submit (there is no number to average that with)."""
+        """Mean over runs; None when any of its runs had no ok submit, which has no number to average."""
         known = [score for score in self.scores if score is not None]
         return fmean(known) if known and len(known) == len(self.scores) else None
 
 
 class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
-    """All cells. Entries in order of name, the reference last; environments in catalogue order, others by name."""
+    """All cells. Entries are in order of name, the reference last; environments in catalogue order, others by name."""
 
     cells: dict[tuple[str, str], Cell]
     """By (entry, env)."""
     harness: dict[str, str]
     """By entry."""
     reference: str | None
-    """Entry that is the uniform-random reference; None when there is none."""
+    """The entry of the uniform-random reference; None when it is missing."""
 
     @property
     def entries(self) -> list[str]:
@@ -60,7 +60,7 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def environments(self) -> list[str]:
-        """All that have a cell, in the catalogue's order."""
+        """All environments with a cell, in the catalogue's order."""
         return ordered_environments(env for _, env in self.cells)
 
     def column(self, env: str) -> dict[str, float | None]:
@@ -68,7 +68,7 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
         return {entry: self.cells[entry, env].mean for entry in self.entries if (entry, env) in self.cells}
 
     def restricted(self, environments: Sequence[str]) -> ScoreTable:
-        """Only the cells of `environments`, and the entries that have any."""
+        """A table with only the cells of `environments`, and the entries that have any."""
         wanted = set(environments)
         cells = {key: cell for key, cell in self.cells.items() if key[1] in wanted}
         left = {entry for entry, _ in cells}
@@ -80,30 +80,30 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def ordered_environments(envs: Iterable[str]) -> list[str]:
-    """Distinct suite ids in catalogue order, then unknown ones by name."""
+    """Distinct environment ids in catalogue order, then unknown ones by name."""
     order = {env: place for place, env in enumerate(catalogue.entries())}
     return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
 
 
 def title_of(env: str) -> str:
-    """Short name for tables; the id itself where the catalogue has none."""
+    """Short name for tables; the id itself if the catalogue has none."""
     found = catalogue.entries().get(env)
     return found.title if found is not None else env
 
 
 def family_of(env: str) -> str:
-    """Family key; `other` for an environment that the catalogue does not know."""
+    """Family key; `other` for an environment that the catalogue lacks."""
     found = catalogue.entries().get(env)
     return found.family if found is not None else "other"
 
 
 def family_title(family: str) -> str:
-    """As it is shown."""
+    """Displayed title of a family."""
     return catalogue.families().get(family, family.replace("_", " ").capitalize())
 
 
 def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
-    """Suite name to those of `environments` that are in it (catalogue's first suite that has it); unknown in `other`."""
+    """Groups `environments` by suite name (the catalogue's first suite with each); unknown ones are in `other`."""
     found: dict[str, list[str]] = {}
     for env in ordered_environments(environments):
         name = catalogue.suite_of(env).name if env in catalogue.entries() else "other"
@@ -112,19 +112,19 @@ def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
 
 
 def suite_title(suite: str) -> str:
-    """As it is shown."""
+    """Displayed title of a suite."""
     known = catalogue.suites().get(suite)
     return known.title if known is not None else suite.capitalize()
 
 
 def suite_size(suite: str) -> int:
-    """Environments of the whole suite; 0 where it has no definition."""
+    """Number of environments in the whole suite; 0 if it has no definition."""
     known = catalogue.suites().get(suite)
     return len(known.environments) if known is not None else 0
 
 
 def score_table(runs: Iterable[Run]) -> ScoreTable:
-    """Cells of the runs, and the random reference from what the runs themselves recorded on their held-out cases."""
+    """Builds the cells of the runs, and the random reference from the runs' own records on their held-out cases."""
     runs = list(runs)
     scores: dict[tuple[str, str], list[float | None]] = {}
     harness: dict[str, set[str]] = {}
@@ -133,7 +133,7 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
         harness.setdefault(run.entry, set()).add(run.harness)
     reference = references(runs)
     name = RANDOM_ENTRY
-    while name in harness:  # an operator may have called an agent that
+    while name in harness:  # an operator may have given an agent this name
         name += " (reference)"
     cells = {
         key: Cell(entry=key[0], env=key[1], scores=tuple(sorted(found, key=_none_first)))
@@ -148,11 +148,11 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
 
 
 def references(runs: Iterable[Run]) -> dict[str, float]:
-    """Environment to the mean held-out return of uniform random actions: one number for each held-out split.
+    """Mean held-out return of uniform random actions by environment: one number per held-out split.
 
-    Its actions follow from split and case, so all runs on a split tell the same number. Runs of earlier versions each drew
-    their own: they count only for a split that no newer run has played, with the mean of their numbers. An environment
-    whose runs have several splits gets the mean over the splits.
+    The actions follow from split and case, so all runs on a split record the same number. Runs of earlier versions
+    each drew their own: they count only for a split that no newer run has played, with the mean of their numbers. An
+    environment whose runs have several splits gets the mean over the splits.
     """
     told: dict[str, dict[str, dict[str, list[float]]]] = {}
     for run in runs:
@@ -171,7 +171,7 @@ def references(runs: Iterable[Run]) -> dict[str, float]:
 
 
 def _one_mean(values: Iterable[float]) -> float:
-    """Their mean; exactly their value where all are equal."""
+    """The mean; exactly the common value if all are equal."""
     found = list(values)
     return found[0] if len(set(found)) == 1 else fmean(found)
 
@@ -181,9 +181,9 @@ def _none_first(score: float | None) -> float:
 
 
 def read_score_csv(text: str, *, source: str = "the CSV") -> ScoreTable:
-    """A table `entry,harness,<suite id>,…` with one row an entry, one score a cell, empty where there is none.
+    """Reads a table `entry,harness,<suite id>,…` with one row per entry and one score per cell, empty if missing.
 
-    The row with harness `Uniform` is the reference. ConfigError for a file that is not such a table.
+    The row with harness `Uniform` is the reference. Raises ConfigError for a file that is not such a table.
     """
     reader = csv.reader(io.StringIO(text))
     header = next(reader, [])
