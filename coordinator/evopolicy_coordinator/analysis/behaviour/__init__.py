@@ -1,1 +1,1 @@
-"""How an agent worked: its edits, the structure of its policies, the feedback that it used."""
+"""An agent's way of working: its edits, the structure of its policies, its use of feedback."""

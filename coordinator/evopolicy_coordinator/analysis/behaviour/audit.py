@@ -1,6 +1,6 @@
 """Audit signals and token accounting of each run (paper, appendix: audit signals, token and cost accounting).
 
-Diagnostics only: none of them is part of a score.
+These are diagnostics: no score depends on them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _Value = TypeVar("_Value")
 
 
 class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
-    """One run."""
+    """Audit signals of one run."""
 
     run: str
     entry: str
@@ -27,25 +27,26 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     accepted: int
     """Submits that were charged."""
     rejected: int | None
-    """Requests refused before the snapshot, not charged. None where the run does not tell, as in the next fields."""
+    """Requests refused before the snapshot, not charged. None, as in the fields below, if the run has no record of
+    them."""
     not_ok: int
     """Accepted submits that are not ok."""
     invalid_rate: float | None
     """Invalid-transition rate: accepted submits that are not ok, of all accepted; None without any."""
     repaired_rate: float | None
-    """Invalid-action rate: steps of train episodes whose action was repaired, of all; None where the run does not tell."""
+    """Invalid-action rate: share of train steps whose action was repaired; None if the run has no record of it."""
     budget: int
     budget_used: int
-    """Episodes."""
+    """In episodes."""
     episodes_per_submit: float | None
     """Mean over accepted submits."""
     failed_episodes: int
     """Train episodes in which the policy failed."""
     score_drops: int
-    """Score-bearing submits whose validation mean is below that of the one before."""
+    """Score-bearing submits with a validation mean below that of the previous one."""
     selected_index: int | None
     complexity_growth: float | None
-    """AST nodes of the selected source bundle over those of the first score-bearing one."""
+    """AST nodes of the selected source bundle divided by those of the first score-bearing one."""
     retries: int | None
     turns: int | None
     wall_s: float
@@ -64,27 +65,27 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     simulation: str
     """Whether the run's rules let its agent simulate: `forbidden`, `allowed`."""
     simulator_flags: int | None
-    """Places in its code that look like a simulator; None where simulation was allowed."""
+    """Places in its code that look like a simulator; None if simulation was allowed."""
 
 
 class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean token use of one entry on one environment, in millions of tokens, over the runs that tell."""
+    """Mean token use of one entry on one environment, in millions of tokens, over the runs that record it."""
 
     entry: str
     env: str
     n_runs: int
-    """Runs whose agent tells its tokens; 0 for a dash in the table."""
+    """Runs whose agent records its tokens; with 0 the table shows a dash."""
     input_noncached: float | None
     cache: float | None
     """Cache read plus cache creation."""
     output: float | None
-    """Reasoning included."""
+    """Including reasoning."""
     cost: float | None
-    """US dollars a run; None when any of the runs has no price."""
+    """US dollars per run; None when any of the runs has no price."""
 
 
 def audit_signals(runs: Iterable[Run]) -> list[AuditSignals]:
-    """One record a run, in the order of `runs`."""
+    """One record per run, in the order of `runs`."""
     return [_signals(run) for run in runs]
 
 
@@ -141,7 +142,7 @@ def _repaired_rate(transitions: Any) -> float | None:
 
 
 def _told(run: Run, value: _Value) -> _Value | None:
-    """What only run directories of ours tell."""
+    """Passes a value that the published software does not record; None for its runs."""
     return None if run.is_published else value
 
 

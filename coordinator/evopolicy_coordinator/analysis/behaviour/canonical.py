@@ -1,8 +1,10 @@
-"""A hash of a bundle's units that does not depend on the names it chose, nor on the order and place of its definitions.
+"""A hash of a bundle's units that is independent of the bundle's own names, and of the order and module of its
+definitions.
 
-Names are made canonical in three steps. Names local to a function are numbered by first use in it. A reference to another definition is replaced by that
-definition's own label, refined a few rounds (Weisfeiler and Leman's colour refinement), so that calling another helper
-is a change and renaming one is not. Attributes and globals are then numbered by first use over the units in label order.
+Names are made canonical in three steps. Names local to a function are numbered by first use in it. A reference to
+another definition is replaced by that definition's own label, refined over a few rounds (Weisfeiler and Leman's
+colour refinement), so that calling another helper is a change and renaming one is not. Attributes and globals are
+then numbered by first use over the units in label order.
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ import hashlib
 
 _ROUNDS = 3
 PROTOCOL_NAMES = frozenset({"Policy", "act", "reset"})
-"""Names that the contract gives, not the bundle: never made canonical."""
+"""Names defined by the contract, not by the bundle: never made canonical."""
 
 Token = str | tuple[str, str]
-"""Text, or a name with its kind: `n` a bare name, `a` an attribute, `m` a local module's attribute, `k` a keyword."""
+"""Text, or a name with its kind: `n` bare name, `a` attribute, `m` attribute of a local module, `k` keyword."""
 
 
 class Names:
@@ -29,7 +31,7 @@ class Names:
 
 
 class Scope:
-    """What one module's import statements bind."""
+    """The names that one module's import statements bind."""
 
     def __init__(self) -> None:
         self.external: dict[str, str] = {}
@@ -38,7 +40,7 @@ class Scope:
 
 
 class Unit:
-    """One function, class or statement of a module or class body: its tokens, and what it binds."""
+    """One function, class or statement of a module or class body: its tokens, and the names that it binds."""
 
     __slots__ = ("children", "globals", "is_function", "module", "name", "stored", "tokens")
 
@@ -58,7 +60,7 @@ def stable_hash(parts: list[str]) -> str:
 
 
 def canonical(units: list[Unit], names: Names) -> str:
-    """One hash of the units: equal for equal structure, whatever names the bundle gave and in whatever order."""
+    """One hash of the units: equal for equal structure, independent of the bundle's names and order."""
     every: list[Unit] = []
     queue = list(reversed(units))
     while queue:
@@ -77,7 +79,7 @@ def canonical(units: list[Unit], names: Names) -> str:
     for turn in range(_ROUNDS):
         for i in range(
             len(every) - 1, -1, -1
-        ):  # a class comes before its children, and its label holds theirs
+        ):  # a class precedes its children, and its label includes theirs
             if turn and not references[i] and not every[i].children:
                 continue
             for at, name in references[i]:

@@ -1,18 +1,19 @@
-"""Edit types: what each score-bearing submit changed, and whether it helped (paper, mechanism section, Table "edit types").
+"""Edit types: the kind of change of each score-bearing submit, and its effect (paper, mechanism section, Table "edit
+types").
 
-A *transition* goes from one score-bearing submit (ok, with a validation mean) to the next. With the source bundle's
-numeric-constant-stripped topology (`topology`) it is, in this order:
+A *transition* goes from one score-bearing submit (ok, with a validation mean) to the next. Its type follows from the
+source bundle's topology, which leaves out numeric constants (`topology`), in this order:
 
-- `retest`: nothing changed, the source bundle is byte-identical to the previous one and so is all of `system/`.
-- `data`: the source bundle is byte-identical, and other files of `system/` changed (weights, tables, unreachable modules).
-  Those are outside the paper's boundary, so this is neither edit type; it is no retest either, as the policy may act
-  otherwise. Where checkpoints' digests are unknown such submits count as retests.
-- `parametric`: bytes changed, and the topology is the immediately previous one.
-- `rollback`: the topology is not the previous one, and an earlier score-bearing submit of this run had it.
+- `retest`: the source bundle and all of `system/` are byte-identical to the previous ones.
+- `data`: the source bundle is byte-identical, and other files of `system/` changed (weights, tables, unreachable
+  modules). Those are outside the paper's boundary, so this is neither edit type. It is no retest either, as the
+  policy may act differently. If the checkpoints' digests are unknown, such submits count as retests.
+- `parametric`: bytes changed, and the topology equals that of the immediately previous submit.
+- `rollback`: the topology differs from the previous one, and an earlier score-bearing submit of this run had it.
 - `synthesis`: the topology is new to this run.
 
-The first score-bearing submit follows none: it is `first`, is no transition, counts in no rate, and is counted among
-the excluded. A transition is a *hit* when it strictly raises the best validation mean so far.
+The first score-bearing submit has no predecessor. Its type is `first`; it is no transition, counts in no rate, and is
+counted among the excluded. A transition is a *hit* when it strictly raises the best validation mean so far.
 """
 
 from __future__ import annotations
@@ -29,27 +30,27 @@ RATED: tuple[EditType, ...] = ("synthesis", "parametric")
 
 
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
-    """One score-bearing submit and what it is to the one before."""
+    """One score-bearing submit and its relation to the previous one."""
 
     index: int
     """Submit index."""
     previous: int | None
-    """Index of the score-bearing submit before it; None for the first."""
+    """Index of the previous score-bearing submit; None for the first."""
     consumed_before: int
     consumed: int
     edit: EditType
     hit: bool
-    """True when it raised the validation best so far; the first always does."""
+    """Whether it raised the best validation mean so far; always true for the first."""
     val_mean: float
     best: float
-    """Validation best so far, this submit included."""
+    """Best validation mean so far, including this submit."""
     val_drop: bool
-    """True when the validation mean is below the previous score-bearing submit's."""
+    """Whether the validation mean is below that of the previous score-bearing submit."""
     mean_return: float | None
     mean_improved: bool | None
     """Whether the visible mean rose; None for the first."""
     changed_lines: int | None
-    """Edit size; None for the first, and where an ok submit without a score lies between."""
+    """Edit size; None for the first, and after an ok submit without a score."""
     back_to: int | None = None
     """For a rollback: the latest earlier submit with that topology."""
 
@@ -59,7 +60,7 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
 
     entry: str
     demand: str
-    """`synthesis`, `tuning`, or `all` for every environment, also those that the paper places in neither group."""
+    """`synthesis`, `tuning`, or `all` for every environment, including those that the paper places in neither group."""
     n_synthesis: int = 0
     hits_synthesis: int = 0
     n_parametric: int = 0
@@ -67,7 +68,7 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
     n_rollback: int = 0
     n_retest: int = 0
     n_data: int = 0
-    """Submits that changed files outside the source bundle only."""
+    """Submits that changed only files outside the source bundle."""
     n_first: int = 0
     n_not_ok: int = 0
     """Accepted submits that are not ok."""
@@ -76,12 +77,12 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def rate_synthesis(self) -> float | None:
-        """Share of syntheses that hit; None without any."""
+        """Share of syntheses that hit; None if there are none."""
         return self.hits_synthesis / self.n_synthesis if self.n_synthesis else None
 
     @property
     def rate_parametric(self) -> float | None:
-        """Share of parametric edits that hit; None without any."""
+        """Share of parametric edits that hit; None if there are none."""
         return self.hits_parametric / self.n_parametric if self.n_parametric else None
 
 
@@ -143,7 +144,7 @@ def _improved(previous: Submit | None, submit: Submit) -> bool | None:
 
 
 def edit_rates(runs: Iterable[Run]) -> list[EditRates]:
-    """Rows by entry (sorted) and demand group; `all` last in each entry. Counts are pooled over runs."""
+    """Rows by entry (sorted) and demand group, with `all` last in each entry. Counts are pooled over runs."""
     counts: dict[tuple[str, str], dict[str, int]] = {}
     for run in runs:
         transitions = classify(run.submits)
@@ -169,6 +170,6 @@ def _count(row: dict[str, int], key: str) -> None:
 
 
 def demand_of(env: str) -> str | None:
-    """The environment's demand group in the catalogue; None where it has none or is unknown."""
+    """The environment's demand group in the catalogue; None if it has none or is unknown."""
     found = catalogue.entries().get(env)
     return found.demand if found is not None else None

@@ -1,7 +1,8 @@
-"""Differences of sources by lines, with a bound on the work: a policy's author may choose lines that all look alike.
+"""Line differences of sources, with a bound on the work: a policy's author may choose lines that are all alike.
 
-Where a comparison would take longer than `MAX_STEPS`, the sources count as wholly different: lines are counted as a multiset,
-and shown as all removed and all added. Nothing here depends on time, so the same sources give the same numbers everywhere.
+If a comparison would exceed `MAX_STEPS`, the sources count as entirely different: lines are counted as a multiset,
+and shown as all removed and all added. Nothing here depends on time, so the same sources give the same numbers
+everywhere.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Hashable, Sequence
 from typing import Any
 
 MAX_STEPS = 3_000_000
-"""Pairs of equal lines that are looked at: about a second."""
+"""Maximum number of compared pairs of equal lines: about a second."""
 _CONTEXT = 3
 
 
@@ -38,7 +39,7 @@ class _Matcher(difflib.SequenceMatcher[Any]):
 
 
 def n_changed(old: Sequence[Hashable], new: Sequence[Hashable]) -> int:
-    """Lines removed plus lines added."""
+    """Number of lines removed plus lines added."""
     head, tail = _equal_ends(old, new)
     old, new = old[head : len(old) - tail], new[head : len(new) - tail]
     try:
@@ -68,7 +69,7 @@ def unified(old: Sequence[str], new: Sequence[str]) -> list[str]:
 
 
 def _equal_ends(old: Sequence[Hashable], new: Sequence[Hashable]) -> tuple[int, int]:
-    """How many lines are equal at the beginning, and of the others at the end."""
+    """Numbers of equal lines at the beginning and, among the rest, at the end."""
     shorter = min(len(old), len(new))
     head = next((i for i in range(shorter) if old[i] != new[i]), shorter)
     tail = next((i for i in range(shorter - head) if old[-1 - i] != new[-1 - i]), shorter - head)
@@ -76,7 +77,7 @@ def _equal_ends(old: Sequence[Hashable], new: Sequence[Hashable]) -> tuple[int, 
 
 
 def _range(start: int, stop: int) -> str:
-    """As in `diff -u`."""
+    """A range of lines as in `diff -u`."""
     length = stop - start
     if length == 1:
         return str(start + 1)

@@ -1,4 +1,4 @@
-"""Code phases: bands of one edit type over a run's budget, and the events that are marked on them (paper, case studies)."""
+"""Code phases: bands of one edit type over a run's budget, and the events marked on them (paper, case studies)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from evopolicy_coordinator.analysis.behaviour.edits import Transition
 
 
 def phases(transitions: Sequence[Transition]) -> list[tuple[int, int, str]]:
-    """Bands (from, to, edit type) over consumed episodes: a run of adjacent transitions of one type is one band.
+    """Bands (from, to, edit type) over consumed episodes: adjacent transitions of one type form one band.
 
-    A submit's band covers its own episodes. Rollbacks and retests are events, not phases: the phase goes on through them.
+    A submit's band covers its own episodes. Rollbacks and retests are events, not phases: the phase continues through
+    them.
     """
     bands: list[tuple[int, int, str]] = []
     for transition in transitions:
@@ -25,6 +26,6 @@ def phases(transitions: Sequence[Transition]) -> list[tuple[int, int, str]]:
 
 
 def events_of(transition: Transition) -> list[str]:
-    """`hit` or `miss`, and `rollback` or `retest` where the submit is one."""
+    """`hit` or `miss`, plus `rollback` or `retest` if the submit is one."""
     outcome = ["hit" if transition.hit else "miss"]
     return outcome + ([transition.edit] if transition.edit in ("rollback", "retest") else [])

@@ -25,8 +25,8 @@ BINS: dict[str, tuple[int, int | None]] = {
     "61–150": (61, 150),
     "151+": (151, None),
 }
-"""Edit sizes in changed lines of the source bundle, inclusive. The first bin is for unchanged bundles alone (retests); the
-second for submits that changed nothing but files outside it."""
+"""Edit sizes in changed lines of the source bundle, inclusive. The first bin is for unchanged bundles only (retests),
+the second for submits that changed only files outside it."""
 
 
 class SelectedStructure(msgspec.Struct, frozen=True, kw_only=True):
@@ -39,8 +39,8 @@ class SelectedStructure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StructureMean(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean features of one entry's selected policies in one demand group; runs weigh equally within an environment,
-    environments equally within the group."""
+    """Mean features of one entry's selected policies in one demand group. Runs have equal weight within an
+    environment, environments within the group."""
 
     demand: str
     entry: str
@@ -64,15 +64,15 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
     """Key of `BINS`."""
     n: int
     n_visible: int
-    """Of them, with visible means on both sides."""
+    """Number of these with visible means on both sides."""
     visible_improved: int
-    """The visible train mean rose."""
+    """Number of these whose visible train mean rose."""
     validation_improved: int
-    """The validation best rose."""
+    """Number of these whose validation best rose."""
 
     @property
     def p_visible(self) -> float | None:
-        """Share whose visible mean rose; None without any to compare."""
+        """Share whose visible mean rose; None if none can be compared."""
         return self.visible_improved / self.n_visible if self.n_visible else None
 
     @property
@@ -82,7 +82,7 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def selected_structures(runs: Iterable[Run]) -> list[SelectedStructure]:
-    """One record for every run whose selected checkpoint can be read."""
+    """One record for every run with a readable selected checkpoint."""
     out: list[SelectedStructure] = []
     for run in runs:
         selected = run.selected
@@ -127,7 +127,7 @@ def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
 
 
 def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
-    """Every transition with a known edit size, by entry (sorted) and bin (all bins, also empty ones)."""
+    """Every transition with a known edit size, by entry (sorted) and bin (all bins, including empty ones)."""
     by_entry: dict[str, list[Transition]] = {}
     for run in runs:
         found = [t for t in classify(run.submits) if t.previous is not None and t.changed_lines is not None]
@@ -150,7 +150,7 @@ def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
 
 
 def bin_of(transition: Transition) -> str:
-    """The transition's key of `BINS`. A bundle that changed without a changed line (line ends, an empty module) counts as one."""
+    """The transition's key of `BINS`. A change without changed lines (line ends, empty module) counts as one line."""
     if transition.edit in ("retest", "data"):
         return UNCHANGED if transition.edit == "retest" else DATA_ONLY
     size = max(1, transition.changed_lines or 0)

@@ -1,14 +1,14 @@
-"""Numeric-constant-stripped AST topology of a policy source bundle, and its structural features.
+"""Topology of a policy source bundle (its AST without numeric constants), and its structural features.
 
-The topology is a hash that stays the same exactly when an edit leaves the policy's structure alone (paper, mechanism
-section: a *parametric* edit changes the bundle "while preserving that stripped topology"). Left out of it, because none
-of them is structure: the value and sign of numeric constants, digits in f-string format specifications, comments,
-formatting, docstrings, type hints, imports that are not used, the order of definitions and of top-level statements,
-which local module a definition is in, and the names that the bundle itself chooses. Kept: node types, operators,
-order of statements inside functions, string and boolean constants, and every name that comes from outside (`np.sin`
-against `np.cos`, `obs["image"]`).
+The topology is a hash that stays the same exactly when an edit preserves the policy's structure (paper, mechanism
+section: a *parametric* edit changes the bundle "while preserving that stripped topology"). It ignores everything that
+is not structure: the value and sign of numeric constants, digits in f-string format specifications, comments,
+formatting, docstrings, type hints, unused imports, the order of definitions and of top-level statements, the local
+module of a definition, and the bundle's own names. It keeps node types, operators, the order of statements inside
+functions, string and boolean constants, and every external name (`np.sin` against `np.cos`, `obs["image"]`).
 
-Every function, class and top-level statement becomes a unit, a list of tokens; `canonical` makes one hash of them.
+Every function, class and top-level statement becomes a unit, a list of tokens; `canonical` hashes all units into one
+digest.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class Features(msgspec.Struct, frozen=True, kw_only=True):
     state: int = 0
     """Persistent state: distinct attributes that methods assign on their instance, counted per class, and `global`s."""
     nodes: int = 0
-    """AST nodes that the topology looks at: a size that formatting does not change."""
+    """AST nodes that the topology includes: a size independent of formatting."""
     lines: int = 0
-    """Source lines, blank ones and comments included."""
+    """Source lines, including blank lines and comments."""
     modules: int = 0
 
 
@@ -89,7 +89,7 @@ class _Walker:
         self.functions = self.branches = self.loops = self.depth = self.nodes = 0
         self._class = ""
         self._instance = ("", "")
-        """Class and first parameter of the method that is being walked."""
+        """Class and first parameter of the visited method."""
 
     def module(self, module: Module) -> None:
         assert module.tree is not None
@@ -124,7 +124,7 @@ class _Walker:
                 scope.aliases[bound] = alias.name
 
     def _statement_unit(self, node: ast.stmt, scope: Scope, defs: set[str]) -> Unit | None:
-        """A unit for a statement of a module's or class's body; None for what is no structure."""
+        """A unit for a statement of a module's or class's body; None for statements that are not structure."""
         if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
             return None
         if isinstance(node, _FUNCTIONS):
@@ -157,7 +157,8 @@ class _Walker:
         return unit
 
     def _class_field(self, node: ast.stmt, scope: Scope) -> Unit | None:
-        """An annotated class variable: a field to dataclasses, so not the same as a plain assignment."""
+        """A unit for an annotated class variable, which is a field to dataclasses and differs from a plain
+        assignment."""
         if not isinstance(node, ast.AnnAssign):
             return None
         unit = Unit(scope, "", is_function=False)
@@ -292,7 +293,7 @@ class _Walker:
                 self._identifier(value, unit)
 
     def _identifier(self, value: object, unit: Unit) -> None:
-        """A bare name in a node's field: what an `except … as`, or a pattern, binds."""
+        """A bare name in a node's field, bound by an `except … as` or a pattern."""
         if isinstance(value, str):
             unit.stored.add(value)
             unit.tokens.append(("n", value))

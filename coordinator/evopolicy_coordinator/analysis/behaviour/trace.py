@@ -1,7 +1,7 @@
 """Feedback use, submit by submit (paper, "feedback-utilization traces"): evidence read, change made, outcome seen.
 
-One `TraceRow` a submit: what the agent read and said since the submit before (`agent_log`, where the log tells), how
-the policy changed, and what came of it. Sources and images stay on disk until a page asks for them.
+One `TraceRow` per submit: what the agent read and wrote since the previous submit (`agent_log`, if the log shows it),
+how the policy changed, and the result. Sources and images stay on disk until a page needs them.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from evopolicy_coordinator.analysis.reading.sources import read_python_files
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
 MAX_IMAGE_BYTES = 4 << 20
 MAX_IMAGES = 40
-"""Images that one run's page shows."""
+"""Maximum number of images on one run's page."""
 MAX_DIFF_LINES = 1500
-"""Lines of one diff that are kept; the rest is counted."""
+"""Maximum number of kept lines of one diff; the others are counted."""
 
 
 class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,13 +33,13 @@ class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
 
     submit: Submit
     transition: Transition | None
-    """None when it bears no score."""
+    """None for a submit without a score."""
     evidence: Evidence | None
-    """None when the log does not tell."""
+    """None if the log has no evidence of it."""
     images: tuple[Path, ...]
     """Images that the agent made before this submit."""
     video: Path | None
-    """The first recorded episode of its feedback; None where the run recorded none."""
+    """The first recorded episode of its feedback; None if the run recorded none."""
 
 
 class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,9 +47,9 @@ class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
 
     path: str
     lines: tuple[str, ...]
-    """Without line ends; begin with ` `, `+`, `-` or `@`."""
+    """Without line ends; each begins with ` `, `+`, `-` or `@`."""
     cut: int
-    """Lines left out at the end."""
+    """Number of lines left out at the end."""
 
 
 class Trace(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,7 +85,7 @@ def _first_video(run: Run, submit: Submit) -> Path | None:
 
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:
-    """Text of a checkpoint's source bundle by path: `policy.py` first. All its Python files when it has no bundle."""
+    """Text of a checkpoint's source bundle by path, `policy.py` first; all its Python files if it has no bundle."""
     system = policy_folder(run.checkpoint(submit.index))
     try:
         if submit.source is not None:
@@ -113,7 +113,8 @@ def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
 
 
 def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
-    """Submit index to images: new in that checkpoint's `system/`, or in the final workspace and named in its part of the log.
+    """Images by submit index: new in that checkpoint's `system/`, or in the final workspace and named in its part of
+    the log.
 
     Workspace images that the log does not name are shown with the last submit.
     """

@@ -1,4 +1,4 @@
-"""Every figure of a report, drawn with matplotlib (imported only here, when a figure is wanted)."""
+"""Every figure of a report, drawn with matplotlib, which is imported only here."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from evopolicy_coordinator.analysis.study import Study
 
 
 def figures_of(study: Study) -> Iterator[Plot]:
-    """The report's figures one after another, in its order; those with nothing to show are left out.
+    """Yields the report's figures in order; figures without data are omitted.
 
-    Each holds its drawing in memory until it is dropped: write it, then take the next.
+    Each keeps its drawing in memory until it is dropped: write it before taking the next.
     """
     look = looks(study.entries, study.reference)
     for suite in study.suites:

@@ -1,4 +1,4 @@
-"""Figures of what policies are and what runs cost: realised structure, tokens, wall time by phase."""
+"""Figures of policies' structure and runs' costs: realised structure, tokens, wall time by phase."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PHASES = (
 
 
 def structure(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """A panel a feature, a row a demand group and agent: the group means of the selected policies."""
+    """One panel per feature, one row per demand group and agent: group means of the selected policies."""
     if not study.structure:
         return None
     groups = [g for g in ("synthesis", "tuning") if any(r.demand == g for r in study.structure)] or ["all"]
@@ -71,7 +71,7 @@ def structure(study: Study, looks: Mapping[str, Look]) -> Plot | None:
 
 
 def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Three panels on a log scale: non-cached input, cache and output of a run, a dot an environment, a bar the mean."""
+    """Three panels on a log scale: a run's non-cached input, cache and output; dots are environments, bars the mean."""
     told = [row for row in study.tokens if row.n_runs]
     if not told:
         return None
@@ -126,7 +126,7 @@ def _decades(panel: matplotlib.axes.Axes) -> float:
 
 
 def wall_time(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Stacked bars: mean wall time of a run by phase, a bar an agent."""
+    """Stacked bars, one per agent: mean wall time of a run by phase."""
     told = [row for row in study.audit if row.agent_s is not None]
     entries = sorted({row.entry for row in told}, key=str.casefold)
     means = {

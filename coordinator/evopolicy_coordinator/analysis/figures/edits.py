@@ -19,7 +19,7 @@ from evopolicy_coordinator.analysis.scoring.scores import title_of
 from evopolicy_coordinator.analysis.study import Study, Timeline
 
 MAX_ROWS = 24
-"""Runs that one timeline figure shows; every run's own page has its own timeline."""
+"""Maximum number of runs in one timeline figure; every run's own page has its own timeline."""
 
 _HATCHES = {"parametric": "////", "data": "|||"}
 _EVENTS = {
@@ -31,7 +31,7 @@ _EVENTS = {
 
 
 def timeline(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> Plot | None:
-    """One environment's runs, a row each: phase bands over the budget, and a mark for each submit's outcome."""
+    """One environment's runs, one row each: phase bands over the budget, and a mark for each submit's outcome."""
     found = [line for line in lines if line.transitions]
     if not found:
         return None
@@ -137,7 +137,7 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
 
 
 def hit_rates(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Hit rate of synthesis and parametric edits by demand group, a panel each, with Wilson intervals and counts."""
+    """Hit rates of synthesis and parametric edits by demand group, one panel each, with Wilson intervals and counts."""
     groups = [g for g in ("synthesis", "tuning") if any(row.demand == g for row in study.edit_rates)] or [
         "all"
     ]
@@ -186,7 +186,7 @@ def _hit_row(panel: matplotlib.axes.Axes, place: int, row: EditRates | None, edi
 
 
 def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Two panels: probability that the visible mean, and the validation best, improves, by size of the edit."""
+    """Two panels: probability that the visible mean, or the validation best, improves, by edit size."""
     if not any(row.n for row in study.edit_sizes):
         return None
     entries = list(dict.fromkeys(row.entry for row in study.edit_sizes))

@@ -15,7 +15,7 @@ from evopolicy_coordinator.analysis.study import Suite
 
 
 def performance_profiles(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
-    """One curve an agent, with its pointwise 95 % band."""
+    """One curve per agent, with its pointwise 95 % band."""
     found = suite.statistics.aggregates
     if not found:
         return None

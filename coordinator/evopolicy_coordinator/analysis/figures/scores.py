@@ -20,7 +20,7 @@ from evopolicy_coordinator.analysis.study import Study, Suite
 
 
 def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
-    """Suite and family rank scores, a panel each, agents from best to worst."""
+    """Suite and family rank scores, one panel each, agents from best to worst."""
     standings = suite.board.standings
     if not any(row.score is not None for row in standings):
         return None
@@ -78,7 +78,7 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
 
 
 def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Small multiples, one an environment: best validation mean so far over consumed episodes, a step curve a run."""
+    """Small multiples, one per environment: best validation mean over consumed episodes, one step curve per run."""
     found = [one for one in study.evolutions if one.env in suite.table.environments and one.steps]
     envs = [env for env in suite.table.environments if any(one.env == env for one in found)]
     if not envs:
@@ -117,7 +117,7 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
 
 
 MAX_CURVES = 3
-"""Runs of one agent on one environment that are drawn one by one; more are drawn as their mean and range."""
+"""Maximum number of runs of one agent on one environment drawn separately; more are drawn as their mean and range."""
 
 
 def _evolution_panel(
@@ -158,7 +158,7 @@ def _one_curve(panel: matplotlib.axes.Axes, one: Evolution, look: Look, thin: fl
 
 
 def _mean_curve(panel: matplotlib.axes.Axes, curves: list[Evolution], look: Look) -> None:
-    """Mean, and band from lowest to highest, from where every run has a score."""
+    """The mean curve with a band from lowest to highest, starting where every run has a score."""
     changes = sorted(
         {step.consumed for one in curves for step in one.steps} | {max(one.budget for one in curves)}
     )
@@ -183,7 +183,7 @@ def _handle(entry: str, looks: Mapping[str, Look]) -> Line2D:
 
 
 def normalised_performance(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
-    """Two panels, one a demand group: each agent's mean as a bar, its environments as dots."""
+    """Two panels, one per demand group: each agent's mean as a bar, its environments as dots."""
     agents = suite.table.agents
     groups = {(g.demand, g.entry): g for g in suite.normalised.groups if g.value is not None}
     demands = [demand for demand in DEMANDS if any(key[0] == demand for key in groups)]

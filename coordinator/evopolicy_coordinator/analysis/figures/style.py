@@ -1,7 +1,7 @@
-"""How every figure is drawn and written: rcParams, SVG and PNG. Agents' looks are in `palette`.
+"""Drawing and writing of all figures: rcParams, SVG and PNG. Agents' looks are in `palette`.
 
-In the page, ink, muted text and grid follow its light or dark theme: `inline_svg` turns their three colours, which
-nothing else uses, into CSS variables.
+On a page, the ink, muted text and grid follow its light or dark theme: `inline_svg` replaces their three colours,
+which nothing else uses, by CSS variables.
 """
 
 from __future__ import annotations
@@ -56,21 +56,21 @@ RC: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 5.0,
     "svg.fonttype": "none",
-    "text.parse_math": False,  # an agent's name may hold a dollar sign
+    "text.parse_math": False,  # an agent's name may contain a dollar sign
     "axes.unicode_minus": True,
 }
 
 
 @dataclass(slots=True, kw_only=True)
 class Plot:
-    """A drawn figure with what belongs beside it."""
+    """A drawn figure with its texts and data."""
 
     name: str
     """File name without suffix."""
     title: str
     caption: str
     alt: str
-    """What it shows, for who cannot see it."""
+    """Alternative text that describes the figure."""
     data: Any
     """JSON-able: the numbers drawn."""
     figure: Figure
@@ -87,7 +87,7 @@ def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, An
 
 
 def _settle(figure: Figure) -> None:
-    """Lays the figure out once and for all: every layout pass moves it a little, and both files should show the same."""
+    """Freezes the layout: every layout pass moves it slightly, and both files must show the same."""
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
         for _ in range(2):
             figure.draw_without_rendering()
@@ -95,7 +95,7 @@ def _settle(figure: Figure) -> None:
 
 
 def svg_text(figure: Figure, name: str) -> str:
-    """The figure as a stand-alone SVG: text as text, transparent background, the same bytes for the same figure."""
+    """The figure as a stand-alone SVG: text as text, transparent background, deterministic bytes."""
     out = io.StringIO()
     with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
         _settle(figure)
@@ -121,7 +121,8 @@ _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)"}
 
 
 def inline_svg(svg: str, name: str, alt: str) -> str:
-    """The SVG for use inside a page: themed, scaling with its container, named for assistive technology, ids made unique."""
+    """The SVG for use inside a page: themed, scaling with its container, labelled for assistive technology, ids
+    unique."""
     prefix = "f" + hashlib.sha256(name.encode()).hexdigest()[:8] + "-"
     body = _METADATA.sub("", _PROLOGUE.sub("", svg, count=1))
     body = _IDS.sub(lambda match: match.group(1) + prefix, body)

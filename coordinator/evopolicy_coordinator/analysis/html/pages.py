@@ -1,4 +1,4 @@
-"""The report's pages as text: what is shown where, and in which words. Markup is in `templates/`, files are `write`'s."""
+"""The report's pages as text: their contents and wording. Markup is in `templates/`; `write` writes the files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from evopolicy_coordinator.analysis.tables.run_tables import submits_text
 from evopolicy_coordinator.analysis.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
-"""Rows from which a table has a filter."""
+"""Number of rows from which a table has a filter."""
 _LONG = 60
-"""Characters from which a cell of text is broken into lines."""
+"""Number of characters from which a cell's text is broken into lines."""
 FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
-"""Written forms of a table, and their suffixes."""
+"""File forms of a table, with their suffixes."""
 
 
 class FigureView(msgspec.Struct, frozen=True, kw_only=True):
@@ -38,12 +38,12 @@ class FigureView(msgspec.Struct, frozen=True, kw_only=True):
     group: str
     svg: str
     width: float
-    """Widest that it is shown, rem."""
+    """Maximum displayed width, rem."""
     timeline: str = ""
 
 
 class PlayedEpisode(msgspec.Struct, frozen=True, kw_only=True):
-    """A recorded episode of one run, with what of it was copied into the report."""
+    """A recorded episode of one run, with the parts of it that were copied into the report."""
 
     run: Run
     split: str
@@ -79,7 +79,7 @@ def index_page(
     trace_links: Mapping[str, str],
     replay_links: Mapping[str, str],
 ) -> str:
-    """`index.html`: every section that has something to show, and what was left out."""
+    """`index.html`: every section with content, and what was left out."""
     views = {table.name: _table_view(table) for table in tables}
     suites = [suite.name for suite in study.suites]
     named = {figure.name: figure for figure in figures}
@@ -286,8 +286,9 @@ def trace_page(
     videos: Mapping[int, str],
     beside: Sequence[tuple[str, Look | None, str]] = (),
 ) -> str:
-    """One run's page. `image_links` has, by submit index, (name, path relative to the page) of its copied images, `videos`
-    the path of its copied feedback video, `beside` (agent, look, page) of other agents on the same environment."""
+    """One run's page. By submit index, `image_links` has (name, path relative to the page) of its copied images, and
+    `videos` the path of its copied feedback video. `beside` lists (agent, look, page) of other agents on the same
+    environment."""
     run = trace.run
     outcome = run.record.outcome
     transitions = [row.transition for row in trace.rows if row.transition is not None]
@@ -336,7 +337,7 @@ def _flag(flag: Flag) -> dict[str, Any]:
 
 
 def failed_page(run: Run, reason: str) -> str:
-    """In place of a run's page that could not be made."""
+    """Replaces a run's page that could not be made."""
     return (
         _environment()
         .get_template("failed.html.j2")
@@ -449,7 +450,7 @@ def _diff_class(line: str) -> str:
 
 
 def replays_page(env: str, episodes: Sequence[PlayedEpisode], looks: Mapping[str, Look]) -> str:
-    """One environment's recordings: a group a case, in it a card a run."""
+    """One environment's recordings: one group per case, with one card per run."""
     groups: dict[tuple[str, int], list[dict[str, Any]]] = {}
     for played in sorted(
         episodes, key=lambda p: (p.split, p.episode, p.run.entry.casefold(), p.run.record.repeat)

@@ -1,4 +1,4 @@
-"""One run's code-phase timeline as a small SVG, written by hand: a thousand pages need no drawing library."""
+"""One run's code-phase timeline as a small hand-written SVG: a thousand pages should not need a drawing library."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BAND_TOP, _BAND_HEIGHT, _MARKS, _AXIS, _HEIGHT = 16.0, 30.0, 62.0, 78.0, 112.0
 def small_timeline(
     transitions: Sequence[Transition], submits: Sequence[Submit], budget: int, prefix: str
 ) -> str:
-    """Bands, a mark and label for every submit, and the budget axis. `prefix` keeps its ids apart from others."""
+    """Bands, a mark and label for every submit, and the budget axis. `prefix` makes its ids unique."""
     last = max([budget, *(submit.consumed for submit in submits), 1])
     scale = (_WIDTH - _LEFT - _RIGHT) / last
 

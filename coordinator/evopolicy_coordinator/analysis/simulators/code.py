@@ -1,4 +1,5 @@
-"""The code of one bundle as the search for simulators sees it: modules, functions by name, recorded data, selections."""
+"""The code of one bundle, indexed for the search for simulators: modules, functions by name, recorded data,
+selections."""
 
 from __future__ import annotations
 
@@ -11,10 +12,10 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 Scope = ast.Module | Function
 
 MAX_NODES = 20_000
-"""AST nodes of one module above which it is not looked into: data in disguise, or a library."""
+"""Modules with more AST nodes are not searched: they are data in disguise, or a library."""
 _MAX_TEXTS = 20
 _MAX_NAMESAKES = 4
-"""Functions of one name that a call may mean."""
+"""Maximum number of functions of one name that a call may refer to."""
 _SELECTING = frozenset(
     {"max", "min", "sorted", "sort", "argmax", "argmin", "argsort", "argpartition", "nlargest", "nsmallest", "amax", "amin"}
 )  # fmt: skip
@@ -25,11 +26,11 @@ _LOADING = frozenset(
 RECORDED_KEYS = frozenset(
     {"obs", "action", "reward", "observation", "observations", "actions", "rewards", "returns", "next_obs", "terminated"}
 )  # fmt: skip
-"""Keys of a trajectory's rows. Reading one of an item that a loop goes through reads what was recorded."""
+"""Keys of a trajectory's rows. Reading one of them from a loop's item reads recorded data."""
 
 
 class Part:
-    """One module of a bundle: a file, or code that a file keeps in a string."""
+    """One module of a bundle: a file, or code that a file contains as a string."""
 
     def __init__(self, path: str, tree: ast.Module, first_line: int = 1) -> None:
         self.path = path
@@ -49,19 +50,19 @@ class Part:
 
 
 class Code:
-    """All modules of a bundle, and what can be told of them before any loop is looked at."""
+    """All modules of a bundle, and the facts about them that are collected before any loop is examined."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self.steps = 0
-        """Expressions that were followed so far."""
+        """Number of expressions followed so far."""
         self.parts = [part for path, source in files.items() for part in _parts(path, source)]
         self.functions: dict[str, list[Function]] = {}
         self.methods: dict[str, list[tuple[ast.ClassDef, ast.FunctionDef]]] = {}
         self.classes: dict[str, ast.ClassDef] = {}
         self.recorded: dict[Scope, set[str]] = {}
-        """Names of each scope that hold recorded data."""
+        """Names in each scope that hold recorded data."""
         self.selected: set[Function] = set()
-        """Functions that are called for each of several candidates, of which one is chosen."""
+        """Functions called for each of several candidates, of which one is selected."""
         self.imported: set[str] = set().union(*(part.imported for part in self.parts))
         for part in self.parts:
             self._collect(part.tree)
@@ -93,7 +94,7 @@ class Code:
                         add(target.id, node.value)
 
     def called(self, call: ast.Call) -> list[Function]:
-        """Functions of the bundle that this call may mean, by name."""
+        """Functions of the bundle that this call may refer to, by name."""
         if isinstance(call.func, ast.Name):
             return self.functions.get(call.func.id, [])
         if isinstance(call.func, ast.Attribute):
@@ -101,7 +102,8 @@ class Code:
         return []
 
     def _find_recorded(self) -> None:
-        """Recorded data: what was loaded from files, and what was made of it; through calls, three deep."""
+        """Finds recorded data: data loaded from files, and data derived from it, through up to three passes over
+        calls."""
         scopes = [scope for part in self.parts for scope in part.scopes]
         self.recorded = {scope: set() for scope in scopes}
         for _ in range(3):
@@ -131,7 +133,7 @@ class Code:
                     self.recorded[function].add(parameter)
 
     def is_recorded(self, node: ast.AST, names: set[str]) -> bool:
-        """Whether an expression reads recorded data; `names` hold some."""
+        """Whether an expression reads recorded data; `names` are those that hold some."""
         for inner in ast.walk(node):
             if isinstance(inner, ast.Name) and inner.id in names:
                 return True
@@ -186,7 +188,7 @@ def _bodies(tree: ast.Module) -> Iterator[list[ast.stmt]]:
 
 
 def own_nodes(scope: Scope, *, lambdas: bool = False) -> list[ast.AST]:
-    """Nodes of a scope without those of functions inside it; with those of its lambdas on demand."""
+    """Nodes of a scope without those of nested functions; optionally with those of its lambdas."""
     kept = "_own_with_lambdas" if lambdas else "_own"
     known: list[ast.AST] | None = getattr(scope, kept, None)
     if known is None:
@@ -203,7 +205,7 @@ def own_nodes(scope: Scope, *, lambdas: bool = False) -> list[ast.AST]:
 
 
 def _calls_for_each(scope: Scope) -> Iterator[ast.Call]:
-    """Calls inside loops, comprehensions and lambdas of a scope, and functions that are named as a key."""
+    """Calls inside loops, comprehensions and lambdas of a scope, and functions passed as a key or to `map`."""
     for node in own_nodes(scope, lambdas=True):
         if isinstance(
             node,
@@ -220,7 +222,7 @@ def _calls_for_each(scope: Scope) -> Iterator[ast.Call]:
 
 
 def selects(node: ast.AST) -> bool:
-    """Whether this chooses among candidates: a maximum, a sort, a comparison with the best so far."""
+    """Whether the node selects among candidates: a maximum, a sort, a comparison with the best so far."""
     if isinstance(node, ast.Call) and called_name(node) in _SELECTING:
         # `min(a, b)` bounds a number; candidates come as one sequence, or with a key.
         return len(node.args) <= 1 or any(k.arg == "key" for k in node.keywords)
@@ -241,12 +243,12 @@ def selects(node: ast.AST) -> bool:
 
 
 def called_name(call: ast.Call) -> str:
-    """The last part of the name that is called; empty for other expressions."""
+    """The last part of the called name; empty for other expressions."""
     return call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
 
 
 def key_of(node: ast.Subscript) -> str | None:
-    """The literal text that subscripts, if any."""
+    """The literal text of the subscript; None for any other."""
     value = node.slice.value if isinstance(node.slice, ast.Constant) else None
     return value if isinstance(value, str) else None
 

@@ -1,7 +1,7 @@
-"""Follows values through one pass of a loop's body: of what was each name at the pass's beginning does its new value depend?
+"""Follows values through one pass of a loop's body, to find the names at its start that each new value depends on.
 
-Functions of the bundle are followed into, four calls deep. Nothing is run. The answer is an approximation on the side of
-too many dependencies: branches are joined, elements of a list are one value.
+The analysis enters functions of the bundle, up to four calls deep. No code is run. The result overestimates
+dependencies: branches are joined, and the elements of a list are one value.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from evopolicy_coordinator.analysis.simulators.code import (
 )
 
 MAX_STEPS, MAX_ALL_STEPS = 8_000, 60_000
-"""Expressions that are followed for one loop, and for all of a bundle."""
+"""Maximum number of expressions followed for one loop, and for all of a bundle."""
 _DEPTH = 4
 _NOTHING: frozenset[str] = frozenset()
 
@@ -45,22 +45,22 @@ _BENDING = (ast.Mult, ast.Div, ast.Pow, ast.MatMult, ast.FloorDiv)
 
 
 class Flow(NamedTuple):
-    """What one value depends on."""
+    """The dependencies of one value."""
 
     deps: frozenset[str] = _NOTHING
-    """Names, as they were at the beginning of the pass."""
+    """Names, with their values at the start of the pass."""
     bent: frozenset[str] = _NOTHING
-    """Those of them that were multiplied, divided or put through a function on the way."""
+    """Those multiplied, divided or passed through a function on the way."""
     looked: frozenset[str] = _NOTHING
-    """Those that were an index into a table."""
+    """Those used as an index into a table."""
     chosen: bool = False
-    """Depends on a decision: a policy's answer, a branch, a draw, an item of a plan."""
+    """Depends on a decision: a policy's answer, a branch, a random draw, an item of a plan."""
     fresh: bool = False
     """Depends on recorded data that this pass read."""
     asked: bool = False
-    """Depends on what another process answered."""
+    """Depends on another process's answer."""
     time: bool = False
-    """Is, or is made from, the number of the pass."""
+    """Is, or is derived from, the number of the pass."""
 
 
 def join(flows: Iterable[Flow]) -> Flow:
@@ -76,13 +76,13 @@ def join(flows: Iterable[Flow]) -> Flow:
 
 
 class _Frame:
-    """One function that is followed into. The bottom frame is the loop's own scope."""
+    """The frame of one entered function. The bottom frame is the loop's own scope."""
 
     def __init__(self, function: Function | None) -> None:
         self.function = function
         self.values: dict[str, Flow] = {}
         self.stands_for: dict[str, str] = {}
-        """Parameter to the bottom frame's name of the object that was passed."""
+        """By parameter, the bottom frame's name of the passed object."""
         self.returned: list[Flow] = []
         self.own: set[str] = set()
         if function is not None:
@@ -101,11 +101,11 @@ class _Frame:
 
 
 class TooMuchError(Exception):
-    """The loop is larger than what is followed."""
+    """The loop is too large to be followed."""
 
 
 class Pass:
-    """One pass of a body. Afterwards `values` has the new values of what it changed."""
+    """One pass of a body. Afterwards `values` has the new values of the names that it changed."""
 
     def __init__(self, code: Code, recorded: set[str]) -> None:
         self.code = code
@@ -113,16 +113,16 @@ class Pass:
         self.recorded = recorded
         self.values: dict[str, Flow] = {}
         self.sums: dict[str, list[Flow]] = {}
-        """Names that something was added to, with what."""
+        """Names that something was added to, with the added values."""
         self.stored_otherwise: set[str] = set()
         self.exchanged: list[Flow] = []
-        """What a generator's body yields in exchange for a value."""
+        """Values that a generator's body yields in exchange for a value."""
         self.returned: list[Flow] = []
-        """What the scope returns from inside the loop."""
+        """Values that the scope returns from inside the loop."""
         self.tested: list[Flow] = []
-        """Conditions that end the loop or leave it."""
+        """Conditions that end or leave the loop."""
         self.asks = False
-        """Whether the body asks another process, as a submit does."""
+        """Whether the body queries another process, as a submit does."""
         self.queued = False
         """Whether values go through a priority queue."""
         self._frames = [_Frame(None)]
@@ -131,7 +131,7 @@ class Pass:
     # -- names
 
     def _place(self, name: str) -> str | None:
-        """The bottom frame's name for it; None for a name of the inner frame."""
+        """The bottom frame's name for it; None for a local name of the inner frame."""
         frame = self._frames[-1]
         if frame.function is None:
             return name
@@ -247,7 +247,7 @@ class Pass:
         self._assign(node.target, new)
 
     def _added(self, target: ast.expr, value: ast.expr) -> bool:
-        """`total = total + x` is `total += x`."""
+        """Treats `total = total + x` as `total += x`."""
         if not isinstance(value, ast.BinOp) or not isinstance(value.op, ast.Add | ast.Sub):
             return False
         if not isinstance(target, ast.Name | ast.Attribute):
@@ -264,7 +264,7 @@ class Pass:
         return self._dotted(target) if isinstance(target, ast.Attribute) else None
 
     def _set(self, target: ast.expr, flow: Flow) -> None:
-        """Stores a sum: no other kind of store."""
+        """Stores a sum without recording it as another kind of store."""
         name = self._sum_name(target)
         was = name in self.stored_otherwise
         self._assign(target, flow)
@@ -299,7 +299,7 @@ class Pass:
             self._weaken(target.value, join([flow, self.value(target.slice)]))
 
     def _weaken(self, target: ast.expr, flow: Flow) -> None:
-        """A part of it has changed."""
+        """Joins `flow` into a target of which only a part has changed."""
         if isinstance(target, ast.Name):
             self._write(target.id, flow, weak=True)
         elif isinstance(target, ast.Attribute):
@@ -313,7 +313,7 @@ class Pass:
             self._weaken(target.value, flow)
 
     def bind_loop(self, target: ast.expr, source: ast.expr) -> None:
-        """Binds what the loop itself goes through."""
+        """Binds the items of the loop's own iterable."""
         self._bind(target, source, inner=False)
 
     def _bind(self, target: ast.expr, source: ast.expr, *, inner: bool) -> None:
@@ -344,7 +344,7 @@ class Pass:
             raise TooMuchError
 
     def value(self, node: ast.expr | None) -> Flow:
-        """What the expression depends on; runs its side effects."""
+        """Returns the expression's dependencies; applies its side effects."""
         if node is None or isinstance(node, ast.Constant):
             return Flow()
         self._count()
@@ -352,7 +352,7 @@ class Pass:
             return Flow() if node.id in self.imported else self._read(node.id)
         if isinstance(node, ast.BinOp):
             both = join([self.value(node.left), self.value(node.right)])
-            # A neighbour's number, found by adding what a table says, is no state that a table gives.
+            # The index of a neighbour, computed by adding a table's entry, is no state from a table.
             return (_bent(both) if isinstance(node.op, _BENDING) else both)._replace(looked=_NOTHING)
         if isinstance(node, ast.Compare):
             both = join([self.value(node.left), *(self.value(c) for c in node.comparators)])
@@ -408,7 +408,7 @@ class Pass:
             found = found._replace(chosen=True, time=False, fresh=found.fresh or recorded)
         if key_of(node) in RECORDED_KEYS and "@item" in base.deps:
             found = found._replace(fresh=True)
-        # A slice is a shorter text or list, not what a table says of a state.
+        # A slice is a shorter text or list, not a table's entry for a state.
         return (
             found if isinstance(node.slice, ast.Slice) else found._replace(looked=found.looked | index.deps)
         )
@@ -432,7 +432,7 @@ class Pass:
             root = node.func.value
             library = isinstance(root, ast.Name) and root.id in self.imported
             if not library:
-                if name == "act":  # the contract's name: whose answer is an action, whatever it remembers
+                if name == "act":  # the contract's name: its result is an action, whatever state it keeps
                     return given._replace(chosen=True, bent=_NOTHING)
                 followed = [
                     (c, m) for c, m in self.code.methods.get(name, []) if m is not self._frames[-1].function
@@ -463,7 +463,7 @@ class Pass:
         return _bent(given) if name in _CURVED else given
 
     def _unknown(self, arguments: list[Flow], given: Flow) -> Flow:
-        """A callable that was passed in. With a state and a choice of its own for it, it may be a model."""
+        """A callable passed in as a value. If its arguments include a state and another choice, it may be a model."""
         chosen = [a for a in arguments if a.chosen]
         states = [a for a in arguments if a.deps and not a.chosen]
         found = given._replace(chosen=True)
@@ -538,7 +538,7 @@ class Pass:
 
 
 def _changes(function: Function, parameter: str) -> bool:
-    """Whether the function stores into a part of what it is given."""
+    """Whether the function stores into a part of its parameter."""
     for node in own_nodes(function):
         stored = isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store)
         if stored and parameter in stored_names(node):
@@ -551,7 +551,7 @@ def _bent(flow: Flow) -> Flow:
 
 
 def _loaded(node: ast.expr) -> ast.expr:
-    """The same expression, read."""
+    """The same expression in load context."""
     if isinstance(node, ast.Name):
         return ast.Name(id=node.id, ctx=ast.Load())
     if isinstance(node, ast.Attribute):

@@ -1,6 +1,6 @@
-"""Looks through what a run has left for code that looks like a simulator: checkpoints, workspace, the agent's log.
+"""Searches a run's checkpoints, workspace and agent log for code that looks like a simulator.
 
-All of it is read as text, none of it is run. A run whose rules allow simulation is not looked through.
+Everything is read as text; nothing is run. Runs whose rules allow simulation are not searched.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from evopolicy_coordinator.analysis.simulators.code import Code
 from evopolicy_coordinator.analysis.simulators.signs import FLAGGED, Kind, Sign, signs_of, with_numbers
 
 MAX_FLAGS = 20
-"""Places that are kept of one run."""
+"""Maximum number of kept places per run."""
 _QUOTED_LINES, _QUOTED_CHARS = 10, 160
 _MAX_FILES, _MAX_LOG_BYTES, _MAX_LOG_LINE, _MAX_LOG_PIECES = 200, 64 << 20, 1 << 20, 200
 _LIBRARIES = frozenset({"site-packages", "node_modules", "__pycache__", "dist-packages"})
@@ -30,29 +30,29 @@ _HERE_DOCUMENT = re.compile(r"<<-?\s*(['\"]?)(\w+)\1[^\n]*\n(.*?)\n\2\b", re.DOT
 
 
 class Flag(msgspec.Struct, frozen=True, kw_only=True):
-    """Code of one place that looks like a simulator."""
+    """Code in one place that looks like a simulator."""
 
     kind: Kind
     submits: tuple[int, ...]
-    """Indices of the submits whose checkpoints have it; empty for what was found elsewhere."""
+    """Indices of the submits whose checkpoints contain it; empty if found elsewhere."""
     path: str
     """`system/…` of a checkpoint, `workspace/…`, or `logs/agent.jsonl:LINE` for code in a command or a message."""
     line: int
     end_line: int
-    """1-based, inclusive, of that file, or of the piece of the log."""
+    """1-based, inclusive; in that file, or in the piece of the log."""
     points: float
     reasons: tuple[str, ...]
     quote: tuple[str, ...]
-    """The lines themselves, shortened, as the agent wrote them."""
+    """The lines as the agent wrote them, shortened."""
 
 
 def flags_of(
     checkpoints: Iterable[tuple[int, Mapping[str, bytes]]], workspace: Path, log: Path | None, env: str
 ) -> tuple[Flag, ...]:
-    """What is found in the Python files of each submit (index, files by path), in the workspace and in the log.
+    """Flags in the Python files of each submit (index, files by path), in the workspace and in the log.
 
-    The same lines in several submits are one flag; lines of the workspace that a checkpoint has too are not told twice.
-    Strongest first, at most `MAX_FLAGS`.
+    The same lines in several submits are one flag; lines of the workspace that a checkpoint contains too are not
+    repeated. Strongest first, at most `MAX_FLAGS`.
     """
     found: dict[tuple[str, tuple[str, ...]], Flag] = {}
     for index, files in checkpoints:
@@ -89,7 +89,7 @@ _MAX_KNOWN = 4096
 
 
 def _signs(files: Mapping[str, bytes]) -> tuple[Sign, ...]:
-    """Remembered by the files without their numbers: edits of constants, most of a run's, are looked at once."""
+    """Cached by the files without their numbers: edits of constants, most of a run's edits, are analysed once."""
     digest = hashlib.sha256()
     for path, source in files.items():
         digest.update(b"\0" + path.encode("utf-8", "replace") + b"\0" + _NUMBER.sub(b"0", source))
@@ -126,7 +126,7 @@ def _flag(sign: Sign, quote: tuple[str, ...], path: str, submits: tuple[int, ...
 
 
 def _left(workspace: Path) -> dict[str, bytes]:
-    """Python files that are left in the workspace, without the feedback, by path."""
+    """Python files left in the workspace, except the feedback, by path."""
     found: dict[str, bytes] = {}
     for path, size in left_files(workspace, enter=lambda name: name not in _LIBRARIES):
         name = path.relative_to(workspace).as_posix()
@@ -141,7 +141,7 @@ def _left(workspace: Path) -> dict[str, bytes]:
 
 
 def _pieces(log: Path) -> Iterator[tuple[int, bytes]]:
-    """Python in an agent's log, with the number of its line: here-documents, and texts that are code as a whole."""
+    """Python in an agent's log, with its line number: here-documents, and texts that are code as a whole."""
     if not log.is_file() or log.is_symlink() or log.stat().st_size > _MAX_LOG_BYTES:
         return
     seen: set[str] = set()
@@ -167,7 +167,7 @@ def _pieces(log: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _texts(told: Any) -> Iterator[str]:
-    """The texts in a JSON value, nested ones too."""
+    """The texts in a JSON value, including nested ones."""
     queue = [told]
     while queue:
         value = queue.pop()

@@ -1,13 +1,15 @@
-"""What makes code look like a simulator, as signs with points; three points of one place make a flag.
+"""Rules by which code looks like a simulator: signs with points; three points in one place make a flag.
 
-A loop is judged by what it does with its own earlier values, not by its names. It looks like a rollout when
+A loop is judged by its use of its own earlier values, not by its names. It looks like a rollout if
 
-- a state is made from the state before by more than addition (multiplied, put through a function, looked up in a table),
-- something decides in between: a policy's answer, an item of a plan, a branch, a candidate that is tried, and
-- something of the states is summed, counted or compared: a return, a length, a final distance.
+- a state is computed from the previous state by more than addition (multiplied, passed through a function, looked up
+  in a table),
+- a decision is made in between: a policy's answer, an item of a plan, a branch, a candidate that is tried, and
+- some value of the states is summed, counted or compared: a return, a length, a final distance.
 
-Loops that read recorded data at each pass (filters, statistics, training, replays through a policy) and loops whose
-sums come from another process (submits) are none. One step for each observation, as in a filter's `act`, is no loop.
+Loops that read recorded data at each pass (filters, statistics, training, replays through a policy), and loops whose
+sums come from another process (submits), do not count. One step for each observation, as in a filter's `act`, is no
+loop.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ class Sign(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def signs_of(code: Code) -> list[Sign]:
-    """Every sign in a bundle, strongest first. Does not depend on the numbers in it."""
+    """Every sign in a bundle, strongest first. Independent of the numbers in its code."""
     found: list[Sign] = []
     for part in code.parts:
         found += _packages(part)
@@ -129,7 +131,7 @@ def _packages(part: Part) -> Iterator[Sign]:
 
 
 def _text(node: ast.expr, names: dict[str, str]) -> str:
-    """A text that is written in pieces; empty where it cannot be told."""
+    """A text assembled from pieces; empty if it cannot be determined."""
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else ""
     if isinstance(node, ast.Name):
@@ -215,7 +217,7 @@ def _comprehension(code: Code, scope: Scope, node: ast.ListComp | ast.GeneratorE
 
 
 class _States:
-    """The names that a loop carries from pass to pass, and what they are to each other."""
+    """The names that a loop carries from pass to pass, and their relations."""
 
     def __init__(self, run: Pass) -> None:
         self.new = dict(run.values)
@@ -239,7 +241,7 @@ class _States:
             )
             and not any(key in {self._name(d, roots) for d in flow.deps} for flow in run.sums[key])
         }
-        """Sums that feed nothing but themselves."""
+        """Sums that only they themselves depend on."""
         self.states = self._cycles() - self.sums
 
     @staticmethod
@@ -248,7 +250,8 @@ class _States:
         return root if root in roots else dep
 
     def _cycles(self) -> set[str]:
-        """Names whose new value depends, over whatever other names, on their own old one with bending on the way."""
+        """Names whose new value depends, through any other names, on their own old value, with a nonlinear step on
+        the way."""
         names = sorted(self.carried)[:_MAX_STATES]
         reach: dict[str, set[str]] = {}
         for name in names:
@@ -269,7 +272,7 @@ class _States:
         return found
 
     def _looked(self, name: str) -> frozenset[str]:
-        """Tables that are looked up with a choice beside the state: `after[state, action]`."""
+        """Names used as an index of a table together with a choice: `after[state, action]`."""
         flow = self.new[name]
         return flow.looked if flow.chosen else frozenset()
 
@@ -368,7 +371,7 @@ def _used_at_end(scope: Scope, states: set[str]) -> bool:
 
 
 def _tries_candidates(code: Code, scope: Scope, node: ast.AST) -> bool:
-    """Whether the loop runs for each of several candidates of which one is chosen."""
+    """Whether the loop runs for each of several candidates, of which one is selected."""
     if not isinstance(scope, ast.Module) and scope in code.selected:
         return True
     outer = (
@@ -383,7 +386,7 @@ def _tries_candidates(code: Code, scope: Scope, node: ast.AST) -> bool:
 
 
 def _fold(code: Code, scope: Scope, call: ast.Call) -> Iterator[_Judged]:
-    """`reduce` and its like: the first parameter of the function is the state."""
+    """`reduce` and similar functions: the first parameter of the passed function is the state."""
     if called_name(call) not in _FOLDS or not call.args:
         return
     for argument in call.args[:3]:
@@ -460,7 +463,7 @@ def _recursion(code: Code, function: Function) -> Iterator[_Judged]:
 
 
 def _weighs(value: ast.expr, call: ast.Call) -> bool:
-    """Whether an expression adds to, or compares, what `call` answers."""
+    """Whether an expression adds to, or compares, the result of `call`."""
     for node in ast.walk(value):
         if (isinstance(node, ast.BinOp) or selects(node)) and any(inner is call for inner in ast.walk(node)):
             return True
@@ -472,7 +475,7 @@ def _selects(function: Function) -> bool:
 
 
 def _sums_of_sums(code: Code, function: Scope) -> Iterator[_Judged]:
-    """Speeds as the cumulative sum of accelerations, places as that of speeds: a rollout without a loop."""
+    """Speeds as the cumulative sum of accelerations, and places as that of speeds: a rollout without a loop."""
     summed: set[str] = set()
     statements = [n for n in own_nodes(function) if isinstance(n, ast.Assign)]
     for statement in sorted(statements, key=lambda n: n.lineno):
@@ -506,7 +509,7 @@ def _sums_of_sums(code: Code, function: Scope) -> Iterator[_Judged]:
 
 
 def _environment_class(code: Code, part: Part, node: ast.ClassDef) -> Iterator[Sign]:
-    """A class that answers each choice with several values of which one is a score, and that can begin again."""
+    """A class that answers each choice with several values, one of them a score, and that can be reset."""
     methods = [m for m in node.body if isinstance(m, ast.FunctionDef)]
     if any(method.name == "act" for method in methods):
         return  # a policy: its own state and its observations
@@ -574,7 +577,7 @@ def _attribute(node: ast.AST, own: str) -> str:
 
 
 def _is_number_and_end(answer: ast.Tuple) -> bool:
-    """Two values at least beside the observation: a score and whether it is over."""
+    """Whether the answer has at least two values besides the observation: a score and an end flag."""
     return len(answer.elts) >= 3
 
 
@@ -592,7 +595,7 @@ def _called_in_loop(code: Code, name: str) -> bool:
 
 
 def with_numbers(sign: Sign, source: bytes, env: str) -> Sign:
-    """Half a point more where the sign's file has numbers of the environment's dynamics, too many for a coincidence."""
+    """Adds half a point if the sign's file has too many numbers of the environment's dynamics for a coincidence."""
     if not FLAGGED - 0.5 <= sign.points < FLAGGED or env not in _CONSTANTS:
         return sign
     numbers, enough = _CONSTANTS[env]

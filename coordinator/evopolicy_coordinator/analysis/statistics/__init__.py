@@ -1,4 +1,4 @@
-"""How sure the scores are: intervals, tests, tie groups, aggregates, and what a suite can resolve.
+"""The uncertainty of scores: intervals, tests, tie groups, aggregates, and the resolution of a suite.
 
     from evopolicy_coordinator.analysis import study
 
@@ -6,7 +6,7 @@
     for pair in core16.pairs:                    # typed records
         print(pair.env, pair.first, pair.second, pair.gap, pair.p_holm, pair.verdict)
 
-Pure: arrays in, records out, seeded. `samples` is the input; `intervals` and `permutation` hold the methods; `pairs`, `standings`,
-`resolution`, `aggregates` and `generalisation` what a report tells; `suite` puts them together. Only runs that
-the report compares come here, so runs that are no fair comparison mix only where the operator allowed it.
+Pure: arrays in, records out, seeded. `samples` is the input; `intervals` and `permutation` hold the methods; `pairs`,
+`standings`, `resolution`, `aggregates` and `generalisation` hold a report's results; `suite` combines them. Only runs
+that the report compares are used, so unfair mixtures occur only if the operator allowed them.
 """

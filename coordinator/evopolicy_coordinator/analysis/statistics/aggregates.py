@@ -1,10 +1,12 @@
-"""Interquartile mean, performance profiles and probability of improvement over normalised scores (Agarwal et al. 2021).
+"""Interquartile mean, performance profiles and probability of improvement over normalised scores (Agarwal et al.
+2021).
 
-The scores of single runs are put on the random-to-best scale of their environment, not clipped. A run without an ok submit counts as
-below every number. Intervals are percentiles of a stratified bootstrap: runs are drawn anew within each environment. Where an
-entry has one run a cell, its cases are drawn anew in place of runs, which is the spread of these checkpoints' scores. Draws out of few runs
-vary too little, by the factor (n − 1)/n: for the IQM they are stretched about their mean to make up for it; profiles and
-probabilities have no interval where a cell has two runs or more and fewer than `LEAST_RUNS`.
+The scores of single runs are normalised to the random-to-best scale of their environment, not clipped. A run without
+an ok submit counts as below every number. Intervals are percentiles of a stratified bootstrap that resamples runs
+within each environment. If an entry has one run per cell, its cases are resampled instead, which gives the spread of
+these checkpoints' scores. Resamples of few runs vary too little, by the factor (n − 1)/n. For the IQM they are
+therefore stretched about their mean; profiles and probabilities have no interval if a cell has two or more runs but
+fewer than `LEAST_RUNS`.
 """
 
 from __future__ import annotations
@@ -23,11 +25,11 @@ from evopolicy_coordinator.analysis.statistics.samples import Floats, Sample, ma
 LEAST_RUNS = 5
 
 TAUS = tuple(round(0.05 * i, 2) for i in range(21))
-"""Normalised scores at which a profile is told."""
+"""Normalised scores at which a profile is evaluated."""
 
 
 class Bounded(msgspec.Struct, frozen=True, kw_only=True):
-    """A number and its 95 % interval; no bounds where a cell shows no spread, or a bound is not finite."""
+    """A number and its 95 % interval; no bounds if a cell shows no spread, or a bound is not finite."""
 
     value: float
     low: float | None = None
@@ -39,17 +41,18 @@ class Aggregate(msgspec.Struct, frozen=True, kw_only=True):
 
     entry: str
     iqm: Bounded | None
-    """Mean of the middle half of all its runs' normalised scores; None where a run without an ok submit is in that half."""
+    """Mean of the middle half of all its runs' normalised scores; None if that half has a run without an ok submit."""
     profile: tuple[Bounded, ...]
-    """Share of its runs whose normalised score is above each of `TAUS`."""
+    """Share of its runs with a normalised score above each of `TAUS`."""
     n_runs: int
     n_environments: int
     over: str
-    """`runs`, or `cases` where every cell has one run, or `nothing`."""
+    """Resampled units: `runs`, `cases` if every cell has one run, or `nothing`."""
 
 
 class Improvement(msgspec.Struct, frozen=True, kw_only=True):
-    """How probably a run of the first entry beats one of the second, mean over the environments that both have played."""
+    """Probability that a run of the first entry beats one of the second; mean over the environments that both have
+    played."""
 
     first: str
     second: str
@@ -82,12 +85,12 @@ def probability_of_improvement(first: Floats, second: Floats) -> Floats:
 class _Cell(msgspec.Struct, frozen=True, kw_only=True):
     scores: Floats
     drawn: Floats | None
-    """(resamples, runs); None where nothing can be drawn anew."""
+    """(resamples, runs); None if nothing can be resampled."""
     n_runs: int
 
     @property
     def stretched(self) -> Floats | None:
-        """`drawn` with the variance that as many runs show."""
+        """`drawn`, stretched to the variance of that many runs."""
         if self.drawn is None or self.n_runs < 2 or not np.isfinite(self.scores).all():
             return self.drawn
         middle = self.scores.mean()
@@ -96,7 +99,7 @@ class _Cell(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def counted(self) -> Floats | None:
-        """`drawn`, unless it is out of too few runs."""
+        """`drawn`, unless it is drawn from too few runs."""
         return None if 1 < self.n_runs < LEAST_RUNS else self.drawn
 
 
@@ -107,7 +110,7 @@ def aggregates(
     *,
     resamples: int = RESAMPLES,
 ) -> tuple[list[Aggregate], list[Improvement]]:
-    """Of all agents, and of each two of them; environments without a scale are left out."""
+    """Aggregates of all agents, and improvements of each pair; environments without a scale are left out."""
     cells = {
         (agent, env): _cell(sample, scale, (place, number), resamples)
         for place, (env, scale) in enumerate(scales.items())
@@ -135,7 +138,7 @@ def _cell(sample: Sample, scale: Scale, seed: tuple[int, int], resamples: int) -
     if n > 1:
         drawn = scores[np.random.default_rng([21, *seed]).integers(0, n, (resamples, n))]
     elif (common := matched([sample])) is not None and common.returns[0].shape[1] > 1:
-        # All entries share the cases' draws, as they share the cases.
+        # All entries share the draws of cases, as they share the cases.
         returns = (common.returns[0][0] - scale.random) / width
         drawn = (weights(len(returns), len(returns), resamples, seed[0]) @ returns / len(returns))[:, None]
     elif sample.runs[0].score is None:

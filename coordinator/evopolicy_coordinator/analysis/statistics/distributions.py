@@ -1,4 +1,5 @@
-"""Quantiles of Student's t and Holm's correction, in plain Python: numpy has neither, and scipy would be a dependency for these two."""
+"""Quantiles of the normal and Student's t distribution and Holm's correction, in plain Python: numpy lacks them, and
+scipy would be a dependency for these alone."""
 
 from __future__ import annotations
 
@@ -12,13 +13,16 @@ ALPHA = 1.0 - CONFIDENCE
 
 
 def normal_quantile(p: float) -> float:
-    """The standard normal distribution's quantile, 0 < p < 1."""
+    """Quantile of the standard normal distribution, 0 < p < 1."""
     return NormalDist().inv_cdf(p)
 
 
 @lru_cache(maxsize=65536)
 def t_quantile(p: float, df: float) -> float:
-    """Student's t quantile for 0.5 ≤ p < 1 and any `df` > 0, to about 1e-10; infinite `df` gives the normal's."""
+    """Quantile of Student's t for 0.5 ≤ p < 1 and any `df` > 0, to about 1e-10; infinite `df` gives the normal's.
+
+    Raises ValueError for other arguments.
+    """
     if not 0.5 <= p < 1.0 or not df > 0.0:
         raise ValueError(
             f"t quantile of p = {p} with {df} degrees of freedom; p is in [0.5, 1) and df above 0"
@@ -42,7 +46,8 @@ def _t_upper(t: float, df: float) -> float:
 
 
 def _incomplete_beta(a: float, b: float, x: float) -> float:
-    """Regularised; by its continued fraction (Abramowitz and Stegun 26.5.8), evaluated with Lentz's method."""
+    """Regularised incomplete beta function, by its continued fraction (Abramowitz and Stegun 26.5.8) with Lentz's
+    method."""
     if x <= 0.0 or x >= 1.0:
         return 0.0 if x <= 0.0 else 1.0
     if x > (a + 1.0) / (a + b + 2.0):
@@ -69,7 +74,8 @@ def _away(value: float, tiny: float) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's step-down correction: adjusted p values in the order given; None stays None and is no test of the family."""
+    """Holm's step-down correction: adjusted p values in the given order; None stays None and is not part of the
+    family."""
     known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     adjusted: list[float | None] = [None] * len(p_values)
     largest = 0.0

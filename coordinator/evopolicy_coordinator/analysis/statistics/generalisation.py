@@ -1,7 +1,9 @@
-"""From train to validation to held-out: what the selected checkpoint scored on each, and how optimistic the selection was.
+"""Generalisation from train to validation to held-out: the selected checkpoint's scores, and the selection's
+optimism.
 
-The validation score of the selected checkpoint is the best of many, so it is too high on average; its held-out score is
-not. Their difference is the selection's optimism. Success is told where the environment's return tells it exactly.
+The validation score of the selected checkpoint is the best of many, so it is too high on average; its held-out score
+is not. Their difference is the selection's optimism. Success is reported if the environment's return determines it
+exactly.
 """
 
 from __future__ import annotations
@@ -17,19 +19,19 @@ from evopolicy_coordinator.analysis.scoring.scores import family_of, ordered_env
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate, of_runs
 
 SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}
-"""Family or environment to the return above which an episode has reached its goal. MiniGrid pays 1 − 0.9 · steps/limit at the goal, else 0.
-Acrobot costs 1 a step, the one that reaches the goal aside, up to 500 steps. MountainCarContinuous pays 100 at the goal,
-and costs at most 0.1 a step, up to 999 steps."""
+"""By family or environment, the return above which an episode has reached its goal. MiniGrid pays 1 − 0.9 ·
+steps/limit at the goal, otherwise 0. Acrobot costs 1 per step except the one that reaches the goal, up to 500 steps.
+MountainCarContinuous pays 100 at the goal, and costs at most 0.1 per step, up to 999 steps."""
 
 
 class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
-    """One entry on one environment; means over its runs that completed."""
+    """One entry on one environment; means over its completed runs."""
 
     entry: str
     env: str
     n_runs: int
     train: float | None
-    """Mean return of the selected submit's own train episodes; None where a run does not tell."""
+    """Mean return of the selected submit's own train episodes; None if a run has no record of it."""
     validation: float | None
     heldout: float
     optimism: float | None
@@ -37,11 +39,11 @@ class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
     normalised_optimism: float | None
     """As a share of the random-to-best scale."""
     success: float | None
-    """Share of held-out episodes that reached the goal; None where the environment's returns do not tell."""
+    """Share of held-out episodes that reached the goal; None if the environment's returns do not determine it."""
 
 
 class Optimism(msgspec.Struct, frozen=True, kw_only=True):
-    """One entry over its environments: normalised optimism, mean and t interval, the unit being the environment."""
+    """One entry over its environments: mean of the normalised optimism and its t interval over environments."""
 
     entry: str
     mean: Estimate
@@ -60,7 +62,7 @@ def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Gen
 
 
 def optimism_of(entry: str, found: Iterable[Generalisation]) -> Optimism | None:
-    """None where no environment has a normalised optimism."""
+    """The entry's optimism; None if no environment has a normalised optimism."""
     values = [
         one.normalised_optimism for one in found if one.entry == entry and one.normalised_optimism is not None
     ]

@@ -1,12 +1,15 @@
-"""95 % intervals of means and of paired differences. `docs/explanation/statistics.md` has the measured coverage of each method.
+"""95 % intervals of means and of paired differences. `docs/explanation/statistics.md` has the measured coverage of
+each method.
 
-The method follows the data, by measured coverage:
+The method depends on the data, as chosen by measured coverage:
 
-- One run: over cases. Differences of returns that take two values (such as 0 and 1) get Bonett and Price's (2012) adjusted
-  Wald interval, all others the symmetric studentised bootstrap (Hall 1988). Fewer than `LEAST_CASES` cases are too few.
-- Several runs: over runs and cases, which are crossed, as every run plays the same cases. From `BOOTSTRAP_RUNS` runs on
-  the percentiles of a hierarchical bootstrap, runs being the unit; below that a t interval whose variance adds that of runs to what of
-  the cases' variance is shared by runs (random-effects analysis of variance, Satterthwaite's degrees of freedom).
+- One run: over cases. Differences of returns with two values (such as 0 and 1) get Bonett and Price's (2012) adjusted
+  Wald interval, all others the symmetric studentised bootstrap (Hall 1988). Fewer than `LEAST_CASES` cases get no
+  interval.
+- Several runs: over runs and cases, which are crossed, as every run plays the same cases. From `BOOTSTRAP_RUNS` runs
+  on, the percentiles of a hierarchical bootstrap with runs as the unit. Below that, a t interval whose variance is
+  that of runs plus the part of the cases' variance that runs share (random-effects analysis of variance,
+  Satterthwaite's degrees of freedom).
 - Several runs without common cases: Welch's t interval over run means.
 """
 
@@ -31,11 +34,11 @@ from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, weig
 from evopolicy_coordinator.analysis.statistics.samples import Floats
 
 LEAST_CASES = 5
-"""Below, no method covers."""
+"""With fewer cases no method reaches its coverage."""
 BOOTSTRAP_RUNS = 10
-"""Runs of each entry from which the hierarchical bootstrap covers."""
+"""Runs per entry from which the hierarchical bootstrap reaches its coverage."""
 _NOUGHT = 1e-9
-"""Of the spread: less is rounding."""
+"""Relative bound: a smaller spread is rounding error."""
 
 Method = Literal["bootstrap-t", "adjusted Wald", "hierarchical bootstrap", "crossed t", "Welch t", "none"]
 Over = Literal["cases", "runs and cases", "runs", "nothing"]
@@ -51,28 +54,28 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     value: float
     low: float | None = None
     high: float | None = None
-    """Both None where no method holds; `reason` says why."""
+    """Both None if no method applies; `reason` explains it."""
     method: Method = "none"
     over: Over = "nothing"
-    """What would be drawn anew in a repetition."""
+    """The units that a repetition of the experiment would draw again."""
     reason: str = ""
 
 
 class Components(msgspec.Struct, frozen=True, kw_only=True):
-    """What a mean over runs and crossed cases varies by; each is a variance of that mean."""
+    """Variance components of a mean over runs and crossed cases; each is a variance of that mean."""
 
     runs: float
-    """Of run means (their variance over the number of runs), residual included."""
+    """Variance of run means over the number of runs, residual included."""
     residual: float
-    """Of it, what is neither run nor case: 0 for one run."""
+    """Its part that neither run nor case explains; 0 for one run."""
     cases: float
-    """Of case means, residual included."""
+    """Variance of case means over the number of cases, residual included."""
     n_runs: int
     n_cases: int
 
 
 def components(returns: Floats) -> Components:
-    """Of a matrix runs × cases without missing values."""
+    """Variance components of a matrix runs × cases without missing values."""
     n_runs, n_cases = returns.shape
     by_run, by_case = returns.mean(axis=1), returns.mean(axis=0)
     residual = 0.0
@@ -89,10 +92,10 @@ def components(returns: Floats) -> Components:
 
 
 def difference(first: Floats, second: Floats, *, resamples: int = RESAMPLES, fixed: bool = False) -> Estimate:
-    """`first − second`, matrices runs × the same cases.
+    """Estimates `first − second` from matrices runs × the same cases.
 
-    Over runs and cases when both have two runs or more; with `fixed`, when the first has, the second being one given policy. Else
-    over cases alone.
+    Over runs and cases if both have two or more runs; with `fixed`, if `first` has, as `second` is one given policy.
+    Otherwise over cases alone.
     """
     value = float(first.mean() - second.mean())
     over_runs = len(first) > 1 and (len(second) > 1 or fixed)
@@ -122,7 +125,7 @@ def mean(returns: Floats, *, resamples: int = RESAMPLES) -> Estimate:
 
 
 def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
-    """Mean of `first`, or `first − second`, of run scores alone: Welch's t interval over runs."""
+    """Mean of `first`, or `first − second`, from run scores alone: Welch's t interval over runs."""
     groups = [np.asarray(one, dtype=np.float64) for one in (first, second) if len(one)]
     value = float(groups[0].mean() - (groups[1].mean() if len(groups) > 1 else 0.0))
     if any(len(group) < 2 for group in groups):
@@ -136,8 +139,8 @@ def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
 
 
 def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int = RESAMPLES) -> Estimate:
-    """The mean of one value a case. `returns` are the returns behind it, where they are single episodes: two-valued ones are
-    counted, not averaged."""
+    """The mean of one value per case. `returns` are the returns behind the values if these are single episodes:
+    two-valued returns are counted, not averaged."""
     n = len(values)
     value = float(values.mean())
     if n < LEAST_CASES:
@@ -155,7 +158,8 @@ def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int
 
 
 def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
-    """Half widths of the symmetric studentised bootstrap intervals of each column's mean; infinite where too few values differ.
+    """Half widths of symmetric studentised bootstrap intervals of each column's mean; infinite if too few values
+    differ.
 
     `columns` is (cases, m); each column is its own sample, resampled with the same draws.
     """
@@ -177,7 +181,8 @@ def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -
 def adjusted_wald(values: Floats, step: float, *, paired: bool) -> tuple[float, float]:
     """Interval of the mean of two-valued returns (0 or `step`), or of the paired difference of two such.
 
-    Paired: Bonett and Price (2012), a case added to each kind of disagreement. One sample: Agresti and Coull (1998).
+    Paired: Bonett and Price (2012), one case added to each kind of disagreement. One sample: Agresti and Coull
+    (1998).
     """
     z = normal_quantile(1.0 - ALPHA / 2.0)
     n = len(values)
@@ -197,10 +202,11 @@ def adjusted_wald(values: Floats, step: float, *, paired: bool) -> tuple[float, 
 def resampled_means(
     returns: Floats, resamples: int, seed: int, *, unbiased: bool = False, cases_seed: int = 0
 ) -> Floats:
-    """(resamples,) means of a matrix runs × cases. Cases are drawn by `cases_seed` alone: runs on the same cases share their draws.
+    """(resamples,) means of a matrix runs × cases.
 
-    Runs are drawn by `seed`. A single run is kept. `unbiased` draws one unit fewer, which makes the variance over resamples that of the
-    mean without the factor (n − 1)/n, which matters for few runs (McCarthy and Snowden 1985).
+    Cases are drawn by `cases_seed` alone, so runs on the same cases share their draws; runs are drawn by `seed`, and
+    a single run is kept. `unbiased` draws one unit fewer: the variance over resamples is then that of the mean
+    without the factor (n − 1)/n, which matters for few runs (McCarthy and Snowden 1985).
     """
     n_runs, n_cases = returns.shape
     fewer = int(unbiased)
@@ -217,10 +223,11 @@ def resampled_means(
 def _hierarchical(
     value: float, groups: Sequence[Floats], parts: Sequence[Components], by_case: Floats, resamples: int
 ) -> Estimate:
-    """Percentiles over draws of runs, and of cases within them, which all runs share.
+    """Percentile interval over draws of runs, and of cases, which all runs share.
 
-    Run means hold the residual of their cases already, so the draw of cases is shrunk to what of its variance is not residual; with one
-    draw fewer than there are units, both variances are unbiased (Davison and Hinkley 1997, section 3.8).
+    Run means already contain the residual of their cases, so the draw of cases is shrunk to the part of its variance
+    that is not residual. With one draw fewer than units, both variances are unbiased (Davison and Hinkley 1997,
+    section 3.8).
     """
     drawn = np.full(resamples, value)
     for number, group in enumerate(groups):
@@ -236,7 +243,7 @@ def _hierarchical(
         drawn += math.sqrt(beyond / shared) * change
     if _constant(drawn):
         return Estimate(value=value, over="runs and cases", reason=NO_SPREAD)
-    # Percentiles are too narrow by the factor normal over t quantile (Hesterberg 2015, expanded percentile interval).
+    # Percentiles are too narrow by the ratio of normal to t quantile (Hesterberg 2015, expanded percentile interval).
     tail = 1.0 - NormalDist().cdf(t_quantile(1.0 - ALPHA / 2.0, round(_variance(parts, shared, n)[1], 6)))
     low, high = np.quantile(drawn, [tail, 1.0 - tail])
     return Estimate(
@@ -245,7 +252,7 @@ def _hierarchical(
 
 
 def _crossed(value: float, parts: Sequence[Components], shared: float, n_cases: int) -> Estimate:
-    """t interval with the runs' variance and what of the cases' variance is not residual, which the runs' holds already."""
+    """t interval from the runs' variance, which contains the residual, plus the rest of the cases' variance."""
     total, df = _variance(parts, shared, n_cases)
     if total <= (_NOUGHT * abs(value)) ** 2:
         return Estimate(value=value, over="runs and cases", reason=NO_SPREAD)
@@ -253,7 +260,7 @@ def _crossed(value: float, parts: Sequence[Components], shared: float, n_cases: 
 
 
 def _variance(parts: Sequence[Components], shared: float, n_cases: int) -> tuple[float, float]:
-    """Of a mean over runs and crossed cases, with Satterthwaite's degrees of freedom, at least 1."""
+    """Variance of a mean over runs and crossed cases, with Satterthwaite's degrees of freedom, at least 1."""
     beyond = max(0.0, shared - sum(part.residual for part in parts))
     total = sum(part.runs for part in parts) + beyond
     if total <= 0.0:
@@ -269,7 +276,7 @@ def _t_interval(value: float, variance: float, df: float, method: Method, over: 
 
 
 def _two_levels(returns: Sequence[Floats]) -> tuple[float, float] | None:
-    """The two values that all returns take; None where there are more, or one."""
+    """The two values that all returns take; None if they take one, or more than two."""
     if not returns:
         return None
     found: NDArray[np.float64] = np.unique(np.concatenate([one.ravel() for one in returns]))

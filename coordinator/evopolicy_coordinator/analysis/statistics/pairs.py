@@ -1,4 +1,4 @@
-"""Every two entries on every environment: the gap, its interval, a permutation test, and Holm's correction over the suite."""
+"""Each pair of entries on every environment: gap, interval, permutation test, and Holm's correction over the suite."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     first: str
     second: str
     gap: Estimate | None
-    """`first − second`, held-out mean return on the common cases; None where there is none."""
+    """`first − second`, held-out mean return on the common cases; None if either has no score."""
     compares: Literal["agents", "checkpoints"]
-    """`checkpoints`: an entry has one run here, so nothing is known of how its runs vary."""
+    """`checkpoints`: an entry has one run here, so the variation between its runs is unknown."""
     n_runs: tuple[int, int]
     n_cases: int
-    """Common cases; 0 where runs are compared by their scores alone."""
+    """Common cases; 0 if runs are compared by their scores alone."""
     n_left_out: int
-    """Cases that only some of the runs have: they do not pair, and are left out."""
+    """Cases that only some of the runs have; they cannot be paired."""
     p: float | None
-    """Of the permutation test; None where there is none."""
+    """p value of the permutation test; None without a test."""
     p_least: float | None
-    """The smallest p that it could give."""
+    """The smallest p that the test could give."""
     p_holm: float | None
     """Corrected over the suite's pairs of agents, or over its pairs with the random reference."""
     verdict: Verdict
-    """Which entry is better by the corrected p at 5 %."""
+    """The better entry by the corrected p at 5 %."""
     reason: str
     """Why there is no interval, or no test that could reject; empty otherwise."""
 
@@ -69,7 +69,8 @@ class _Draft(msgspec.Struct, kw_only=True):
     test: Test | None = None
     reason: str = ""
     signs: Floats | None = None
-    """Differences by case (or by run, against a fixed policy) whose signs are flipped; tested together with its like."""
+    """Differences by case (or by run, against a fixed policy) whose signs are flipped; those of equal length share a
+    test."""
 
 
 def pairs(
@@ -129,7 +130,7 @@ def _draft(samples: tuple[Sample, Sample], resamples: int) -> _Draft:
 
 
 def _test(drafts: Sequence[_Draft], n_random: int) -> None:
-    """Tests over cases share their sign patterns; tests over runs are one by one."""
+    """Runs the tests: those over cases share their sign patterns, those over runs are separate."""
     together: dict[int, list[_Draft]] = {}
     for draft in drafts:
         if draft.signs is not None:
@@ -182,7 +183,7 @@ def _pair(draft: _Draft, p_holm: float | None, n_tests: int) -> Pair:
 
 
 def cell_mean(sample: Sample, *, resamples: int = RESAMPLES) -> Estimate | None:
-    """An entry's held-out mean on one environment; None where a run has no ok submit."""
+    """An entry's held-out mean on one environment; None if a run has no ok submit."""
     if sample.scores is None:
         return None
     common = matched([sample])

@@ -1,8 +1,9 @@
-"""Permutation tests of no difference, two-sided.
+"""Two-sided permutation tests of no difference.
 
-Over cases, signs of the paired differences are flipped: under the null hypothesis the two checkpoints are exchangeable on every case.
-Over runs, runs change their entries; the statistic is Welch's t, so that entries of equal mean and unequal spread are not taken for
-different when runs are many (Janssen 1997). All patterns are tried where they are few, else a random part, the observed one counted in.
+Over cases, the signs of the paired differences are flipped: under the null hypothesis the two checkpoints are
+exchangeable on every case. Over runs, the labels of runs are permuted. The statistic is Welch's t, so that entries of
+equal mean and unequal spread are not reported as different when there are many runs (Janssen 1997). All patterns are
+tried if they are few, otherwise a random sample plus the observed pattern.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from evopolicy_coordinator.analysis.statistics.samples import Floats
 LEAST_PATTERNS = 9999
 _CHUNK = 20_000
 _CLOSE = 1e-9
-"""Relative: statistics that are equal but for rounding count as equal."""
+"""Relative tolerance: statistics that differ only by rounding count as equal."""
 
 
 class Test(msgspec.Struct, frozen=True, kw_only=True):
@@ -26,17 +27,18 @@ class Test(msgspec.Struct, frozen=True, kw_only=True):
 
     p: float
     least: float
-    """The smallest p value that so few cases or runs can give."""
+    """The smallest p value possible with so few cases or runs."""
     exact: bool
 
 
 def patterns_for(n_tests: int, alpha: float) -> int:
-    """Random patterns such that a family of `n_tests` can still reject under Holm's correction at level `alpha`."""
+    """Number of random patterns with which a family of `n_tests` can still reject under Holm's correction at level
+    `alpha`."""
     return max(LEAST_PATTERNS, int(4 * n_tests / alpha) - 1)
 
 
 def sign_test(columns: Floats, n_random: int = LEAST_PATTERNS) -> list[Test]:
-    """Of each column (cases, m): that its values are symmetric about 0."""
+    """Tests for each column of a (cases, m) matrix that its values are symmetric about 0."""
     n = len(columns)
     patterns, exact = sign_patterns(n, n_random)
     observed = np.abs(columns.sum(axis=0))
@@ -49,7 +51,7 @@ def sign_test(columns: Floats, n_random: int = LEAST_PATTERNS) -> list[Test]:
 
 
 def label_test(first: Sequence[float], second: Sequence[float], n_random: int = LEAST_PATTERNS) -> Test:
-    """That two groups of run scores, of two runs or more each, come from one distribution."""
+    """Tests that two groups of run scores, of two or more runs each, come from one distribution."""
     n_first, n_second = len(first), len(second)
     pooled = np.array([*first, *second])
     pooled = pooled - pooled.mean()
@@ -67,7 +69,7 @@ def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 
 
 
 def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Floats:
-    """|t| of each pattern; no spread and no difference is 0, no spread and a difference infinite."""
+    """t| of each pattern: 0 without spread and difference, infinite for a difference without spread."""
     scale = float(np.abs(pooled).max(initial=0.0))
     if scale == 0.0:
         return np.zeros(len(labels))

@@ -1,4 +1,4 @@
-"""Seeded resampling, as weights: row b of a matrix says how often resample b draws each unit."""
+"""Seeded resampling as weights: row b of a matrix holds how often resample b draws each unit."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from evopolicy_coordinator.analysis.statistics.samples import Floats
 
 RESAMPLES = 2000
 EXACT_UP_TO = 1 << 13
-"""Sign or label patterns up to so many are all tried; of more a random part."""
+"""Up to so many sign or label patterns are all tried; otherwise a random sample of them."""
 
 
 @lru_cache(maxsize=8)
 def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
-    """(resamples, n): multinomial counts of `n_drawn` draws with replacement out of `n`; rows sum to `n_drawn`. Read-only."""
+    """(resamples, n): multinomial counts of `n_drawn` draws with replacement from `n`; rows sum to `n_drawn`.
+    Read-only."""
     drawn = np.random.default_rng([seed, n, n_drawn]).multinomial(n_drawn, np.full(n, 1.0 / n), resamples)
     found: Floats = drawn.astype(np.float64)
     found.setflags(write=False)
@@ -25,7 +26,7 @@ def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
 
 @lru_cache(maxsize=4)
 def sign_patterns(n: int, n_random: int) -> tuple[Floats, bool]:
-    """(patterns, n) of ±1, and whether they are all 2ⁿ of them; else `n_random` random ones. Read-only."""
+    """(patterns, n) of ±1, and whether these are all 2ⁿ; otherwise they are `n_random` random ones. Read-only."""
     if 2**n <= EXACT_UP_TO:
         found = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
         exact = True
@@ -38,7 +39,8 @@ def sign_patterns(n: int, n_random: int) -> tuple[Floats, bool]:
 
 @lru_cache(maxsize=4)
 def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, bool]:
-    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether they are all. Read-only."""
+    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether all are there.
+    Read-only."""
     n = n_first + n_second
     n_all = 1
     for i in range(n_first):

@@ -1,4 +1,4 @@
-"""The smallest gap that an experiment resolves at 95 %, and how many repeats a given gap would need."""
+"""The smallest gap that an experiment resolves at 95 %, and the number of repeats that a given gap would need."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from evopolicy_coordinator.analysis.statistics.pairs import Pair
 from evopolicy_coordinator.analysis.statistics.samples import Sample, matched
 
 GAPS = (0.05, 0.1, 0.2)
-"""Gaps on the random-to-best scale whose repeats a report tells."""
+"""Gaps on the random-to-best scale for which a report gives the repeats."""
 MAX_REPEATS = 1000
 
 
 class Spread(msgspec.Struct, frozen=True, kw_only=True):
-    """How a difference between two agents varies on one environment, mean over its pairs."""
+    """Variances of a difference between two agents on one environment, mean over its pairs."""
 
     run: float
     """Variance between runs of one agent, of their held-out means."""
@@ -31,15 +31,15 @@ class Spread(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Repeats(msgspec.Struct, frozen=True, kw_only=True):
-    """How many runs of each agent resolve a gap."""
+    """Number of runs per agent that resolve a gap."""
 
     gap: float
     n: int | None
-    """None where no number up to `MAX_REPEATS` does: it needs more cases."""
+    """None if no number up to `MAX_REPEATS` does: the gap needs more cases."""
 
 
 class Resolution(msgspec.Struct, frozen=True, kw_only=True):
-    """What one environment can resolve between agents."""
+    """The gap that one environment can resolve between agents."""
 
     env: str
     gap: float | None
@@ -48,9 +48,9 @@ class Resolution(msgspec.Struct, frozen=True, kw_only=True):
     """Best agent's mean minus the random reference's, in returns; None without such a scale."""
     n_cases: int
     n_runs: tuple[int, int]
-    """Fewest and most of an agent."""
+    """Fewest and most runs of an agent."""
     spread: Spread | None
-    """None unless every agent has two runs or more on the same cases: one run does not show how runs vary."""
+    """None unless every agent has two or more runs on the same cases: one run does not show how runs vary."""
 
     @property
     def normalised_gap(self) -> float | None:
@@ -58,7 +58,7 @@ class Resolution(msgspec.Struct, frozen=True, kw_only=True):
         return None if self.gap is None or self.scale is None else self.gap / self.scale
 
     def repeats(self, share: float) -> Repeats | None:
-        """Runs of each agent that resolve a gap of `share` of the scale; None where it cannot be told."""
+        """Runs per agent that resolve a gap of `share` of the scale; None if unknown."""
         if self.spread is None or self.scale is None:
             return None
         return repeats_needed(self.spread, share * self.scale)
@@ -77,8 +77,9 @@ def half_width(spread: Spread, n: int) -> float:
 
 
 def repeats_needed(spread: Spread, gap: float) -> Repeats:
-    """The fewest runs of each agent, from 2, whose 95 % interval of a difference is no wider than ± `gap`: a true gap of that size is
-    then told from 0 every second time. ValueError for a gap that is not above 0."""
+    """The fewest runs per agent, from 2, whose 95 % interval of a difference is no wider than ± `gap`. A true gap of
+    that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is not above
+    0."""
     if not gap > 0.0:
         raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
     if half_width(spread, MAX_REPEATS) > gap:
@@ -97,7 +98,7 @@ def resolutions(
     scales: Mapping[str, Scale],
     environments: Sequence[str],
 ) -> list[Resolution]:
-    """One for each environment that two agents have played."""
+    """One for each environment that two or more agents have played."""
     out: list[Resolution] = []
     for env in environments:
         here = [samples[agent, env] for agent in agents if (agent, env) in samples]
@@ -124,8 +125,8 @@ def resolutions(
 
 
 def overall(found: Sequence[Resolution]) -> Resolution | None:
-    """Of the mean over environments of normalised scores, on which the scale is 1; None unless each environment has a scale and
-    a gap. Environments are fixed: the suite is what it is."""
+    """Resolution of the mean of normalised scores over environments, on which the scale is 1; None unless each
+    environment has a scale and a gap. Environments are fixed: the suite is not a sample."""
     gaps = [one.normalised_gap for one in found]
     if not found or any(gap is None for gap in gaps):
         return None

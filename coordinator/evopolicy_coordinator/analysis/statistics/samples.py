@@ -1,7 +1,7 @@
 """The input of all statistics: the held-out returns of each run, by case, for one environment.
 
-Two runs share a case when they name the same case set (the hash of the held-out split) and the case has the same place in it.
-A return that is not finite, or that is missing at the end, is a missing case of that run.
+Two runs share a case if they name the same case set (the hash of the held-out split) and the case has the same
+position in it. A return that is not finite, or missing at the end, is a missing case of that run.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class RunReturns(msgspec.Struct, frozen=True, kw_only=True):
     """One run's score and the returns behind it."""
 
     score: float | None
-    """Held-out mean return; None with no ok submit."""
+    """Held-out mean return; None without an ok submit."""
     returns: tuple[float, ...] = ()
-    """By case, in the order of its case set; empty where only the score is known."""
+    """By case, in the order of its case set; empty if only the score is known."""
     case_set: str = ""
     """Equal for runs that played the same cases; empty: cases that no other run has."""
 
@@ -36,11 +36,11 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     runs: tuple[RunReturns, ...]
     is_fixed: bool = False
-    """The entry is one given policy, not an agent whose runs vary: the random reference."""
+    """Whether the entry is one given policy (the random reference), not an agent whose runs vary."""
 
     @property
     def scores(self) -> list[float] | None:
-        """Of each run; None when a run has no ok submit, or a score that is not finite."""
+        """The score of each run; None when a run has no ok submit, or a score that is not finite."""
         known = [run.score for run in self.runs if run.score is not None and np.isfinite(run.score)]
         return known if known and len(known) == len(self.runs) else None
 
@@ -49,13 +49,13 @@ class Matched(msgspec.Struct, frozen=True, kw_only=True):
     """Samples on the cases that all their runs have."""
 
     returns: tuple[Floats, ...]
-    """A matrix runs × cases for each sample."""
+    """One matrix runs × cases per sample."""
     n_left_out: int
-    """Cases that some run has and another has not."""
+    """Number of cases that only some of the runs have."""
 
 
 def matched(samples: Sequence[Sample]) -> Matched | None:
-    """The samples' returns on their common cases; None where there is no case that all runs have."""
+    """The samples' returns on their common cases; None if no case is common to all runs."""
     runs = [run for sample in samples for run in sample.runs]
     if not runs or any(not run.returns or run.score is None for run in runs):
         return None
@@ -77,9 +77,10 @@ def matched(samples: Sequence[Sample]) -> Matched | None:
 
 
 def samples_of(runs: Iterable[Run], table: ScoreTable) -> dict[tuple[str, str], Sample]:
-    """A sample for each cell of `table`, by (entry, env): the runs' own returns, or only scores where nothing else is known.
+    """A sample for each cell of `table`, by (entry, env): the runs' own returns, or only scores if nothing else is
+    known.
 
-    The random reference has the returns that the runs recorded on the case set which most of them played.
+    The random reference has the returns recorded by the runs on the case set that most of them played.
     """
     found: dict[tuple[str, str], list[RunReturns]] = {}
     reference: dict[str, list[RunReturns]] = {}

@@ -1,10 +1,11 @@
-"""Intervals of rank scores and ranks, and tie groups: the whole suite is resampled.
+"""Intervals of rank scores and ranks, and tie groups, by resampling the whole suite.
 
-A rank score depends on the order of noisy means only. Its interval is for the score that the entry would have on average if the experiment
-were repeated with as many new runs and cases, on the same environments against the same entries. Each
-resample draws cases (the same for all entries, as they are shared) and runs, ranks all entries anew, and averages. Two entries are told apart
-when the resampled differences of their scores say so at 5 % after Holm's correction over all pairs. An entry's rank then
-lies between 1 + (entries told apart and better) and N − (entries told apart and worse), as in Mogstad et al. (2024).
+A rank score depends only on the order of noisy means. Its interval is for the entry's average score over repetitions
+of the experiment with as many new runs and cases, on the same environments against the same entries. Each resample
+draws cases (the same for all entries, as they are shared) and runs, ranks all entries again, and averages. Two
+entries are distinguished if the resampled differences of their scores are significant at 5 % after Holm's correction
+over all pairs. An entry's rank then lies between 1 + (better distinguished entries) and N − (worse distinguished
+entries), as in Mogstad et al. (2024).
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, weig
 from evopolicy_coordinator.analysis.statistics.samples import Floats, Sample, matched
 
 MAX_GROUPS = 200
-"""More tie groups than this are not told: the letters would say nothing."""
+"""Above this number of tie groups the letters are omitted: they would not be informative."""
 
 
 class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
-    """How sure one row of a leaderboard is."""
+    """The uncertainty of one row of a leaderboard."""
 
     entry: str
     score_low: float
@@ -35,22 +36,22 @@ class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
     """95 % interval of the rank score."""
     rank_low: int
     rank_high: int
-    """Best and worst rank that the comparisons leave, all pairs together at 95 %."""
+    """Best and worst rank consistent with the comparisons, at 95 % for all pairs together."""
     ties: str
-    """Letters of its tie groups: entries that share a letter cannot be told apart."""
+    """Letters of its tie groups: entries that share a letter cannot be distinguished."""
 
 
 class Standings(msgspec.Struct, frozen=True, kw_only=True):
-    """Of a suite; entries whose cells show no spread are not in it."""
+    """Rank estimates of a suite; entries with a cell without spread are left out."""
 
     rows: tuple[RankEstimate, ...]
     gap: float | None
     """Half width of the 95 % interval of a difference of two agents' rank scores, median over pairs."""
     over: str
-    """`cases`, `runs and cases`, or both where cells differ."""
+    """`cases`, `runs and cases`, or both if cells differ."""
 
     def of(self, entry: str) -> RankEstimate | None:
-        """The row of `entry`, if it has one."""
+        """The row of `entry`; None if it has none."""
         return next((row for row in self.rows if row.entry == entry), None)
 
 
@@ -61,7 +62,7 @@ def standings(
     *,
     resamples: int = RESAMPLES,
 ) -> Standings:
-    """Of the entries of `scores` (entry to its observed rank score), best first."""
+    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first."""
     entries = sorted(scores, key=lambda entry: (-_or_least(scores[entry]), entry.casefold(), entry))
     n_pairs = len(entries) * (len(entries) - 1) // 2
     resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
@@ -112,7 +113,8 @@ def _drawn_scores(
     environments: Sequence[str],
     resamples: int,
 ) -> tuple[Floats, set[str]]:
-    """(entries, resamples) rank scores, NaN without any, and the entries that vary wherever they have played."""
+    """(entries, resamples) rank scores, NaN for entries without scores, and the entries that vary wherever they
+    played."""
     total, n_scored = np.zeros((len(entries), resamples)), np.zeros(len(entries))
     spread = set(entries)
     for number, env in enumerate(environments):
@@ -141,7 +143,7 @@ def _drawn_scores(
 
 
 def _known_failure(sample: Sample) -> bool:
-    """A single run without an ok submit is the worst there is, and stays it."""
+    """Whether the sample has a run without an ok submit: it has the worst rank in every resample."""
     return sample.scores is None
 
 
@@ -151,7 +153,7 @@ def _fixed_mean(sample: Sample, resamples: int) -> Floats:
 
 
 def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats | None:
-    """Resampled means; None where the sample shows no spread, or has no mean."""
+    """Resampled means; None if the sample shows no spread, or has no mean."""
     if sample.scores is None:
         return None
     common = matched([sample])
@@ -166,7 +168,7 @@ def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats 
 
 
 def _told_apart(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
-    """Pairs of places in `sure`, the better first."""
+    """Distinguished pairs of places in `sure`, the better one first."""
     places = list(itertools.combinations(range(len(sure)), 2))
     tails: list[tuple[float, bool]] = []
     for a, b in places:
@@ -181,7 +183,7 @@ def _told_apart(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
 
 
 def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
-    """Letters of n entries such that two share one if and only if they are not told apart (Piepho 2004, insert and absorb)."""
+    """Letters of n entries; two share one exactly if they are not distinguished (Piepho 2004, insert and absorb)."""
     groups: list[frozenset[int]] = [frozenset(range(n))]
     for a, b in sorted(apart):
         split = [

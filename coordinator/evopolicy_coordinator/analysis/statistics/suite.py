@@ -26,7 +26,7 @@ from evopolicy_coordinator.analysis.statistics.standings import Standings, stand
 
 
 class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """How sure a suite's scores are."""
+    """The uncertainty of a suite's scores."""
 
     means: dict[tuple[str, str], Estimate]
     """Held-out mean by (entry, env); cells without a mean are absent."""
@@ -34,7 +34,7 @@ class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
     standings: Standings
     resolutions: tuple[Resolution, ...]
     overall: Resolution | None
-    """Of the mean of normalised scores over all environments."""
+    """Resolution of the mean of normalised scores over all environments."""
     aggregates: tuple[Aggregate, ...]
     improvements: tuple[Improvement, ...]
     generalisation: tuple[Generalisation, ...]
@@ -44,7 +44,8 @@ class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
 def suite_statistics(
     runs: Sequence[Run], table: ScoreTable, board: Leaderboard, *, resamples: int = RESAMPLES
 ) -> SuiteStatistics:
-    """Of the cells of `table`, ranked as `board`; `runs` bring the returns by case, and may hold others."""
+    """Statistics of the cells of `table`, ranked as `board`. `runs` supply the returns by case, and may include
+    others."""
     samples = samples_of(runs, table)
     environments = table.environments
     scales = scales_of(table)

@@ -1,8 +1,8 @@
-r"""A table in LaTeX as a paper takes it: booktabs rules, best in bold, second-best underlined, no larger than its page.
+r"""A table in LaTeX for a paper: booktabs rules, best in bold, second-best underlined, fitted to its page.
 
-What it writes compiles with pdfLaTeX and the packages that its first line names. A table too wide gets small type, then
-headings and texts in several lines, then panels one below the other that each name their rows; one too long goes on over
-pages. Widths are estimates from numbers of characters, since type cannot be measured here.
+The output compiles with pdfLaTeX and the packages named in its first line. A table that is too wide gets small type,
+then headings and texts on several lines, then panels one below the other that each repeat the row names. A table that
+is too long continues over pages. Widths are estimated from numbers of characters, since type cannot be measured here.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import msgspec
 from evopolicy_coordinator.analysis.tables.table import DASH, Column, Table, shown
 
 _WIDTH = 375.0
-"""Width to fit, in points: somewhat less than common one-column styles' text, as bold is wider than average."""
+"""Maximum width in points: slightly less than the text of common one-column styles, as bold is wider than average."""
 _LINES = 50
-"""Lines of small type that fit a page under a caption."""
+"""Number of lines of small type that fit on a page under a caption."""
 _FEWEST = 10
-"""Characters that a line of a broken text has at least; `_FEWEST_OF_PROSE` for a text of `_PROSE` characters or more."""
+"""Minimum characters per line of a broken text; `_FEWEST_OF_PROSE` applies to texts of `_PROSE` characters or more."""
 _FEWEST_OF_PROSE = 22
 _PROSE = 60
 _UNBROKEN = 20
-"""Characters after which a word that has no natural break may be broken."""
+"""Length in characters above which a word without a natural break may be broken."""
 
 _JOINER = "\N{WORD JOINER}"
 _CHARACTERS = {
@@ -66,7 +66,7 @@ _ACCENTED = frozenset(map(chr, range(0xC0, 0x100))) - set("×÷ÐÞðþ")
 
 
 def latex_text(text: str) -> str:
-    """`text` with nothing that LaTeX takes as a command, a ligature of dashes or an unknown letter (which is `?`)."""
+    """Escapes `text`: no LaTeX commands, no ligatures of dashes; unknown letters become `?`."""
     return "".join(map(_character, re.sub("-(?=-)", "-" + _JOINER, " ".join(text.split()))))
 
 
@@ -80,7 +80,7 @@ def _character(character: str) -> str:
 
 
 class _Type(msgspec.Struct, frozen=True):
-    """A size of type: points that a character is wide on average, and that a column has beside its text."""
+    """A size of type: average width of a character and extra width of a column, both in points."""
 
     character: float
     gap: float
@@ -91,18 +91,18 @@ _SMALL = _Type(3.8, 6.0)
 
 
 class _Fit(msgspec.Struct, frozen=True):
-    """How wide one column may be, in characters."""
+    """The width of one column, in characters."""
 
     column: Column
     least: int
     natural: int
-    """With its heading broken between words and its text not broken."""
+    """Width with its heading broken between words and its text unbroken."""
     width: int = 0
-    """As set; below `natural` its text is broken into lines."""
+    """Width as set; below `natural` its text is broken into lines."""
 
 
 def to_latex(table: Table) -> str:
-    """The table as `table`, or as `longtable` when it is longer than a page."""
+    """The table as `table`, or as `longtable` if it is longer than a page."""
     cells = [[shown(row.get(column.key), column) for column in table.columns] for row in table.rows]
     caption = f"\\caption{{{latex_text(table.caption or table.title)}}}"
     label = f"\\label{{tab:{table.name}}}"
@@ -145,12 +145,12 @@ def _fit(column: Column, texts: list[str]) -> _Fit:
 
 
 def _pieces(text: str) -> list[str]:
-    """What of `text` has to stay in one line."""
+    """The parts of `text` that cannot be broken."""
     return re.findall(rf"[^\s/_,:=-]{{0,{_UNBROKEN - 1}}}[^\s]", text)
 
 
 def _panels(fits: list[_Fit]) -> list[list[_Fit]]:
-    """Columns that go beside each other, each with the first ones, which name a row."""
+    """Groups of columns that fit side by side, each with the first columns, which name a row."""
     texts = next((i for i, fit in enumerate(fits) if fit.column.kind != "text"), len(fits))
     head = max(1, texts)
     while head > 1 and _least(fits[:head]) > _WIDTH / 3:
@@ -171,7 +171,7 @@ def _least(fits: Sequence[_Fit]) -> float:
 
 
 def _set(panel: list[_Fit]) -> list[_Fit]:
-    """The panel's columns with their texts as wide as there is room for, the longest broken first."""
+    """Sets the columns' widths to the available room, breaking the longest texts first."""
     cap = min(max(fit.natural for fit in panel), int(_WIDTH / _SMALL.character))
     while cap > 0 and _room([_capped(fit, cap) for fit in panel], _SMALL) > _WIDTH:
         cap -= 1
@@ -183,7 +183,7 @@ def _capped(fit: _Fit, cap: int) -> int:
 
 
 def _height(table: Table, panel: list[_Fit], cells: list[list[str]]) -> int:
-    """Lines that a panel takes, its heading and rules included."""
+    """Number of lines of a panel, including its heading and rules."""
     places = [(table.columns.index(fit.column), fit.width) for fit in panel]
     return 4 + sum(max(-(-len(row[i]) // max(1, width)) for i, width in places) for row in cells)
 

@@ -1,4 +1,4 @@
-"""The report's tables, made from a `Study`: the paper's, and the diagnostics beyond them."""
+"""The report's tables, made from a `Study`: the paper's, and further diagnostics."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _DEMAND = Column("demand", "Demand")
 
 
 def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
-    """Every table of the report in its order; those without rows are left out, except what was left out."""
+    """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
     found: list[Table] = []
     for suite in study.suites:
         found += [_aggregate(suite, study), _heldout(suite), _cells(suite)]
@@ -127,7 +127,7 @@ def _sure(row: RankEstimate | None) -> dict[str, Any]:
 
 
 def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
-    """Entry to the train episodes that its runs could spend."""
+    """By entry, the train episode budget of its runs."""
     found: dict[str, set[int]] = {}
     for run in study.runs:
         if run.env in suite.board.environments:

@@ -1,5 +1,5 @@
-"""The report's tables about runs themselves: how agents and environments were set up, the runs, their audit signals, their
-submits with the feedback that went before, and what was left out."""
+"""The report's tables about the runs: setups of agents and environments, the runs, their audit signals, their submits
+with the preceding feedback, and the omitted runs."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ ENV = Column("env", "Environment")
 RUN = Column("run", "Run")
 
 _COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
-"""What a harness notes among its settings of how a run went: no setting."""
+"""Counters of a run's course that a harness stores among its settings; they are not settings."""
 _MAX_QUOTE = 240
 
 LinkOf = Callable[[str], str]
-"""Run name to the page about it, or the empty string."""
+"""Returns the page about a run by its name, or the empty string."""
 
 
 def no_link(run: str) -> str:
@@ -49,7 +49,7 @@ def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
 
 
 def one_or_all(values: Iterable[Any]) -> Any:
-    """The value that they all are, or `A or B` where unlike runs were mixed."""
+    """The common value of all, or `A or B` if different runs were mixed."""
     found = list(dict.fromkeys(values))
     return found[0] if len(found) == 1 else " or ".join(str(value) for value in found)
 
@@ -93,13 +93,13 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
 
 
 def _journal(run: Run) -> str | None:
-    """Where the coordinator's journal has the run's result; None for runs from before there was one."""
+    """Position of the run's result in the coordinator's journal; None for runs from before the journal existed."""
     place = run.record.committed
     return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
 
 
 def _agents(study: Study) -> Table:
-    """A row for each way in which an entry was set up: more than one shows that its runs are not alike."""
+    """One row per setup of an entry: several rows show that its runs differ."""
     counts: dict[tuple[str, ...], int] = {}
     for run in study.runs:
         agent = run.record.agent
@@ -141,7 +141,7 @@ def _agents(study: Study) -> Table:
 
 
 def _settings(run: Run) -> str:
-    """The plain ones in a line; lists, and paths of the machine that it ran on, are in run.json."""
+    """The plain settings on one line; lists and paths of the original machine are only in run.json."""
     settings = run.record.agent.settings
     plain = {
         key: value
@@ -240,7 +240,7 @@ def _submit(row: TraceRow) -> dict[str, Any]:
 
 
 def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
-    """Every submit of every run (`submits_of`): too long for a page, where each run has its own."""
+    """Every submit of every run (`submits_of`). Too long for a page; each run has a page of its own."""
     return Table(
         name="feedback_use",
         title="Feedback use",
@@ -373,7 +373,7 @@ def _simulators(study: Study, link_of: LinkOf) -> Table:
 
 
 def submits_text(indices: Iterable[int]) -> str:
-    """`s000–s003, s007`: neighbours as a range."""
+    """Submit labels such as `s000–s003, s007`: neighbours as a range."""
     spans: list[list[int]] = []
     for index in sorted(indices):
         if spans and index == spans[-1][1] + 1:
@@ -410,11 +410,11 @@ _NOT_TOLD: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
     ("Agents", "harness, version, settings, jail, hidden isolation", lambda run: True),
     ("Environments", "the bounds of a submit, the number of validation cases", lambda run: True),
 )
-"""Table, what it lacks of a run of the published software, and of which."""
+"""Table, the information that it lacks for runs of the published software, and a test for affected runs."""
 
 
 def _not_told(study: Study) -> Table:
-    """What the published software's run directories lack, table by table."""
+    """The information missing from the published software's run directories, by table."""
     runs = [run for run in study.runs if run.is_published]
     counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _NOT_TOLD]
     return Table(

@@ -1,4 +1,4 @@
-"""The report's tables about how sure its scores are. Each caption says what an interval means, and over what."""
+"""The report's tables about the uncertainty of its scores. Each caption explains its intervals and their units."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _VERDICTS = {"not told apart": "no", "not comparable": None}
 
 
 def statistics_tables(suite: Suite) -> list[Table]:
-    """In the order of the report; those without rows are empty."""
+    """The tables in the order of the report; some may have no rows."""
     return [
         _pairs(suite),
         _resolution(suite),
@@ -40,7 +40,7 @@ def _rounded(value: float, digits: int) -> str:
 
 
 def interval_text(estimate: Estimate | None, digits: int = 3) -> str | None:
-    """The interval, or why there is none."""
+    """The interval, or the reason why there is none."""
     if estimate is None:
         return None
     return span(estimate.low, estimate.high, digits) or estimate.reason or None
@@ -51,7 +51,7 @@ def _bounds(bounded: Bounded | None, digits: int = 2) -> str | None:
 
 
 def has_single_runs(suite: Suite) -> bool:
-    """An agent has one run on an environment."""
+    """Whether an agent has one run on an environment."""
     return any(pair.compares == "checkpoints" for pair in suite.statistics.pairs)
 
 

@@ -1,7 +1,7 @@
 """A table as data, and its plain forms: CSV (full precision) and Markdown (rounded, best and second marked).
 
-Cells hold what agents and policies wrote. In CSV a text that a spreadsheet would take for a formula gets an apostrophe in
-front; in Markdown no text becomes HTML, an image or a link; in both nothing is left that would steer a terminal.
+Cells contain text from agents and policies. In CSV a text that a spreadsheet would take for a formula gets a leading
+apostrophe. In Markdown no text becomes HTML, an image or a link. Neither contains terminal control sequences.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from evopolicy_common.terminal import harmless, one_line
 
 Kind = Literal["text", "integer", "number", "percent"]
 DASH = "–"
-"""Shown where there is no value; CSV leaves the field empty."""
+"""Shown for a missing value; CSV leaves the field empty."""
 
 
 class Column(msgspec.Struct, frozen=True):
-    """One column: its field, its heading and how its values are shown."""
+    """One column: its field, heading and display format."""
 
     key: str
     """Name of the field in CSV."""
     title: str
     kind: Kind = "text"
     digits: int = 3
-    """Decimals that a `number` is shown with."""
+    """Number of displayed decimals of a `number`."""
     below: bool = False
-    """A `number` above 0 that is less than its last decimal is shown as such (`<0.01`), not as 0."""
+    """Whether a `number` above 0 but below its last decimal is shown as such (`<0.01`) instead of as 0."""
     note: str = ""
-    """What it means, in a sentence, shown on demand."""
+    """One-sentence explanation, shown on demand."""
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,11 +48,11 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     marks: dict[tuple[int, str], int] = {}
     """(row, column key) to 1 for the best and 2 for the second-best of its column."""
     links: dict[int, str] = {}
-    """Row to a page about it, relative to the report."""
+    """By row, the page about it, relative to the report."""
 
 
 def shown(value: Any, column: Column) -> str:
-    """`value` as text for reading; a true minus is not used, so that numbers can be copied."""
+    """`value` as display text, with an ASCII minus so that numbers can be copied."""
     if value is None:
         return DASH
     if column.kind == "percent":
@@ -67,7 +67,8 @@ def shown(value: Any, column: Column) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """Header of column keys; numbers unrounded; empty for no value; an apostrophe before a text that looks like a formula."""
+    """Header of column keys; unrounded numbers; missing values empty; an apostrophe before texts that look like
+    formulas."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([column.key for column in table.columns])
@@ -111,17 +112,18 @@ _MARKUP = re.compile(r"[\\|`\[\]<>]")
 
 
 def _pipe(text: str) -> str:
-    """A cell's text: nothing in it ends the cell or becomes HTML, code, a link or an image."""
+    """A cell's text, escaped so that it neither ends the cell nor becomes HTML, code, a link or an image."""
     return _MARKUP.sub(_escaped, one_line(text))
 
 
 def _escaped(found: re.Match[str]) -> str:
-    # Not every reader takes a backslash before these two.
+    # Not every renderer accepts a backslash before these two.
     return {"<": "&lt;", ">": "&gt;"}.get(found[0], f"\\{found[0]}")
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:
-    """Marks 1 and 2 for the highest and second-highest value of each column; equal values share a mark (as ranks do)."""
+    """Marks 1 and 2 for the highest and second-highest value of each column; equal values share a mark, as with
+    ranks."""
     marks: dict[tuple[int, str], int] = {}
     for key in keys:
         values = {i: row[key] for i, row in enumerate(rows) if row.get(key) is not None}
