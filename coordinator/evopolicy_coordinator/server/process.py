@@ -179,7 +179,7 @@ async def _until(stop: asyncio.Event, service: Service) -> None:
 def _listen(
     state: StateFolder, options: Options, machines: Machines
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Returns the endpoints for this machine (always the state folder's socket) and those for other machines."""
+    """Returns the endpoints for this machine (with the state folder's socket if possible) and for others."""
     for endpoint in options.listen:
         _check_listen(endpoint, options.insecure_tcp, machines)
     wanted = resolve_listen(list(options.listen))

@@ -12,8 +12,8 @@ import threading
 from collections import OrderedDict
 
 MAX_RUNS = 10_000
-"""The least recently used runs are forgotten beyond this number. Only open runs are recorded, so no gateway can crowd
-out others."""
+"""Beyond this number, the runs with the oldest uploads are forgotten. Only open runs are recorded, so no gateway can
+crowd out others."""
 MAX_OF_A_RUN = 64
 
 
