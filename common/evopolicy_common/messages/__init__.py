@@ -1,1 +1,2 @@
-"""The wire messages, by who speaks: workers, gateways, operators; all msgspec structs over msgpack."""
+"""The wire messages, one module per kind of client (worker, gateway, operator); all are msgspec structs over
+msgpack."""

@@ -1,6 +1,6 @@
-"""What a run's audits came to: told to operators and kept in `run.json`, never to a gateway.
+"""Results of a run's audits: reported to operators and kept in `run.json`, never sent to a gateway.
 
-An audit plays an episode's recorded actions again on another worker and compares what comes of them, bit for bit.
+An audit replays an episode's recorded actions on another worker and compares the two records bit for bit.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Wor
 
 
 class AuditFinding(msgspec.Struct, frozen=True, kw_only=True):
-    """An audited episode over which workers did not agree."""
+    """An audited episode on which workers disagree."""
 
     split: Literal["train", "validation", "heldout", "random"]
     submit_index: Int
@@ -21,36 +21,36 @@ class AuditFinding(msgspec.Struct, frozen=True, kw_only=True):
     episode: Int
     """Position in the submit's list, or in the split."""
     player: Word
-    """The worker whose result stands."""
+    """The worker whose result counts."""
     auditors: Many[Text]
-    """Those that played it again, in order."""
+    """The workers that replayed it, in order."""
     difference: Text
-    """Where player and first auditor part, such as `step 3: reward 1.0 and 2.0`."""
+    """The first difference between player and first auditor, such as `step 3: reward 1.0 and 2.0`."""
     forger: Word = ""
-    """Who was alone against the two others; empty where that could not be told."""
+    """The worker that disagreed with two others; empty when it could not be determined."""
 
 
 class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The audits of one run. Counts are of episodes."""
 
     share: Number
-    """Of the run's episodes that were drawn, 0 to 1."""
+    """Share of the run's episodes that was drawn, 0 to 1."""
     sampled: Int = 0
-    """Drawn."""
+    """Episodes drawn."""
     audited: Int = 0
-    """Played again and judged."""
+    """Episodes replayed and judged."""
     agreed: Int = 0
-    """Of the audited: the result was confirmed."""
+    """Audited episodes whose result was confirmed."""
     disputed: Int = 0
-    """Of the audited: the result was refuted, or workers disagree and nobody could tell who is right."""
+    """Audited episodes whose result was refuted, or on which workers disagree without a majority."""
     not_audited: Named[Int] = {}
-    """Of the sampled: why they were not, such as `one worker only`."""
+    """Sampled episodes without an audit, by reason, such as `one worker only`."""
     forgers: Named[Int] = {}
-    """Workers that were found to report what did not happen, to the episodes of this run that each of them played."""
+    """Workers found to report forged results, with the number of this run's episodes that each of them played."""
     findings: Many[AuditFinding] = ()
-    """The first of what workers did not agree on."""
+    """The first disagreements."""
 
     @property
     def in_question(self) -> bool:
-        """Whether the run's numbers may be forged: a result is in dispute, or a forger's episodes are among them."""
+        """Whether the run's numbers may be forged: a result is disputed, or a forger played some of its episodes."""
         return self.disputed > 0 or any(self.forgers.values())

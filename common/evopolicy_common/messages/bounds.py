@@ -1,6 +1,6 @@
-"""How large a part of a message may be: refused by the decoder, and by `codec.encode` before it is sent.
+"""Bounds of the parts of a message, enforced by the decoder and by `codec.encode` before sending.
 
-Wide enough for whatever earlier versions have stored; what a message may be as a whole is `codec.MAX_MESSAGE_BYTES`.
+They are wide enough for everything that earlier versions stored. `codec.MAX_MESSAGE_BYTES` bounds a message as a whole.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from msgspec import Meta, Struct, inspect
 T = TypeVar("T")
 
 MAX_DEPTH = 32
-"""How deep a `Plain` value may nest."""
+"""Maximal nesting of a `Plain` value."""
 MAX_VALUES = 1 << 20
-"""How many values it may be made of."""
+"""Maximal number of values in it."""
 
 Word = Annotated[str, Meta(max_length=1024)]
 """A name, an id, a token, a digest."""
@@ -25,16 +25,16 @@ Text = Annotated[str, Meta(max_length=1 << 18)]
 Bytes = Annotated[bytes, Meta(max_length=16 << 20)]
 Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
-"""Finite."""
+"""A finite float."""
 Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
 Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
 Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
 Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True})]
-"""What JSON can say; `check_plain` bounds what is in it."""
+"""JSON-like data; `check_plain` bounds its content."""
 
 
 def plain_parts(message: Struct) -> Iterator[object]:
-    """The `Plain` parts of a message, and of the structs in it."""
+    """Yields the `Plain` parts of a message and of the structs in it."""
     for name, plain in _fields(type(message)):
         value = getattr(message, name)
         if value is None:
@@ -48,7 +48,8 @@ def plain_parts(message: Struct) -> Iterator[object]:
 
 @cache
 def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
-    """The fields of a struct that are `Plain` (True), or that are or list structs in which there are some."""
+    """The fields of a struct that are `Plain` (True), or that are structs (or tuples of structs) with such fields
+    (False)."""
     found = inspect.type_info(kind)
     assert isinstance(found, inspect.StructType)
     fields = []
@@ -62,7 +63,7 @@ def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
 
 
 def _alternatives(found: inspect.Type) -> Iterator[inspect.Type]:
-    """What a field may be, and of a list what is in it."""
+    """The types that a field may have, and for a tuple also those of its items."""
     if isinstance(found, inspect.UnionType):
         for each in found.types:
             yield from _alternatives(each)
@@ -75,7 +76,7 @@ def _alternatives(found: inspect.Type) -> Iterator[inspect.Type]:
 
 
 def check_plain(value: object) -> None:
-    """ValueError for a value that nests too deep or is made of too many."""
+    """Raises ValueError for a value that nests too deep or consists of too many values."""
     n = 0
     level = [value]
     for _ in range(MAX_DEPTH):

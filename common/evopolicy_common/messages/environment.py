@@ -1,4 +1,4 @@
-"""What is said about environments and cases: the nouns that the other message modules are made of.
+"""Descriptions of environments and cases, on which the other message modules build.
 
 In all messages unknown fields are skipped, and every field added later has a default.
 """
@@ -13,7 +13,7 @@ import msgspec
 from evopolicy_common.messages.bounds import Int, Many, Named, Number, Plain, Text, Word
 
 SpaceSchema = Plain
-"""A space as a plain dict: `{"type": "Box", "shape": [2], "dtype": "float32", "low": …, "high": …}` and so on."""
+"""A space as plain data: `{"type": "Box", "shape": [2], "dtype": "float32", "low": …, "high": …}` and so on."""
 
 Split = Literal["train", "validation", "heldout"]
 PolicyScope = Literal["episode", "submit"]
@@ -24,7 +24,7 @@ ObsStorage = Literal["inline", "npy", "npz"]
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
-    """One initial condition of an environment: what its `reset` is given."""
+    """One initial condition of an environment: the arguments of its `reset`."""
 
     seed: Int
     """Seed of the environment's own generator, 0 ≤ seed < 2**31."""
@@ -33,12 +33,12 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """All that anyone without the simulator knows of an environment; made by the worker that offers it."""
+    """Everything that is known of an environment without its simulator; made by the worker that offers it."""
 
     env: Word
     """Suite id, such as `gym/acrobot`."""
     env_version: Word
-    """Name and version of what is played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
+    """Name and version of the simulated environment, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
     obs_space: SpaceSchema
     action_space: SpaceSchema
     obs_storage: ObsStorage = "inline"
@@ -47,36 +47,37 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     reward_components: Many[Text] = ()
     """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
     reward_texts: Named[Text] = {}
-    """What each of them stands for; empty from workers of older versions."""
+    """What each reward component stands for; empty from workers of older versions."""
     task_text: Text
     """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
     deterministic: bool = True
     """False when even a fresh environment does not repeat an episode from its seed and actions."""
     renders: bool = False
-    """True when a recorded episode can have a video."""
+    """True when an episode can be recorded as video."""
     title: Word = ""
     """Short name for tables; empty: the id."""
     family: Word = ""
-    """Key of the family its scores are averaged in; empty: as the catalogue has it."""
+    """Key of the family in which its scores are averaged; empty: the catalogue's."""
     definition: Plain = {}
-    """How it is made: `gymnasium_id`, and `kwargs` and `wrappers` where it has any."""
+    """How it is constructed: `gymnasium_id`, plus `kwargs` and `wrappers` where it has any."""
     reward_weights: Named[Number] = {}
-    """Of a reward that is a vector: how its elements, in their order, are weighted in the return. Empty: it is a number."""
+    """For a vector reward: the weights of its elements, in their order, in the return. Empty: the reward is a
+    number."""
     success: Word = ""
-    """Key in `info` that tells whether the task was solved; empty where nothing tells."""
+    """Key in `info` that reports whether the task was solved; empty when no key does."""
     success_at: Literal["end", "any"] = "end"
-    """Whether the last step's word counts, or that of any."""
+    """Whether only the last step's value counts, or a true value at any step."""
     adapter: Word = ""
-    """What plays it: the revision of its adapter, `+`, and a digest of the adapter's code. Empty from workers of older versions,
-    whose fingerprint is that of the whole worker."""
+    """What plays it: the revision of its adapter, `+`, and a digest of the adapter's code. Empty from workers of
+    older versions, whose fingerprint is that of the whole worker."""
     packages: Named[Text] = {}
     """Name to exact version of the distributions that decide this environment's numbers."""
 
     def digest(self) -> str:
-        """SHA-256 of the definition, 64 hex digits: of all that is told here but what plays it, in which versions,
-        and where its observations are kept.
+        """SHA-256 of the definition, 64 hex digits: of all fields except the adapter, versions, and where observations
+        are kept.
 
-        A field at its default does not count, so that fields that are added later change no digest.
+        A field at its default does not count, so that fields added later change no digest.
         """
         told = {
             field.name: value

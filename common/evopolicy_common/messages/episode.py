@@ -1,4 +1,4 @@
-"""A job, what limits it, and what came of it: what passes between coordinator and worker about episodes."""
+"""Jobs, their limits, and the outcomes of episodes, as coordinator and worker exchange them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FailureCategory = Literal[
     "denied_import",
     "import_error",
     "init_error",
-    # One episode's failure: the episode goes on with keyed uniform random actions.
+    # One episode's failure: the episode continues with keyed uniform random actions.
     "reset_error",
     "act_error",
     "act_timeout",
@@ -28,19 +28,19 @@ FailureCategory = Literal[
 ]
 
 NO_POLICY: frozenset[str] = frozenset({"missing_policy", "denied_import", "import_error", "init_error"})
-"""Failure categories which, at request index 0, become the whole submit's verdict."""
+"""Failure categories that become the whole submit's verdict at request index 0."""
 
 TIME_LIMITS: frozenset[str] = frozenset({"act_timeout", "episode_timeout", "cpu_limit"})
-"""Failure categories that the summary lists under `timeouts` too."""
+"""Failure categories that the summary also lists under `timeouts`."""
 
 Record = Literal["full", "actions"]
-"""What a worker keeps of an episode: the whole trajectory, or for hidden episodes the action log only."""
+"""What a worker keeps of an episode: the whole trajectory, or (for hidden episodes) only the action log."""
 
 Tier = Literal["bwrap", "landlock", "none"]
 
 
 class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
-    """What one episode's policy may use. All are visible in `/info.resource_limits`."""
+    """Limits of one episode's policy. `/info.resource_limits` shows all of them."""
 
     episode_wall_s: Number = 600.0
     """Wall time of the policy's own work in one episode (import, init, reset, acts), seconds."""
@@ -51,42 +51,43 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: Number = 300.0
     """CPU time of the policy process in one episode, seconds."""
     memory_bytes: Int = 1 << 30
-    """Address space that the policy may add to what Python and the allowed packages take, bytes."""
+    """Address space of the policy beyond what Python and the allowed packages take, bytes."""
     processes: Int = 16
-    """Threads of the policy process; it may start no process."""
+    """Threads of the policy process; it may start no other process."""
     file_bytes: Int = 64 << 20
-    """What it may write to its copy of `system/` and `/tmp`, bytes together."""
+    """Bytes that the policy may write to its copy of `system/` and to `/tmp`, together."""
     files: Int = 4096
-    """Files and folders that it may make there, beside its bundle's."""
+    """Files and folders that it may create there, besides its bundle's."""
     open_files: Int = 256
-    """Its open file descriptors, the five that it starts with among them."""
+    """Its open file descriptors, including the five that it starts with."""
     output_bytes: Int = 64 << 10
-    """What is kept of each of stdout and stderr of an episode, bytes."""
+    """Bytes kept of each of stdout and stderr of an episode."""
     action_bytes: Int = 16 << 10
-    """What one action may take beyond 16 bytes for each number or character that the action space has, bytes; it may be
-    made of as many values as there are 16 bytes in that."""
+    """Size of one action beyond 16 bytes for each number or character of the action space, bytes. The action may
+    consist of at most one value for every 16 bytes of the whole."""
     episode_action_bytes: Int = 4 << 20
-    """What the actions of an episode may take together beyond what the action space needs, bytes."""
+    """Size of an episode's actions together beyond what the action space needs, bytes."""
     feedback_bytes: Int = 16 << 30
-    """What the files of all the run's episodes may take together, bytes. Each episode has an equal share, whatever others take:
-    what is written must not depend on which was done first. Beyond it its video is left out, then its observations, then its rows."""
+    """Size of the files of all the run's episodes together, bytes. Each episode has an equal share, whatever others
+    use, so that the files do not depend on which episode finished first. An episode beyond its share loses its video
+    first, then its observations, then its rows."""
     submit_wall_s: Number | None = None
-    """Wall time of a whole submit, seconds; None (the default) for no limit."""
+    """Wall time of a whole submit, seconds; None for no limit."""
 
 
 LARGEST_LIMITS: dict[str, int] = {
-    # Feedback keeps no more, and an outcome has to fit into a message.
+    # Feedback keeps no more than this, and an outcome has to fit into a message.
     "output_bytes": 64 << 10,
     "action_bytes": 1 << 20,
     "episode_action_bytes": 64 << 20,
 }
-"""Limits that cannot be set higher."""
+"""Maxima of these limits."""
 LARGEST_LIMIT = 1 << 53
-"""The same for all others."""
+"""The maximum of every other limit."""
 
 
 class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
-    """Names bytes in a content-addressed store, or carries them where they are few."""
+    """A reference to bytes in a content-addressed store; small ones are carried inline."""
 
     digest: Word
     """SHA-256 of the bytes, lowercase hex."""
@@ -99,19 +100,19 @@ class EpisodeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """One episode to play."""
 
     index: Int
-    """Request index: position in the submit's (or split's) list."""
+    """Request index: position in the submit's list or in the split."""
     episode_index: Int
-    """What the policy's `reset` is given."""
+    """Passed to the policy's `reset`."""
     case: Case
     policy_seed: Bytes
-    """16 bytes that seed the policy process's generators and the random actions that replace a failed policy."""
+    """16 bytes that seed the policy process's generators and the random actions that replace a failed policy's."""
     replay: BlobRef | None = None
-    """A trajectory (of either record) whose actions are played in place of a policy's, to see whether the environment
-    answers as it did; None for an episode of the job's own policy."""
+    """A trajectory (of either record) whose actions are played in place of a policy's, to check that the environment
+    responds as before; None for an episode of the job's own policy."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
-    """Work that is leased as one piece: one episode, or with policy scope `submit` a submit's episodes in order."""
+    """The unit of leasing: one episode, or with policy scope `submit` all episodes of a submit in order."""
 
     job_id: Word
     env: Word
@@ -120,28 +121,29 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     episodes: Many[EpisodeSpec]
     policy_scope: PolicyScope = "episode"
     policy_every: Int = 0
-    """With scope `submit`: a new Policy every that many episodes; 0 for one Policy through all."""
+    """With scope `submit`: a new Policy after this many episodes; 0 for one Policy throughout."""
     env_meta: Plain = {}
-    """Handed to `Policy.__init__` without the spaces, which the worker adds."""
+    """Passed to `Policy.__init__`; the worker adds the spaces."""
     observations: ObservationForm = "arrays"
     record: Record = "full"
     render: bool = False
-    """With record "full": report the feedback files themselves (`records.rendered`), which their reader only unpacks."""
+    """With record "full": report finished feedback files (`records.rendered`), which the receiver only unpacks."""
     video: bool = False
-    """Also record a video of each episode (a rendered frame a row)."""
+    """Also record a video of each episode (one rendered frame per row)."""
     video_episodes: Int = 0
-    """With `video`: only of the job's first so many episodes; 0 for all."""
+    """With `video`: record only the job's first this many episodes; 0 for all."""
     tier: Tier = "bwrap"
-    """The sandbox tier that the run demands."""
+    """The sandbox tier that the run requires."""
     limits: ResourceLimits = ResourceLimits()
     max_steps: Int = 0
-    """An episode is cut after so many steps; 0: only its environment ends it."""
+    """An episode is cut after this many steps; 0: only its environment ends it."""
     begun: BlobRef | None = None
-    """What the policy returned in an earlier attempt, and stands (`JobResult.begun`); None: the job begins anew."""
+    """What the policy returned in an earlier attempt, which stays valid (`JobResult.begun`); None: the job starts
+    from the beginning."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
-    """How a policy failed in one episode. A result, never a fault of ours."""
+    """How a policy failed in one episode. It is a result, not an infrastructure failure."""
 
     category: FailureCategory
     step_index: Int | None
@@ -149,29 +151,29 @@ class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
     message: Text
     traceback: Text = ""
     limit: Number | None = None
-    """Value of the limit that was hit, in its own unit; None when no limit was."""
+    """Value of the exceeded limit, in its own unit; None when it was no limit."""
     used: Number | None = None
-    """What the policy had used of it."""
+    """What the policy used of that limit, in the same unit."""
 
 
 class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What one episode came to."""
+    """The result of one episode."""
 
     index: Int
     episode_return: Number
     """Sum of the rewards; always finite."""
     length: Int
-    """Steps played."""
+    """Number of steps played."""
     terminated: bool
     truncated: bool
     failure: PolicyFailure | None = None
     reward_components: Named[Number] = {}
-    """Per-episode sum of each of the environment's reward components."""
+    """Sum over the episode of each of the environment's reward components."""
     success: bool | None = None
-    """Whether the task was solved, by the environment's own word; None where it tells none."""
+    """Whether the task was solved, as the environment reports it; None where it reports nothing."""
     trajectory: BlobRef | None = None
-    """`trajectory` codec bytes: the whole episode, or with record `actions` the action log. Of a job with `render` those of
-    `rendered`; workers of earlier versions do not know that."""
+    """Bytes of the `trajectory` codec: the whole episode, or with record `actions` the action log. For a job with
+    `render`, bytes of `rendered`, except from workers of earlier versions."""
     video: BlobRef | None = None
     """MP4 bytes."""
     stdout: Bytes = b""

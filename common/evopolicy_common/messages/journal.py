@@ -1,4 +1,4 @@
-"""A run's place in its coordinator's journal, as `run.json` tells it."""
+"""A run's entries in its coordinator's journal, as `run.json` has them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from evopolicy_common.messages.bounds import Int, Word
 
 
 class Committed(msgspec.Struct, frozen=True, kw_only=True):
-    """What the coordinator fixed before the run's agent began, and where the journal says so. See `records.journal`."""
+    """What the coordinator committed to before the run's agent started, and the journal entries that prove it. See
+    `records.journal`."""
 
     commitment: Word
     """Salted SHA-256 (hex) of the run's splits and settings."""
     epoch: Word
-    """Of the cases: all runs of an epoch derive theirs from one secret."""
+    """The epoch of the run's cases: all runs of an epoch derive theirs from one secret."""
     opened: Int
-    """Number of the journal's entry that holds the commitment, from 0."""
+    """Index of the journal entry that holds the commitment, from 0."""
     opened_head: Word
     """Hash (hex) of the journal up to that entry."""
     ended: Int | None = None
-    """Number of the entry that holds the digest of the run's result; None while it is not finished."""
+    """Index of the entry that holds the digest of the run's result; None until the run is finished."""
     ended_head: Word = ""
     """Hash (hex) of the journal up to that entry."""

@@ -1,4 +1,4 @@
-"""What an operator's commands and the coordinator say to each other. Only operators learn hidden results."""
+"""Messages between an operator's commands and the coordinator. Only operators receive hidden results."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ from evopolicy_common.messages.worker import (
 )
 
 HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
-"""Whether hidden episodes and agents shared a kernel: never; they could, as the rule was off for all or some of the run; the
-operator vouched for where the agent was; or the run was played before this was recorded."""
+"""Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible, as the rule was off
+for all or part of the run. waived: the operator vouched for where the agent was. unknown: the run was played before
+this was recorded."""
 
 HiddenCases = Literal["shared", "per_run"]
-"""Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
+"""Validation and held-out cases: the same for all runs of an environment, or separate for each run (no paired
+statistics)."""
 
 ELSEWHERE = "elsewhere"
-"""For `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
+"""Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
 
 
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is opened with. None means the suite's own number."""
+    """Settings with which a run is opened. None means the suite's own number."""
 
     env: Word
     entry: Word
@@ -59,7 +61,7 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     sandbox_tier: Tier = "bwrap"
     video: VideoOption = "off"
     replays: VideoOption | None = None
-    """Which held-out episodes of the selected checkpoint are recorded for people to watch; None: as `video`."""
+    """Which held-out episodes of the selected checkpoint are recorded as video for people; None: as `video`."""
     limits: ResourceLimits = ResourceLimits()
     notes: Named[Text] = {}
     """The operator's own labels; kept in `run.json`."""
@@ -67,16 +69,16 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     simulation: SimulationRule = "forbidden"
     finish: FinishRule = "early"
     step_limit: StepLimit = "natural"
-    """Rows and messages of earlier versions tell none."""
+    """Missing in rows and messages of earlier versions."""
     profile: Profile = "own"
     definition: Word = ""
-    """First digits of the digest of the environment's definition; empty: the one that ships or is approved."""
+    """First digits of the digest of the environment's definition; empty: the definition that ships or is approved."""
     agent_host: Word = ""
-    """Boot id of the kernel that the agent runs on, or `ELSEWHERE`; empty: its gateway's own, or for a remote agent unknown."""
+    """Boot id of the agent's kernel, or `ELSEWHERE`; empty: the gateway's own kernel, or unknown for a remote agent."""
 
     @property
     def recorded_heldout(self) -> VideoOption:
-        """Which held-out episodes are recorded."""
+        """Which held-out episodes are recorded as video."""
         return self.video if self.replays is None else self.replays
 
 
@@ -88,13 +90,13 @@ PUBLISHED: dict[str, str] = {
     "step_limit": "published",
     "hidden_cases": "shared",
 }
-"""What the profile `published` chooses, by the names of `RunSettings`. Its cases are the published files besides."""
+"""The settings of the profile `published`, by their names in `RunSettings`. Its cases are the published files."""
 PUBLISHED_TRAIN = 1024
-"""Train ids of the published case files."""
+"""Number of train ids in the published case files."""
 
 
 def off_profile(settings: RunSettings) -> str:
-    """The settings in which a run of profile `published` differs from it, in words; empty where there are none."""
+    """The settings in which a run of profile `published` differs from the profile, in words; empty when none does."""
     if settings.profile == "own":
         return ""
     told = {name: getattr(settings, name) for name in PUBLISHED}
@@ -108,7 +110,7 @@ class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
 
     token: Word
     key: Word
-    """Idempotency key: creating twice with one key gives the same run."""
+    """Idempotency key: creating twice with one key returns the same run."""
     settings: RunSettings
 
 
@@ -121,11 +123,11 @@ class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
 
 
 RunEnd = Literal["completed", "no_ok_submit", "error", "cancelled"]
-"""`cancelled`: the operator ended the run; `error`: it could not be played to its end."""
+"""`cancelled`: the operator ended the run. `error`: the run could not be completed."""
 
 
 class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
-    """A finalised run as the coordinator knows it: the source of `run.json`."""
+    """A finalised run as stored by the coordinator: the source of `run.json`."""
 
     run: Word
     settings: RunSettings
@@ -139,20 +141,20 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     val_scores: Numbered[Number]
     heldout_returns: Many[Number]
     validation_ineligible: Numbered[Text]
-    """Checkpoints that were quarantined while hidden, with the reason."""
+    """Checkpoints quarantined during hidden episodes, with the reason."""
     policy_failures: Named[Int]
     """Hidden episodes in which the selected policy failed, by split."""
     random_heldout_returns: Many[Number]
-    """Uniform random actions on the same held-out cases."""
+    """Returns of uniform random actions on the same held-out cases."""
     episode_budget: Int
     budget_used: Int
     split_hashes: Named[Text]
-    """SHA-256 by split name."""
+    """SHA-256 of each split, by its name."""
     split_secret: bool
     env_version: Word
     deterministic: bool
     fingerprint: Fingerprint | None
-    """Of the worker that the run was pinned by."""
+    """Fingerprint of the worker to which the run was pinned."""
     created_at: Number
     closed_at: Number
     finished_at: Number
@@ -161,20 +163,21 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """Seconds by phase: `queue`, `rollout`, `finalise`."""
     infrastructure_retries: Int = 0
     nondeterministic_results: Int = 0
-    """Repeated attempts of one job whose results differed."""
+    """Repeated attempts of a job whose results differed."""
     audit: AuditRecord | None = None
-    """None where nothing was to be audited and no forger is known."""
+    """None when nothing was audited and no forger is known."""
     hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: Many[Text] = ()
-    """`CLASS → CLASS: why` for each time an operator let the run go on with workers of other versions, oldest first."""
+    """`CLASS → CLASS: why` for each time an operator let the run continue with workers of other versions, oldest
+    first."""
     reference_by_case: bool = False
-    """The random actions follow from split and case; False for runs that an earlier version created."""
+    """The reference's random actions depend on split and case only; False for runs created by an earlier version."""
     committed: Committed | None = None
-    """None for runs that an earlier version opened: they were never committed to, and cannot be any more."""
+    """None for runs opened by an earlier version, which have no commitment."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One accepted submit, for checkpoints and `metrics.json`."""
+    """One accepted submit, as checkpoints and `metrics.json` need it."""
 
     submit_index: Int
     status: SubmitStatus
@@ -182,14 +185,14 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     env_instances: Many[Int]
     remaining_budget: Int
     mean_return: Number | None
-    """Visible mean over the train episodes; None unless ok."""
+    """Mean return over the train episodes, visible to the agent; None unless ok."""
     val_mean: Number | None
     started_at: Number
     completed_at: Number
 
 
 class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
-    """A long poll until the run is finished; answered with `RunProgress` while it is not."""
+    """A long poll for a finished run; answered with `RunProgress` until then."""
 
     token: Word
     run: Word
@@ -197,32 +200,32 @@ class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
 
 
 class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
-    """Where a run stands, and once it is finished all of it."""
+    """A run's progress, and its result once it is finished."""
 
     phase: Literal["open", "validation", "heldout", "random", "finished"]
     done: Int
-    """Episodes done of this phase."""
+    """Finished episodes of this phase."""
     total: Int
     waits_for: Text = ""
     finished: RunFinished | None = None
 
 
 class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
-    """Where episodes that are played again stood when a run played them: the policy is told the same."""
+    """The place of replayed episodes in their original run: the policy receives the same arguments."""
 
     run: Word
-    """The coordinator's id of the run; its policy seeds are used where the coordinator knows it. May be empty."""
+    """The coordinator's id of the run; its policy seeds are used if the coordinator knows the run. May be empty."""
     submit_index: Int
     """-1 for the random reference."""
     env_instances: Many[Int]
-    """The whole list of cases that they were part of, in order."""
+    """The whole list of cases to which they belonged, in order."""
     indexes: Many[Int]
     """Their positions in that list."""
     modulo: Int
-    """Episodes of the checkpoint's own submit: episode indexes count modulo this."""
+    """Number of episodes of the checkpoint's own submit: episode indexes count modulo this."""
     remaining_budget_after: Int
     policy_scope: PolicyScope = "episode"
-    """With `submit`, `indexes` must be the whole list."""
+    """With `submit`, `indexes` must cover the whole list."""
     observations: ObservationForm = "arrays"
 
 
@@ -241,38 +244,39 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     sandbox_tier: Tier = "bwrap"
     limits: ResourceLimits = ResourceLimits()
     replays: Many[BlobRef] = ()
-    """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded before, `bundle` None."""
+    """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded beforehand,
+    `bundle` None."""
     as_in: PlayedAs | None = None
-    """None for what was not played in a run before."""
+    """None for episodes that were not played in a run before."""
     step_limit: StepLimit = "natural"
     definition: Word = ""
     """As `RunSettings.definition`."""
 
 
 class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):
-    """What a cluster has for playing a finished run's episodes again."""
+    """Requests what a cluster has for replaying a finished run's episodes."""
 
     token: Word
     env: Word
     run: Word = ""
     n_validation: Int | None = None
     n_heldout: Int | None = None
-    """Of the run, where they were not the suite's own."""
+    """The run's own numbers, where they were not the suite's."""
 
 
 class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_state"):
-    """The answer to `DescribeEnvironment`."""
+    """The reply to `DescribeEnvironment`."""
 
     split_hashes: Named[Text]
-    """SHA-256 by split name: equal to a run's where the cases are the same."""
+    """SHA-256 by split name; equal to a run's when the cases are the same."""
     knows_run: bool
-    """The run is finished here, and its episodes' records may still be stored."""
+    """The run finished here, and its episodes' records may still be stored."""
     fingerprints: Many[Fingerprint]
-    """Of the connected workers that offer the environment, each once."""
+    """Distinct fingerprints of the connected workers that offer the environment."""
 
 
 class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
-    """Outcomes of a finished run's episodes as they were stored; answered with an `EvaluationPage`."""
+    """Requests the stored outcomes of a finished run's episodes; answered with an `EvaluationPage`."""
 
     token: Word
     run: Word
@@ -283,13 +287,13 @@ class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
 
 
 class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_started"):
-    """The evaluation is queued; also the answer to a repeated key."""
+    """The evaluation is queued; also the reply to a repeated key."""
 
     evaluation: Word
 
 
 class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
-    """A long poll for outcomes of an evaluation from a cursor on."""
+    """A long poll for outcomes of an evaluation from `cursor` on."""
 
     token: Word
     evaluation: Word
@@ -298,7 +302,7 @@ class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
 
 
 class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
-    """Outcomes in order of arrival; `cursor` is where the next page begins."""
+    """Outcomes in order of arrival; the next page starts at `cursor`."""
 
     cursor: Int
     total: Int
@@ -308,23 +312,25 @@ class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
 
 
 class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
-    """End a run or an evaluation without a score."""
+    """Ends a run or an evaluation without a score."""
 
     token: Word
     run: Word
 
 
 class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
-    """The operator's word that a run's agent is no longer alive: ends its permit. For machines that are lost for good."""
+    """The operator declares that a run's agent is no longer alive, which ends its permit. For machines lost for
+    good."""
 
     token: Word
     run: Word
     boot_id: Word = ""
-    """Of the kernel that it is gone from; empty: from wherever it was. The run may go on elsewhere meanwhile."""
+    """Boot id of the kernel that it is gone from; empty: from every kernel. The run may continue elsewhere
+    meanwhile."""
 
 
 class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
-    """Let a run go on with the workers of another fingerprint class; the reason is recorded in the run."""
+    """Lets a run continue with workers of another fingerprint class; the reason is recorded in the run."""
 
     token: Word
     run: Word
@@ -334,12 +340,13 @@ class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
 
 
 class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
-    """Take a worker out of service, or back."""
+    """Takes a worker out of service, or puts it back."""
 
     token: Word
     worker: Word
     state: Literal["active", "paused", "draining"]
-    """paused: it gets no more work and stays. draining: it gets no more, and ends once what it plays is done."""
+    """paused: the worker gets no more work and stays. draining: it gets no more work, and exits once its jobs are
+    done."""
 
 
 class Done(Message, frozen=True, kw_only=True, tag="ok"):
@@ -347,7 +354,8 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
 
 
 class Claim(Message, frozen=True, kw_only=True, tag="claim"):
-    """One run of a sweep, for this host to play: taken, renewed, given back or settled, so that none is played twice."""
+    """One run of a sweep, claimed for this host to play: taken, renewed, released or settled, so that no run is
+    played twice."""
 
     token: Word
     suite: Word
@@ -355,46 +363,47 @@ class Claim(Message, frozen=True, kw_only=True, tag="claim"):
     name: Word
     """The run's name in the sweep."""
     holder: Word
-    """The host that asks; the same after its restart."""
+    """The requesting host; the same after its restart."""
     ttl_s: Number
-    """Asked for again before this many seconds are over; 0.0 gives it back."""
+    """The claim expires after this many seconds unless renewed; 0.0 releases it."""
     run: Word = ""
-    """The cluster's id of what is played for it, once there is one."""
+    """The cluster's id of the run that is played for it, once it exists."""
     result: Plain | None = None
-    """What it came to: settles the claim for good."""
+    """The run's result; settles the claim for good."""
 
 
 class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
-    """How things stand after a `Claim`."""
+    """The state of a claim after a `Claim`."""
 
     granted: bool
-    """The asker holds it, or may not and need not because it is settled."""
+    """True when the requester holds the claim or has just settled it. False: another host holds it, it was settled
+    before, or this request released it."""
     holder: Word
-    """Who holds or held it last; empty: nobody."""
+    """The present or last holder; empty: nobody."""
     run: Word
-    """What the last holder played for it; empty: nothing yet."""
+    """The run that the last holder played for it; empty: none yet."""
     previous: Word = ""
-    """The holder from whom it has just been taken over, because its time was up."""
+    """The previous holder, if the claim has just been taken over because it expired."""
     result: Plain | None = None
-    """What it came to, once it is settled."""
+    """The run's result, once the claim is settled."""
 
 
 class Disclose(Message, frozen=True, kw_only=True, tag="disclose"):
-    """Declare the cases of finished runs public; answered with `Done` once the journal says so."""
+    """Declares the cases of finished runs public; answered with `Done` once the journal records it."""
 
     token: Word
     runs: Many[Word]
 
 
 class JournalRequest(Message, frozen=True, kw_only=True, tag="journal"):
-    """Entries of the journal from `cursor` on."""
+    """Requests entries of the journal from `cursor` on."""
 
     token: Word
     cursor: Int
 
 
 class JournalPage(Message, frozen=True, kw_only=True, tag="journal_page"):
-    """Entries in order, as they were hashed; `cursor` is where the next page begins."""
+    """Entries in order, as they were hashed; the next page starts at `cursor`."""
 
     cursor: Int
     entries: Many[Bytes]
@@ -402,7 +411,7 @@ class JournalPage(Message, frozen=True, kw_only=True, tag="journal_page"):
 
 
 class OpeningRequest(Message, frozen=True, kw_only=True, tag="opening"):
-    """What the coordinator committed to for a run whose cases were disclosed."""
+    """Requests what the coordinator committed to for a run whose cases were disclosed."""
 
     token: Word
     run: Word
@@ -417,7 +426,7 @@ class RunOpening(Message, frozen=True, kw_only=True, tag="run_opening"):
 
 
 class SignRequest(Message, frozen=True, kw_only=True, tag="sign"):
-    """Have the manifest of published results signed with the coordinator's key."""
+    """Requests a signature of a manifest of published results with the coordinator's key."""
 
     token: Word
     digest: Word
@@ -425,14 +434,14 @@ class SignRequest(Message, frozen=True, kw_only=True, tag="sign"):
 
 
 class Signed(Message, frozen=True, kw_only=True, tag="signed"):
-    """The signature (128 hex digits) and the public key (64) that it is checked with: Ed25519."""
+    """An Ed25519 signature (128 hex digits) and the public key (64 hex digits) that verifies it."""
 
     key: Word
     signature: Word
 
 
 class EnvironmentsRequest(Message, frozen=True, kw_only=True, tag="environments"):
-    """Which environments the workers offer; answered a page at a time."""
+    """Requests the environments that the workers offer, page by page."""
 
     token: Word
     cursor: Int = 0
@@ -443,15 +452,15 @@ class OfferedEnvironment(msgspec.Struct, frozen=True, kw_only=True):
 
     description: EnvironmentDescription
     digest: Word
-    """First digits of its digest."""
+    """First digits of the definition's digest."""
     accepted: Text
-    """`ships`, `approved`, `trusted`, or `by digest only`: then a run has to name `ID@DIGEST`."""
+    """`ships`, `approved`, `trusted`, or `by digest only`: in the last case a run has to name `ID@DIGEST`."""
     workers: Many[Text]
     """Connected workers that offer it."""
 
 
 class EnvironmentsReply(Message, frozen=True, kw_only=True, tag="environments_reply"):
-    """A page of what is offered."""
+    """A page of the offered environments."""
 
     environments: Many[OfferedEnvironment]
     cursor: Int
@@ -459,7 +468,7 @@ class EnvironmentsReply(Message, frozen=True, kw_only=True, tag="environments_re
 
 
 class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_environment"):
-    """Let runs use an environment that does not ship, in one definition."""
+    """Lets runs use one definition of an environment that does not ship."""
 
     token: Word
     env: Word
@@ -467,13 +476,13 @@ class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_enviro
 
 
 class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
-    """What the cluster is doing."""
+    """Requests the cluster's status."""
 
     token: Word
 
 
 class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One worker that is connected, or was lately."""
+    """One worker that is connected, or recently was."""
 
     worker: Word
     host: Word
@@ -482,20 +491,20 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     tiers: Many[Tier]
     environments: Many[Text]
     fingerprint: Text
-    """Short class of the whole worker's fingerprint: workers of which it is equal may share any run."""
+    """Short class of the whole worker's fingerprint: workers with equal classes may share any run."""
     versions: Named[Text]
-    """What the class is made of: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
+    """The components of the class: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
     held: Int
     running: Int
     last_seen_s: Number
     """Seconds since its last heartbeat."""
     refused: Named[Text] = {}
-    """Run id to why this worker gets no work of it."""
+    """Run id to the reason why this worker gets no work of that run."""
     boot_id: Word = ""
     hidden_bar: Text = ""
     """Why it plays no hidden episodes now; empty when it may."""
     classes: Named[Word] = {}
-    """Environment to its fingerprint class here: only workers of one class share a run of it."""
+    """Environment to its fingerprint class on this worker: only workers of one class share a run of it."""
     playing: Named[Int] = {}
     """Episode jobs that it plays now, by run or evaluation."""
 
@@ -513,7 +522,7 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     queued: Int
     running: Int
     done: Int
-    """Episode jobs finished, train and hidden together."""
+    """Finished episode jobs, train and hidden together."""
     waits_for: Text = ""
     agent_host: Word = ""
     """Where its agent may be alive: a host's name, a boot id, or `everywhere`; empty: nowhere."""
@@ -529,15 +538,15 @@ class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
     """A worker whose registration was refused."""
 
     worker: Word
-    """As it called itself."""
+    """The name that it sent."""
     host: Word
     why: Text
     ago_s: Number
-    """Seconds since the last time."""
+    """Seconds since its last attempt."""
 
 
 class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
-    """The answer to `StatusRequest`."""
+    """The reply to `StatusRequest`."""
 
     cluster: Word
     version: Word
@@ -550,13 +559,13 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     stalls: Many[Text] = ()
     """What waits longer than it should, and for what."""
     audit_share: Number = 0.0
-    """Share of the episodes of new runs that is played again elsewhere."""
+    """Share of the episodes of new runs that is audited, 0 to 1."""
     audits: Named[Int] = {}
-    """Of the unfinished runs: audited episodes by where they stand (`open`, `agreed`, `disputed`, `not_audited`)."""
+    """Audited episodes of the unfinished runs, by state (`open`, `agreed`, `disputed`, `not_audited`)."""
     disputes: Many[Text] = ()
-    """What workers disagree on, the latest last."""
+    """Disagreements of workers, the latest last."""
     quarantined: Named[Text] = {}
-    """Workers that get no more leases, and why."""
+    """Workers that get no more leases, with the reason."""
     turned_away: Many[TurnedAway] = ()
 
 

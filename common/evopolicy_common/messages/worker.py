@@ -1,4 +1,5 @@
-"""What workers and the coordinator say to each other. A worker asks, the coordinator answers; never the reverse."""
+"""Messages between workers and the coordinator. A worker sends requests and the coordinator replies; never the
+reverse."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.wire.refusals import Refusal
 
 DEFINITION_DIGITS = 16
-"""Of a definition's digest, as fingerprints and people name it."""
+"""Leading hex digits of a definition's digest that fingerprints and command lines use."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
@@ -22,29 +23,29 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Refused(Message, frozen=True, kw_only=True, tag="refused"):
-    """The request was understood and is not served; nothing was changed by it."""
+    """The request was understood but refused; it changed nothing."""
 
     status: Refusal
     message: Text
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker's numbers depend on, beside the seed; of the whole worker, or of one environment (`of`)."""
+    """What a worker's numbers depend on besides the seed: of the whole worker, or of one environment (see `of`)."""
 
     code_version: Word
     """Version and source digest of the worker's own code."""
     python: Word
     packages: Named[Text]
-    """Name to exact version of the packages that environments are made of."""
+    """Name to exact version of the distributions that environments are made of."""
     cpu: Text
-    """CPU model and the features that numerical libraries choose their code by."""
+    """CPU model and the features by which numerical libraries choose their code."""
     adapter: Word = ""
-    """`EnvironmentDescription.adapter`; empty: of the whole worker."""
+    """`EnvironmentDescription.adapter`; empty in the fingerprint of a whole worker."""
     definition: Word = ""
     """The first digits of `EnvironmentDescription.digest()`."""
 
     def of(self, description: EnvironmentDescription) -> Fingerprint:
-        """What the numbers of one environment depend on; the whole where the worker does not tell them apart."""
+        """The fingerprint of one environment; the whole worker's where the worker does not distinguish environments."""
         if not description.adapter:
             return self
         return replace(
@@ -55,9 +56,10 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def class_name(self, *, cpu: bool) -> str:
-        """12 hex digits, equal for workers whose results may stand in one run; `cpu`: the CPU's features count too.
+        """12 hex digits, equal for workers whose results may stand in one run. With `cpu`, the CPU's features count
+        too.
 
-        Another file of the worker's code makes another class only where it is one of the adapter's.
+        A change in the worker's code changes an environment's class only if it is in the adapter's code.
         """
         code = [self.adapter, self.definition] if self.adapter else [self.code_version]
         parts = [*code, self.python, sorted(self.packages.items())]
@@ -66,17 +68,17 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
         return hashlib.sha256(msgspec.json.encode(parts)).hexdigest()[:12]
 
     def versions(self) -> dict[str, str]:
-        """What the class is made of, by name."""
+        """The components of the class, by name."""
         code = {"adapter": self.adapter, "definition": self.definition} if self.adapter else {}
         return {"evopolicy-worker": self.code_version, **code, "python": self.python, **self.packages}
 
     def flat(self) -> dict[str, str]:
-        """As `run.json` has it."""
+        """The form that `run.json` uses."""
         return {**self.versions(), "cpu": self.cpu}
 
 
 class Register(Message, frozen=True, kw_only=True, tag="register"):
-    """The first thing a worker says, and again whenever the coordinator does not know its session."""
+    """A worker's first request; repeated whenever the coordinator does not know its session."""
 
     worker: Word
     """The worker's name, unique in the cluster, such as `host-3f2a`."""
@@ -90,64 +92,66 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     fingerprint: Fingerprint
     host: Word = ""
     boot_id: Word = ""
-    """Of the worker's kernel (`host.boot_id`); a worker without one plays no hidden episodes."""
+    """Boot id of the worker's kernel (`host.boot_id`); without it a worker plays no hidden episodes."""
     machine_id: Word = ""
-    """Of its machine (`host.machine_id`)."""
+    """Id of the worker's machine (`host.machine_id`)."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):
-    """The worker is known from now on, and may ask for leases."""
+    """The worker is registered and may request leases."""
 
     session: Word
-    """To be sent with every later request; ends with the coordinator's or the worker's process."""
+    """Sent with every later request; valid until the coordinator's or the worker's process ends."""
     lease_ttl_s: Number
-    """A lease that no heartbeat renews for so long is taken away."""
+    """A lease without a heartbeat for this many seconds expires."""
     heartbeat_s: Number
     refused: Named[Text] = {}
-    """Run id to why this worker gets no work of it, such as other versions than the run began with."""
+    """Run id to the reason why this worker gets no work of that run, such as versions other than the run started
+    with."""
     hidden_bar: Text = ""
-    """Why this worker gets no hidden work of any run; empty when it may."""
+    """Why this worker gets no hidden work of any run; empty when it gets some."""
     refused_environments: Named[Text] = {}
-    """Environment to why its announcement is not listened to."""
+    """Environment to the reason why its announcement is ignored."""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
-    """A long poll for work: answered as soon as there is some, or empty after `wait_s`."""
+    """A long poll for work: answered as soon as there is some, or with no leases after `wait_s`."""
 
     worker: Word
     session: Word
     n: Int
-    """How many leases the worker can take; 0 takes back the poll that waits, and is answered at once with none."""
+    """How many leases the worker can take; 0 withdraws the open poll, which is then answered at once with none."""
     wait_s: Number
     warm_bundles: Many[Text] = ()
     warm_environments: Many[Text] = ()
     serial: Int = 0
-    """The worker's own number of this sending; grows, over its starts too. 0: it does not count."""
+    """The worker's own number of this poll; increases, also across its restarts. 0: the worker does not number its
+    polls."""
 
 
 class Lease(msgspec.Struct, frozen=True, kw_only=True):
-    """The right, for a time, to play one job and report its result."""
+    """A temporary right to play one job and report its result."""
 
     lease_id: Word
     attempt: Int
-    """Counts from 1 per job: fences off the results of attempts that were given up."""
+    """Counts from 1 per job; rejects results of abandoned attempts."""
     stimulus_id: Word
-    """Runs from the event that made the job through every log line about it."""
+    """Identifies the event that created the job, in every log line about it."""
     job: Job
     stop_in_silence: bool = False
-    """Stop it, and give it back, when no heartbeat was answered for `lease_ttl_s`: an agent may be let onto this kernel."""
+    """Stop and return it when no heartbeat was answered for `lease_ttl_s`: an agent may be admitted to this kernel."""
 
 
 class Leases(Message, frozen=True, kw_only=True, tag="leases"):
-    """The answer to a poll; empty when there was nothing in time."""
+    """The reply to a poll; empty when no work came within `wait_s`."""
 
     leases: Many[Lease]
     cancelled: Many[Text] = ()
-    """Leases to stop at once, told here because the poll happened to wait; heartbeats tell them too."""
+    """Leases to stop at once. Listed here because the poll was open anyway; heartbeat replies list them too."""
 
 
 class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
-    """One lease in a worker's hands, as its heartbeat tells."""
+    """One lease that the worker holds, as its heartbeat reports it."""
 
     lease_id: Word
     job_id: Word
@@ -156,39 +160,39 @@ class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
     """False while it waits in the worker's prefetch queue."""
     episodes_done: Int = 0
     steps: Int = 0
-    """Environment steps done in the running job: a sign of progress."""
+    """Environment steps done in the running job; shows progress."""
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
-    """Every lease that the worker holds, renewed by being listed."""
+    """Lists every lease that the worker holds; each listed lease is renewed."""
 
     worker: Word
     session: Word
     held: Many[HeldLease]
     wait_s: Number = 0.0
-    """The answer may be held back for so long, and then comes at once when there is a lease to stop."""
+    """The reply may be held back for this long; it comes at once when there is a lease to stop."""
     settled: Int = 0
-    """All polls up to this number were over when `held` was put down: what they brought is in it, or was let go of. 0: the
-    worker does not count its polls."""
+    """All polls up to this number had ended when `held` was written: their leases are in it or were released. 0: the
+    worker does not number its polls."""
 
 
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
-    """What the worker is to stop."""
+    """Leases that the worker has to stop."""
 
     cancelled: Many[Text] = ()
     """Leases to stop at once: expired, cancelled or preempted."""
     drain: bool = False
-    """Ask for no more work; finish what runs."""
+    """Request no more work; finish the running jobs."""
 
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played; returned: given back unfinished (drained, preempted, cancelled); failed: infrastructure (ended
-from outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions; the same as
-failed."""
+"""done: played. returned: given back unfinished (drained, preempted, cancelled). failed: infrastructure (ended from
+outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions; the
+same as failed."""
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of one lease."""
+    """The result of one lease."""
 
     lease_id: Word
     job_id: Word
@@ -197,18 +201,18 @@ class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     episodes: Many[EpisodeOutcome] = ()
     """In the job's order; empty unless `done`."""
     packed: BlobRef | None = None
-    """`codec.pack_outcomes` of the episodes, uploaded before, where they are too large for a message."""
+    """`codec.pack_outcomes` of the episodes, uploaded beforehand, when they are too large for a message."""
     error: Text = ""
     """For operators; never shown to an agent."""
     begun: BlobRef | None = None
-    """Of a hidden job that was not finished: what its policy has returned, and how it has failed, for `Job.begun` of the next
-    attempt. Bytes that workers alone read."""
+    """Of an unfinished hidden job: the actions that its policy has returned and its failures, for `Job.begun` of the
+    next attempt. Only workers read these bytes."""
     limit_verdict: bool = False
-    """Whether that tells of a failure by a limit."""
+    """Whether `begun` contains a failure by a limit."""
 
 
 class ReportResults(Message, frozen=True, kw_only=True, tag="done"):
-    """Results. Answered once they are durable; sending the same again is safe."""
+    """Results of finished leases. Answered once they are durable; safe to send again."""
 
     worker: Word
     session: Word
@@ -216,33 +220,33 @@ class ReportResults(Message, frozen=True, kw_only=True, tag="done"):
 
 
 class ResultsReported(Message, frozen=True, kw_only=True, tag="done_reply"):
-    """Every result of the request was taken (committed, compared, or found to be of a closed job)."""
+    """Every result of the request was handled: committed, compared, or found to belong to a closed job."""
 
     n: Int
 
 
 class BlobPut(Message, frozen=True, kw_only=True, tag="blob_put"):
-    """One chunk; chunks of a blob go in order, each answered before the next."""
+    """One chunk of a blob. A blob's chunks are sent in order, each after the reply to the one before."""
 
     sender: Word
-    """Worker's session or run id: whose right to write is checked."""
+    """The worker's session, or the run id; its right to write is checked."""
     token: Word
     digest: Word
     size: Int
-    """Bytes of the whole blob."""
+    """Size of the whole blob, bytes."""
     offset: Int
     data: Bytes
 
 
 class BlobAck(Message, frozen=True, kw_only=True, tag="blob_ack"):
-    """How far a blob has come: the next chunk begins there."""
+    """How much of a blob has arrived; the next chunk starts there."""
 
     have: Int
-    """Bytes that the receiver has; equal to `size` when it is stored (also when it was already there)."""
+    """Bytes that the receiver has; equal to `size` once the blob is stored (also if it was stored already)."""
 
 
 class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
-    """One chunk of a stored blob."""
+    """Requests one chunk of a stored blob."""
 
     sender: Word
     token: Word
@@ -251,7 +255,7 @@ class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
 
 
 class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
-    """The answer to `BlobGet`: the bytes from its offset on, and the size of the whole."""
+    """The reply to `BlobGet`: the bytes from its offset on, and the size of the whole blob."""
 
     size: Int
     data: Bytes
