@@ -1,6 +1,6 @@
-"""What every room of evopolicy shares: wire messages, keys, transport, bundles, trajectories, the catalogue.
+"""Code that every room of evopolicy shares: wire messages, keys, transport, bundles, trajectories, the catalogue.
 
-Imports none of the other rooms and no simulator, so that an agent's host can install it alone.
+It imports none of the other rooms and no simulator, so that an agent's host can install it alone.
 """
 
 __version__ = "0.1.0"

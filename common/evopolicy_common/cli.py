@@ -1,6 +1,6 @@
-"""What all commands share: how a cluster is named, logging to stderr, and errors of ours as one line and an exit code.
+"""Shared by all commands: options that name a cluster, logging to stderr, and our errors as one line and an exit code.
 
-Help and completion import this: what is large, or needed for work only, is imported where it is used.
+Help and completion import this module, so large modules are imported where they are used.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ CredentialsFile = Annotated[
         help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
     ),
 ]
-"""How an operator's command finds its cluster."""
+"""Options by which an operator's command finds its cluster."""
 
 USAGE_ERROR = 2
 FAILURE = 1
 
 
 class _Stderr:
-    """Where log lines go. One that cannot be written (disk full, reader gone) is lost, and stops nothing."""
+    """Stream for log lines. Lines that cannot be written (disk full, reader gone) are lost without an error."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError, ValueError):
@@ -54,7 +54,7 @@ class _Stderr:
 
 
 def bytes_text(n: float) -> str:
-    """A number of bytes as people read it, such as `3.4 GiB`."""
+    """Formats a number of bytes for people, such as `3.4 GiB`."""
     for unit in ("B", "KiB", "MiB", "GiB"):
         if n < 1024:
             return f"{n:.0f} {unit}" if unit == "B" else f"{n:.1f} {unit}"
@@ -63,7 +63,8 @@ def bytes_text(n: float) -> str:
 
 
 def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    """What a policy or an agent said may stand in any of them; JSON lines escape it by themselves."""
+    """Removes unprintable characters: any value may contain text of a policy or an agent. JSON lines escape it
+    themselves."""
     for name, value in event.items():
         if isinstance(value, str):
             event[name] = harmless(value)
@@ -71,7 +72,7 @@ def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> Mutabl
 
 
 def setup_logging(level: str = "info") -> None:
-    """Structured logs on stderr: for people on a terminal, JSON lines otherwise."""
+    """Configures structured logs on stderr: readable on a terminal, JSON lines otherwise."""
     import structlog
 
     terminal = sys.stderr.isatty()
@@ -91,7 +92,8 @@ def setup_logging(level: str = "info") -> None:
 
 
 def setup_notices() -> None:
-    """For commands of people and scripts: warnings as plain lines on stderr, so that stdout holds results only."""
+    """For interactive commands and scripts: prints warnings as plain lines on stderr, so that stdout holds results
+    only."""
     import structlog
 
     def plain(_: Any, __: str, event: Any) -> str:
@@ -113,14 +115,14 @@ def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
 
 
 def code_of(error: ConfigError | DamagedStoreError) -> int:
-    """What a program that cannot begin ends with: it is not started again with wrong options, or on a damaged store."""
+    """Exit code of a program that cannot start: one with wrong options or a damaged store is not restarted."""
     return FAILURE if isinstance(error, MachineError) else USAGE_ERROR
 
 
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line: exit code 2 for wrong options and files, 1 for what the machine refuses and for what
-    went wrong later."""
+    """Turns our errors into one line and an exit code: 2 for wrong options and files, 1 for what the machine refuses
+    and for later failures."""
     try:
         yield
     except (ConfigError, DamagedStoreError) as error:
@@ -128,7 +130,7 @@ def fail_on_our_errors() -> Iterator[None]:
     except EvopolicyError as error:
         fail(str(error), FAILURE)
     except OSError as error:
-        # A net below the checks that come first: what the machine refuses later is told, too.
+        # Fallback for what the machine refuses after the preflight checks.
         text = explained(error)
         if text is None:
             raise
@@ -145,7 +147,7 @@ def fail_on_our_errors() -> Iterator[None]:
 
 
 def run_to_end(work: Coroutine[Any, Any, T]) -> T:
-    """Runs it to its end; SIGTERM, which cancels it, ends the command as Ctrl-C does."""
+    """Runs `work` to its end; SIGTERM cancels it and ends the command as Ctrl-C does."""
     import asyncio
 
     try:
@@ -155,10 +157,10 @@ def run_to_end(work: Coroutine[Any, Any, T]) -> T:
 
 
 def end_on_sigterm() -> None:
-    """From now on SIGTERM cancels the task that calls this: a command ends as with Ctrl-C, in order."""
+    """Makes SIGTERM cancel the calling task, so that the command ends in order, as with Ctrl-C."""
     import asyncio
 
     main = asyncio.current_task()
     assert main is not None
-    with contextlib.suppress(RuntimeError, ValueError):  # not on the main thread: there are no signals here
+    with contextlib.suppress(RuntimeError, ValueError):  # no signal handlers outside the main thread
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)

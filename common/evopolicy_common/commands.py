@@ -1,4 +1,4 @@
-"""The frame of every command: help in groups, `--version`, shell completion, usage errors, and what is not installed."""
+"""The frame of every command: grouped help, `--version`, shell completion, usage errors, and missing extras."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_no
 from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.terminal import end_without_reader, open_streams, say
 
-# typer brings click with it, under a name of its own in newer versions: only its public exceptions lead there.
+# typer ships click, in newer versions under another name; only its public exceptions lead to `ClickException`.
 _ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "PATH", "directory": "DIR"}
-"""How values are shown in help, by the type's name."""
+"""How help shows values, by the name of their type."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -42,11 +42,11 @@ Version = Annotated[
         show_default=False,
     ),
 ]
-"""Of each program's first level."""
+"""Option of each program's top level."""
 
 
 class _Help:
-    """Options under the heading of their `rich_help_panel`, in plain text: it folds on narrow terminals, and pipes well."""
+    """Lists options under their `rich_help_panel` in plain text, which folds on narrow terminals and suits pipes."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         groups: dict[str, list[tuple[str, str]]] = {}
@@ -57,7 +57,7 @@ class _Help:
             usual = "Options" if param.param_type_name == "option" else "Arguments"
             name = getattr(param, "rich_help_panel", None) or usual
             groups.setdefault(name, []).append((_value_names(record[0]), record[1]))
-        if "Options" in groups:  # last: where there are groups, they tell more
+        if "Options" in groups:  # last: grouped options are more specific
             others = groups.pop("Options")
             groups["Other options" if groups.keys() - {"Arguments"} else "Options"] = others
         for name, records in groups.items():
@@ -67,16 +67,16 @@ class _Help:
             self.format_commands(ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
-        setup_notices()  # not before: help and completion tell nothing, and do without structlog
+        setup_notices()  # not earlier: help and completion log nothing and do not need structlog
         return super().invoke(ctx)  # type: ignore[misc]
 
 
 class Command(_Help, TyperCommand):
-    """A command whose help is grouped."""
+    """A command with grouped help."""
 
 
 class Group(_Help, TyperGroup):
-    """A group of commands that, without one, shows its help and ends as wrong usage does."""
+    """A command group; without a subcommand it shows its help and exits with a usage error."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         rows = self.command_rows(ctx)
@@ -85,9 +85,9 @@ class Group(_Help, TyperGroup):
                 formatter.write_dl(rows)
 
     def command_rows(self, ctx: Any) -> list[tuple[str, str]]:
-        """Names of the commands, with what each does."""
+        """Names of the commands, with a short help text each."""
         shown = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        # Whole sentences, folded: typer would cut them to one line.
+        # Whole sentences, folded: typer would truncate them to one line.
         return [(name, each.get_short_help_str(1000)) for name, each in shown if each and not each.hidden]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -98,7 +98,7 @@ class Group(_Help, TyperGroup):
 
 
 class App(typer.Typer):
-    """A `typer.Typer` of ours: `-h`, plain help in groups, and no traceback of typer's."""
+    """Our `typer.Typer`: `-h`, plain grouped help, and no traceback formatting by typer."""
 
     def __init__(self, **options: Any) -> None:
         usual = {
@@ -110,7 +110,7 @@ class App(typer.Typer):
         super().__init__(**(usual | options))
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Function], Function]:
-        """As typer's; the command's help is grouped and knows `-h`."""
+        """As typer's; the command has grouped help and accepts `-h`."""
         usual: dict[str, Any] = {"cls": Command, "context_settings": _SETTINGS}
         return super().command(name, **(usual | options))
 
@@ -131,7 +131,7 @@ def run_app(app: typer.Typer) -> NoReturn:
 
 @contextlib.contextmanager
 def needed_extras() -> Iterator[None]:
-    """Ends the command with the extra to install where a module of one is missing inside the `with`."""
+    """Ends the command, and names the extra to install, when the body misses a module of an extra."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -142,7 +142,7 @@ def needed_extras() -> Iterator[None]:
 
 
 def _value_names(text: str) -> str:
-    """`--runs <path>` as `--runs PATH`, `--env <list[str]>` as `--env TEXT`; choices stay as they are."""
+    """Rewrites `--runs <path>` as `--runs PATH` and `--env <list[str]>` as `--env TEXT`; choices stay unchanged."""
     return re.sub(
         r"<(?:list\[)?(\w+)(?: range)?\]?>", lambda found: _METAVARS.get(found[1].lower(), found[0]), text
     )

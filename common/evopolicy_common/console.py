@@ -1,6 +1,6 @@
-"""Tables, live views and progress for people, made with rich. `terminal` has the rules of all that is printed.
+"""Tables, live views and progress bars, made with rich. The rules for all output are in `terminal`.
 
-A module of its own, as rich is large and most of what commands print needs none of it.
+This is a module of its own because rich is large and most commands do not need it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from rich.text import Text
 from evopolicy_common.terminal import harmless
 
 WIDTH = 200
-"""Columns where there is no terminal: a table that is cut off is worse than a long line."""
+"""Columns without a terminal: a truncated table is worse than a long line."""
 
 
 class Terminal(rich.console.Console):
-    """A console that takes texts as they are: no markup, no emoji codes, nothing that is not printable."""
+    """A console that prints texts literally: no markup, no emoji codes, no unprintable characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
@@ -30,19 +30,19 @@ class Terminal(rich.console.Console):
         return super().render_str(harmless(text), **options)
 
     def on_broken_pipe(self) -> None:
-        # Of stderr: the results are on stdout, which ends the program by itself.
+        # Concerns stderr: results are on stdout, which ends the program by itself.
         self.quiet = True
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
-            # Control segments are rich's own: they move the cursor of a live table.
+            # Control segments come from rich itself: they move the cursor of a live table.
             yield segment if segment.control else segment._replace(text=harmless(segment.text))
 
 
 def table(*headings: str, right: Collection[str] = ()) -> Table:
-    """A table that cuts nothing: where the terminal is narrow, cells fold, as other commands need what stands in them.
+    """A table without truncation: on narrow terminals cells fold, because other commands need their full content.
 
-    `right`: headings of columns that are aligned at the right.
+    `right`: headings of right-aligned columns.
     """
     made = Table(box=None, pad_edge=False)
     for heading in headings:
@@ -51,6 +51,6 @@ def table(*headings: str, right: Collection[str] = ()) -> Table:
 
 
 def terminal(*, stderr: bool = False) -> Terminal:
-    """For people: as wide as their terminal, and `WIDTH` columns where there is none."""
+    """A console as wide as the terminal, or `WIDTH` columns without one."""
     found = Terminal(stderr=stderr)
     return found if found.is_terminal else Terminal(stderr=stderr, width=WIDTH)

@@ -1,7 +1,7 @@
-"""Errors, grouped by whose fault they are.
+"""Errors, grouped by cause.
 
-A message says what was wrong, with the value, and what to do about it. `RequestError` may be shown to an agent;
-the others are for operators and never cross the visibility boundary.
+A message states the problem, the value, and the remedy. `RequestError` may be shown to an agent; the others are for
+operators and never reach an agent.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import msgspec
 from evopolicy_common.wire.refusals import Refusal
 
 DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-"""What msgspec raises for bytes that are not what was expected: malformed or of another shape, text that is not UTF-8
-inside, or nested without end."""
+"""Errors that msgspec raises for malformed or mismatching input: another shape, text that is not UTF-8, nesting
+without end."""
 
 
 class EvopolicyError(Exception):
-    """Base of every error this project raises on purpose."""
+    """Base class of every error that this project raises on purpose."""
 
 
 class RequestError(EvopolicyError):
-    """The agent's or operator's request cannot be served as it is; nothing was changed by it."""
+    """The agent's or operator's request cannot be served as it is; it changed nothing."""
 
     def __init__(self, status: str, message: str) -> None:
         super().__init__(message)
@@ -33,14 +33,14 @@ class ConfigError(EvopolicyError):
 
 
 class MachineError(ConfigError):
-    """The machine refuses what is needed, as a full or read-only disk does, and may give it later.
+    """The machine refuses a resource that it may provide later, as with a full or read-only disk.
 
-    Exit code 1, not 2: whoever keeps the program up starts it again.
+    Exit code 1, not 2, so that a process manager restarts the program.
     """
 
 
 class BundleError(EvopolicyError):
-    """A policy folder cannot be snapshot, or stored bytes are not the bundle their digest names."""
+    """A snapshot of a policy folder cannot be made, or stored bytes do not match the bundle's digest."""
 
 
 class ProtocolError(EvopolicyError):
@@ -48,11 +48,11 @@ class ProtocolError(EvopolicyError):
 
 
 class TransportError(EvopolicyError):
-    """The other side could not be reached, or did not answer in time; asking again is safe."""
+    """The other side could not be reached, or did not reply in time; the request may be sent again."""
 
 
 class RefusedError(EvopolicyError):
-    """The coordinator answered, and refused: a wrong token, an unknown run, a closed run."""
+    """The coordinator refused the request: a wrong token, an unknown run, a closed run."""
 
     def __init__(self, status: Refusal, message: str) -> None:
         super().__init__(f"{message} ({status})")
@@ -61,24 +61,24 @@ class RefusedError(EvopolicyError):
 
 
 class SandboxError(EvopolicyError):
-    """The sandbox itself failed (not the policy in it): infrastructure, retried and never charged."""
+    """The sandbox itself failed, not the policy in it. This is an infrastructure failure: retried and never charged."""
 
 
 class WorkerError(EvopolicyError):
-    """A worker, or one of its slots, was lost or cannot do what it was asked: infrastructure, never charged."""
+    """A worker or one of its slots was lost, or cannot do its job. This is an infrastructure failure, never charged."""
 
 
 class SlotDiedError(WorkerError):
-    """A slot's processes were ended from outside while its supervisor lives."""
+    """A slot's processes were ended from outside while its supervisor is alive."""
 
 
 class PartFailedError(EvopolicyError):
-    """A part of a process met what it does not know how to go on from: the process ends with this, to be started again."""
+    """A part of a process met an error that it cannot handle; the process ends with it, to be restarted."""
 
 
 class StorageError(EvopolicyError):
-    """The store could not persist or read back; what was not persisted did not happen."""
+    """The store could not persist or read data; nothing unpersisted takes effect."""
 
 
 class DamagedStoreError(StorageError):
-    """What is stored cannot be read, or contradicts itself: trying again does not help."""
+    """Stored data cannot be read or contradict each other; a retry does not help."""

@@ -1,7 +1,8 @@
-"""Which Python packages simulate: only a worker's environment process may have them.
+"""Python packages that simulate: only a worker's environment process may have them.
 
-With one of them a policy could look ahead, and an agent could train outside its budget. Policies' sandboxes and agents'
-jails do not show them.
+With one of them a policy could look ahead, and an agent could train outside its budget. The sandboxes of policies and
+the
+jails of agents hide them.
 """
 
 from __future__ import annotations
@@ -21,4 +22,4 @@ SIMULATORS = (
     *("pygame", "ale_py", "miniworld", "mo_gymnasium", "metaworld", "browsergym", "miniwob", "pettingzoo"),
     *("dm_control", "shimmy", "pybullet", "pybullet_envs"),
 )
-"""Names to import, or of their files in a Python installation."""
+"""Import names, or names of their files in a Python installation."""

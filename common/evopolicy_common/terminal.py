@@ -1,8 +1,9 @@
-"""Everything that a command prints goes through here.
+"""All output of commands goes through this module.
 
 Texts of policies, agents, exceptions and file names reach a terminal. An escape sequence in one of them could clear the
-screen, forge a link or write over what stands there; square brackets could be taken for markup. So no markup is read, and
-every character that is not printable is shown as U+FFFD. `tests/unit/test_rooms.py` holds the rooms to it.
+screen, forge a link or overwrite earlier output; square brackets could be taken for markup. So no markup is
+interpreted, and
+every unprintable character is shown as U+FFFD. `tests/unit/test_rooms.py` enforces this in all rooms.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ if TYPE_CHECKING:
 
 _ODD = re.compile(r"[^\n\t -~]")
 READER_GONE = 128 + signal.SIGPIPE
-"""Exit status of a program that nobody reads any more, as a shell tells it."""
+"""Exit status of a program whose reader is gone, as a shell reports it."""
 
 
 def harmless(text: str) -> str:
-    """`text` with U+FFFD for every character that is not printable; newlines and tabs stay."""
+    """Returns `text` with U+FFFD for every unprintable character; newlines and tabs stay."""
     return _ODD.sub(_shown, text)
 
 
 def one_line(text: str) -> str:
-    """As `harmless`, with spaces for newlines and tabs: nothing in it can pass for a further line."""
+    """As `harmless`, with spaces for newlines and tabs, so that no part of `text` can look like another line."""
     return harmless(text.replace("\n", " ").replace("\t", " "))
 
 
 def number(value: float | None) -> str:
-    """For a table: four digits, or a dash for None."""
+    """Formats a number for a table: four digits, or a dash for None."""
     return "–" if value is None else f"{value:.4g}"
 
 
@@ -47,7 +48,7 @@ def _shown(found: re.Match[str]) -> str:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Prints `text` and a newline on stdout, or on stderr, where it is lost if nobody reads that any more."""
+    """Prints `text` and a newline on stdout, or on stderr, where the output is dropped when the reader is gone."""
     with contextlib.suppress(BrokenPipeError) if err else contextlib.nullcontext():
         print(harmless(text), file=sys.stderr if err else sys.stdout, flush=True)
 
@@ -59,14 +60,14 @@ def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
 
 
 def say_json(value: Any, *, indent: bool = True) -> None:
-    """Prints `value` as JSON on stdout: over several lines, or on one. Characters that are not printable are escaped."""
+    """Prints `value` as JSON on stdout, indented or on one line. Unprintable characters are escaped."""
     import msgspec
 
     try:
         data = msgspec.json.encode(value)
         text = (msgspec.json.format(data, indent=2) if indent else data).decode()
     except UnicodeEncodeError:
-        # A file name that is no UTF-8 is in it.
+        # It contains a file name that is not UTF-8.
         text = json.dumps(msgspec.to_builtins(value), indent=2 if indent else None)
     print(_ODD.sub(_escaped, text), flush=True)
 
@@ -76,7 +77,7 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class _WatchedStdout(io.FileIO):
-    """Stdout that ends the program when its reader is gone: quietly, in order, and as SIGPIPE would have it."""
+    """Stdout that exits the program quietly and in order when its reader is gone, with the exit status of SIGPIPE."""
 
     def write(self, data: Buffer, /) -> int:
         try:
@@ -88,9 +89,9 @@ class _WatchedStdout(io.FileIO):
 
 
 def open_streams() -> None:
-    """Gives a program that was started without stdin, stdout or stderr (`2>&-`) ones that lead nowhere.
+    """Opens `/dev/null` for missing stdin, stdout or stderr (`2>&-`).
 
-    Else the next file that is opened, a database perhaps, gets what is written there.
+    Otherwise the next file that is opened, perhaps a database, would receive that output.
     """
     for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
@@ -101,11 +102,11 @@ def open_streams() -> None:
 
 
 def end_without_reader() -> None:
-    """From now on the program ends with `READER_GONE` when it prints what nobody reads, as in `evopolicy status | head -1`."""
+    """Makes the program exit with `READER_GONE` when it prints to a closed pipe, as in `evopolicy status | head -1`."""
     stream = sys.stdout
     if not isinstance(stream, io.TextIOWrapper):
-        return  # closed, or not ours
-    # The loop that a task ends with it is as good as told: asyncio need not complain that nobody looked at the task.
+        return  # closed, or replaced by someone else
+    # SystemExit ends the loop, so asyncio need not report that nobody retrieved the task's exception.
     logging.getLogger("asyncio").addFilter(_is_no_exit)
     raw = _WatchedStdout(stream.fileno(), "wb", closefd=False)
     sys.stdout = io.TextIOWrapper(

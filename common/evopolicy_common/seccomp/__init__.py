@@ -1,6 +1,7 @@
-"""Seccomp programs: the instructions of classic BPF that filters of system calls are made of, put together by hand.
+"""Seccomp programs: assembles filters of system calls from classic BPF instructions.
 
-A filter begins with `program`, which looks at the processor and loads the number of the call; what follows ends in verdicts.
+A filter starts with `program`, which checks the architecture and loads the call's number; the body returns the
+verdicts.
 """
 
 from __future__ import annotations
@@ -9,14 +10,14 @@ import struct
 from collections.abc import Iterable
 
 Instruction = tuple[int, int, int, int]
-"""Opcode, how many instructions to skip when it holds and when it does not, and a number."""
+"""Opcode, number of instructions to skip when the condition holds and when it does not, and an operand."""
 
 LOAD, AND = 0x20, 0x54
 JUMP_EQUAL, JUMP_AT_LEAST = 0x15, 0x35
 RETURN = 0x06
 KILL_PROCESS, ERRNO, ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
 AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-"""The kernel's numbers of the processors, by `platform.machine()`: those that there are tables of calls for."""
+"""The kernel's architecture numbers by `platform.machine()`, for the architectures with tables of calls."""
 _X32_BIT = 0x40000000
 _NUMBER, _ARCHITECTURE = 0, 4
 
@@ -25,9 +26,10 @@ KILLED: Instruction = (RETURN, 0, 0, KILL_PROCESS)
 
 
 def program(machine: str, otherwise: Instruction, body: Iterable[Instruction]) -> bytes:
-    """A whole filter, 8 bytes an instruction: `otherwise` for calls of another processor's kind, `body` for the others.
+    """A complete filter, 8 bytes an instruction: `otherwise` applies to calls of another architecture, `body` to the
+    rest.
 
-    `body` begins with the number of the call loaded.
+    At the start of `body` the call's number is loaded.
     """
     head = [
         (LOAD, 0, 0, _ARCHITECTURE),
@@ -46,12 +48,12 @@ def argument(index: int) -> int:
 
 
 def refuse(number: int) -> Instruction:
-    """The call fails with this errno; with 0 it is taken and ignored."""
+    """Makes the call fail with this errno; with 0 the call is accepted and ignored."""
     return (RETURN, 0, 0, ERRNO | number)
 
 
 def one_of(index: int, allowed: Iterable[int], *otherwise: Instruction) -> list[Instruction]:
-    """Allows a call whose argument `index` is one of these numbers; else `otherwise`."""
+    """Allows a call whose argument `index` is one of `allowed`; runs `otherwise` for other values."""
     block: list[Instruction] = [(LOAD, 0, 0, argument(index))]
     for value in allowed:
         block += [(JUMP_EQUAL, 0, 1, value), ALLOWED]

@@ -1,4 +1,4 @@
-"""Numbers of the system calls that the filters name, by processor (from the kernel's unistd headers)."""
+"""Numbers of the system calls that the filters name, by architecture (from the kernel's unistd headers)."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ REFUSED: dict[str, dict[str, int]] = {
     "x86_64": _parsed(_X86_64_REFUSED),
     "aarch64": _parsed(_AARCH64_REFUSED),
 }
-"""What no environment process needs and namespaces do not divide, or what makes namespaces."""
+"""Calls that create namespaces, and calls that no environment process needs and namespaces do not isolate."""
 REACHING_OUT: dict[str, dict[str, int]] = {
     "x86_64": _parsed("kill=62 tkill=200 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 pidfd_open=434"),
     "aarch64": _parsed("kill=129 tkill=130 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 pidfd_open=434"),
 }
-"""What reaches other processes of the same user."""
+"""Calls that affect other processes of the same user."""
 SOCKET = {"x86_64": 41, "aarch64": 198}
 SECCOMP = {"x86_64": 317, "aarch64": 277}

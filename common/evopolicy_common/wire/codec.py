@@ -1,8 +1,10 @@
-"""Messages to bytes and back: msgpack by msgspec, one decoder for each speaker's union.
+"""Encodes and decodes messages: msgpack by msgspec, with one decoder for each client's union.
 
-A decoder checks types, required fields and the bounds of `messages.bounds`: how long texts and lists are, how deep plain
-values nest, that numbers are finite. `encode` holds what it makes to the same. Unknown fields are skipped, so an older peer
-may be told more than it knows.
+A decoder checks types, required fields and the bounds of `messages.bounds`: lengths of texts and lists, nesting of
+plain
+values, finite numbers. `encode` applies the same checks to its output. Unknown fields are skipped, so a newer peer may
+send
+fields that an older one does not know.
 """
 
 from __future__ import annotations
@@ -21,25 +23,26 @@ from evopolicy_common.messages.operator import OperatorReply, OperatorRequest
 from evopolicy_common.messages.worker import Message, WorkerReply, WorkerRequest
 
 WIRE_VERSION = 1
-"""Raised when a change is not understood by older peers; the first message of a session carries it."""
+"""Incremented when older peers would not understand a change; the first message of a session carries it."""
 
 CHUNK_BYTES = 256 * 1024
-"""Payload of one blob chunk: as large as a page of results, so that no chunk holds up its lane longer than one."""
+"""Payload of one blob chunk, bytes: as large as a page of results, so that a chunk occupies its lane no longer than
+a page."""
 
 INLINE_BYTES = 24 * 1024
-"""A blob up to this size travels inside the message that names it."""
+"""A blob up to this many bytes is sent inside the message that refers to it."""
 
 INLINE_BEGUN_BYTES = 4096
-"""The same of what a job goes on from: one answer may bring hundreds of jobs."""
+"""The same limit for `JobResult.begun` and `Job.begun`, bytes: one reply may carry hundreds of jobs."""
 
 MAX_MESSAGE_BYTES = (16 << 20) - (64 << 10)
-"""No longer message is made or read. Zenoh's own limit, beyond which it drops a message without a word, is 16 MiB."""
+"""Largest message that is encoded or decoded, bytes. Zenoh silently drops messages beyond its own limit, 16 MiB."""
 
 MAX_BLOB_BYTES = 1 << 30
-"""Of one blob."""
+"""Largest blob, bytes."""
 
 MAX_PACKED_BYTES = 256 << 20
-"""Of a job's outcomes packed as one blob; of what a job goes on from, too."""
+"""Largest blob of a job's packed outcomes, bytes; also the limit for `JobResult.begun`."""
 
 _encoder = msgspec.msgpack.Encoder()
 worker_requests: msgspec.msgpack.Decoder[WorkerRequest] = msgspec.msgpack.Decoder(WorkerRequest)
@@ -54,7 +57,8 @@ T = TypeVar("T")
 
 
 def encode(message: Message) -> bytes:
-    """The message's bytes; ProtocolError when its peer would refuse them, or the transport drop them."""
+    """The bytes of `message`. Raises ProtocolError when its peer would refuse them, or the transport would drop
+    them."""
     try:
         data = _encoder.encode(message)
         _decoder_of(type(message)).decode(data)
@@ -69,7 +73,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(decoder: msgspec.msgpack.Decoder[T], data: bytes) -> T:
-    """The message in `data`; ProtocolError when it is none that `decoder` knows."""
+    """The message in `data`. Raises ProtocolError when `decoder` cannot read it."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise ProtocolError(f"a message of {len(data):,} bytes; {MAX_MESSAGE_BYTES:,} are the limit")
     try:
@@ -86,7 +90,7 @@ _REQUESTS = frozenset(get_args(WorkerRequest | GatewayRequest | OperatorRequest)
 
 
 def _check_plain(message: object) -> None:
-    """Of requests only: the coordinator's answers, of which there are many more, are made of what it has checked."""
+    """Checks requests only: the coordinator's replies are far more numerous, and it builds them from checked data."""
     if isinstance(message, msgspec.Struct) and type(message) in _REQUESTS:
         for part in bounds.plain_parts(message):
             bounds.check_plain(part)
@@ -98,7 +102,7 @@ def _decoder_of(kind: type[Message]) -> msgspec.msgpack.Decoder[Message]:
 
 
 def pack_outcomes(outcomes: Sequence[EpisodeOutcome]) -> bytes:
-    """Outcomes as one blob; ProtocolError when they are too many bytes."""
+    """Encodes outcomes as one blob. Raises ProtocolError when it is too large."""
     data = _encoder.encode(outcomes)
     if len(data) > MAX_PACKED_BYTES:
         raise ProtocolError(
@@ -108,7 +112,7 @@ def pack_outcomes(outcomes: Sequence[EpisodeOutcome]) -> bytes:
 
 
 def unpack_outcomes(data: bytes) -> tuple[EpisodeOutcome, ...]:
-    """What `pack_outcomes` was given; ProtocolError when `data` is not that."""
+    """Decodes the outcomes of `pack_outcomes`. Raises ProtocolError when `data` is something else."""
     if len(data) > MAX_PACKED_BYTES:
         raise ProtocolError(f"outcomes of {len(data):,} bytes; {MAX_PACKED_BYTES:,} are the limit")
     try:

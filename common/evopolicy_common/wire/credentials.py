@@ -1,13 +1,14 @@
-"""Who may speak to a cluster, as files: `STATE/credentials/<role>.json`, mode 0600, never an argument or a variable.
+"""Credentials for a cluster, as files: `STATE/credentials/<role>.json`, mode 0600, never an argument or a variable.
 
-The coordinator writes them for its own machine. So that commands there find the cluster they are pointed at, it also
-leaves a copy's path under the user's own registry folder, by endpoint; a command given `--connect ENDPOINT` and no
-credentials file looks there.
+The coordinator writes them for its own machine. It also records their folder in the user's registry folder, by
+endpoint:
+a command with `--connect ENDPOINT` and without a credentials file looks there.
 
-Another machine has a folder of its own, from `evopolicy-coordinator certs issue`: such a file beside its certificates,
-which it names by paths relative to itself. Wherever credentials are named, the file or its folder may be.
+Another machine has a folder from `evopolicy-coordinator certs issue`: a credentials file beside its certificates, which
+it
+names by relative paths. Wherever credentials are named, the file or its folder may be given.
 
-Rule: tokens and results cross a network inside TLS only, unless the file says that its coordinator was started with
+Rule: tokens and results cross a network inside TLS only, unless the file states that its coordinator was started with
 `--insecure-tcp`.
 """
 
@@ -27,7 +28,7 @@ from evopolicy_common.records.blobs import digest_of, write_atomically
 
 Role = Literal["worker", "gateway", "operator"]
 MachineRole = Literal["worker", "gateway", "operator", "router"]
-"""What a machine's certificate is issued for: a role, or a router before the coordinator."""
+"""The subject of a machine's certificate: a role, or a router before the coordinator."""
 
 
 class TlsFiles(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,7 +40,7 @@ class TlsFiles(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What one role needs to reach a cluster and to be let in."""
+    """Everything one role needs to connect to a cluster and be admitted."""
 
     cluster: str
     role: Role
@@ -51,35 +52,36 @@ class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Worker: join token. Operator: operator token. Gateway: the run's capability; empty in the role's own file."""
     tls: TlsFiles | None = None
     insecure_tcp: bool = False
-    """Whether `tcp/` may be spoken beyond this machine: the coordinator's `--insecure-tcp`, which travels with its files."""
+    """Whether `tcp/` is permitted beyond this machine: the coordinator's `--insecure-tcp`, recorded in its files."""
 
 
 def default_state_dir() -> Path:
-    """The coordinator's state folder when none is named: `$EVOPOLICY_STATE` or one in the user's state home."""
+    """The coordinator's default state folder: `$EVOPOLICY_STATE`, or one in the user's state home."""
     named = os.environ.get("EVOPOLICY_STATE")
     return Path(named) if named else state_home() / "coordinator"
 
 
 def local_state_dir() -> Path:
-    """The state folder that clusters of a command's own share (`evopolicy local`, `try`, …) when none is named."""
+    """The default state folder of clusters that commands start themselves (`evopolicy local`, `try`, …)."""
     return state_home() / "local"
 
 
 def registry_dir() -> Path:
-    """Where this user's clusters on this machine are found by endpoint."""
+    """Folder in which this user's commands find this machine's clusters by endpoint."""
     return state_home() / "clusters"
 
 
 def write(credentials: Credentials, path: Path) -> None:
-    """Writes the file with mode 0600, replacing what was there."""
+    """Writes the file with mode 0600, replacing an existing one."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     write_atomically(path, msgspec.json.format(msgspec.json.encode(credentials)), mode=0o600)
 
 
 def read(path: Path) -> Credentials:
-    """The credentials in `path`, its certificates by absolute paths.
+    """The credentials in `path`, with absolute paths of certificates.
 
-    ConfigError when it, or a certificate, is missing, it is malformed, or it or its private key is readable by others.
+    Raises ConfigError when the file or a certificate is missing, the file is malformed, or others can read it or its
+    private key.
     """
     data = _read_private(path)
     try:
@@ -102,14 +104,14 @@ def read(path: Path) -> Credentials:
 
 
 def at(credentials: Credentials, connect: tuple[str, ...]) -> Credentials:
-    """The same with `connect`, if it names any, as its endpoints. ConfigError when these may not be spoken to so."""
+    """The same credentials with the endpoints `connect`, if any. Raises ConfigError as `check_endpoints` does."""
     found = msgspec.structs.replace(credentials, endpoints=connect) if connect else credentials
     check_endpoints(found)
     return found
 
 
 def check_endpoints(credentials: Credentials) -> None:
-    """ConfigError for an endpoint that would carry secrets in the clear, or that needs certificates which are not there."""
+    """Raises ConfigError for an endpoint that would carry secrets unencrypted, or that needs missing certificates."""
     for endpoint in credentials.endpoints:
         protocol = endpoint.partition("/")[0]
         if protocol == "tls":
@@ -126,7 +128,7 @@ def check_endpoints(credentials: Credentials) -> None:
 
 
 def stays_on_machine(endpoint: str) -> bool:
-    """Whether what is sent to a Zenoh endpoint cannot leave this machine: a unix socket, or tcp to a loopback address."""
+    """Whether data sent to a Zenoh endpoint stay on this machine: a unix socket, or tcp to a loopback address."""
     protocol, _, rest = endpoint.partition("/")
     if protocol != "tcp":
         return protocol == "unixsock-stream"
@@ -138,7 +140,7 @@ def stays_on_machine(endpoint: str) -> bool:
 
 
 def publish(endpoints: tuple[str, ...], folder: Path) -> None:
-    """Tells this user's commands that the credentials of these endpoints lie in `folder`."""
+    """Registers `folder` as the place of the credentials of these endpoints, for this user's commands."""
     registry = registry_dir()
     registry.mkdir(parents=True, exist_ok=True, mode=0o700)
     for endpoint in endpoints:
@@ -146,16 +148,17 @@ def publish(endpoints: tuple[str, ...], folder: Path) -> None:
 
 
 def withdraw(endpoints: tuple[str, ...]) -> None:
-    """Takes `publish` back; what is not there is no error."""
+    """Reverts `publish`; missing entries are no error."""
     for endpoint in endpoints:
         _registered(endpoint).unlink(missing_ok=True)
 
 
 def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) -> Credentials:
-    """The credentials that a command uses, with its `--connect` endpoints put in place of the file's.
+    """The credentials of a command, with its `--connect` endpoints in place of the file's.
 
-    Looks at `file` if one is named (or, when that is a folder, at the role's file in it), else at the registry for the
-    endpoints, else at the default state folder. ConfigError says where it looked and what to do.
+    Reads `file` if given (or, when that is a folder, the role's file in it), else the registry's entry for the
+    endpoints,
+    else the default state folder. Raises ConfigError that names the searched place and the remedy.
     """
     if file is not None and file.is_dir():
         held = ", ".join(sorted(path.stem for path in file.glob("*.json"))) or "none"
@@ -191,7 +194,7 @@ def _read_private(path: Path) -> bytes:
 
 
 def state_home() -> Path:
-    """Where this user's lasting files are that no command was told a place for."""
+    """Folder of this user's persistent files when a command is given no other."""
     home = os.environ.get("XDG_STATE_HOME")
     return (Path(home) if home else Path.home() / ".local" / "state") / "evopolicy"
 

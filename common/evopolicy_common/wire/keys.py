@@ -1,4 +1,4 @@
-"""Zenoh key expressions, all under `evopolicy/v1/<cluster>/`. Access control grants by these prefixes."""
+"""Zenoh key expressions, all under `evopolicy/v1/<cluster>/`. Access control grants rights by these prefixes."""
 
 from __future__ import annotations
 
@@ -9,42 +9,42 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 def valid_name(name: str) -> bool:
-    """Whether `name` may stand in a key: a cluster's, worker's or run's name."""
+    """Whether `name` is valid in a key: the name of a cluster, worker or run."""
     return _NAME.fullmatch(name) is not None
 
 
 def worker_key(cluster: str, verb: str) -> str:
-    """Where workers ask: `register`, `lease`, `beat`, `done`, `blob`."""
+    """Key of a worker's requests: `register`, `lease`, `beat`, `done`, `blob`."""
     return f"{_ROOT}/{cluster}/work/{verb}"
 
 
 def liveliness_key(cluster: str, worker: str) -> str:
-    """A worker's liveliness token: a hint to look at its leases now, never the truth."""
+    """Key of a worker's liveliness token: a hint to check its leases now, never a fact."""
     return f"{_ROOT}/{cluster}/worker/{worker}/live"
 
 
 def gateway_key(cluster: str, run: str, verb: str) -> str:
-    """Where the gateway of `run` asks: `open`, `state`, `submit`, `results`, `close`, `blob`."""
+    """Key of requests of the gateway of `run`: `open`, `permit`, `state`, `submit`, `results`, `close`, `blob`."""
     return f"{_ROOT}/{cluster}/gw/{run}/{verb}"
 
 
 def operator_key(cluster: str, verb: str) -> str:
-    """Where operators ask."""
+    """Key of operators' requests."""
     return f"{_ROOT}/{cluster}/ops/{verb}"
 
 
 def worker_expr(cluster: str) -> str:
-    """All that workers ask."""
+    """All keys of workers' requests."""
     return f"{_ROOT}/{cluster}/work/**"
 
 
 def gateway_expr(cluster: str) -> str:
-    """All that gateways of all runs ask."""
+    """All keys of requests of all runs' gateways."""
     return f"{_ROOT}/{cluster}/gw/**"
 
 
 def operator_expr(cluster: str) -> str:
-    """All that operators ask."""
+    """All keys of operators' requests."""
     return f"{_ROOT}/{cluster}/ops/**"
 
 

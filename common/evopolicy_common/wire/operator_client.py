@@ -1,4 +1,4 @@
-"""What an operator's commands ask the coordinator, whichever room they are of."""
+"""Requests of operators' commands to the coordinator, for all rooms."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ from evopolicy_common.wire.requests import operator_requests
 from evopolicy_common.wire.transport import Link
 
 WAIT_S = 3.0
-"""Of a long poll: so often a command hears what it waits for."""
+"""Duration of a long poll: the interval in which a command gets news."""
 TIMEOUT_S = 10.0
-"""Of what must be answered soon: TransportError when nobody does."""
+"""Timeout of requests with an immediate reply; TransportError after it."""
 _SENDER = "operator"
 
 
 class OperatorClient:
-    """One operator's link. RefusedError where the coordinator says no; a message's token is filled in."""
+    """One operator's link. Fills in the token of each message. Raises RefusedError where the coordinator refuses."""
 
     def __init__(self, link: Link) -> None:
         self._token = link.credentials.token
@@ -58,7 +58,7 @@ class OperatorClient:
     # The cluster.
 
     async def status(self) -> StatusReply:
-        """What the cluster is doing."""
+        """The cluster's status."""
         message = StatusRequest(token=self._token)
         return await self._requests.until_answered("status", message, StatusReply, timeout_s=TIMEOUT_S)
 
@@ -75,38 +75,38 @@ class OperatorClient:
                 return found
 
     async def approve(self, env: str, digest: str) -> None:
-        """Lets runs use an environment that does not ship, in that definition."""
+        """Lets runs use this definition of an environment that does not ship."""
         await self._done("approve", ApproveEnvironment(token=self._token, env=env, digest=digest))
 
     async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
         await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
 
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
-        """What there is for playing a finished run's episodes again."""
+        """What the cluster has for replaying a finished run's episodes."""
         asked = replace(message, token=self._token)
         return await self._requests.until_answered("describe", asked, EnvironmentState, timeout_s=TIMEOUT_S)
 
     # Runs.
 
     async def cancel(self, run: str) -> None:
-        """Ends a run as it is, without a score."""
+        """Ends a run without a score."""
         await self._done("cancel", CancelRun(token=self._token, run=run))
 
     async def agent_gone(self, run: str, boot_id: str = "") -> None:
-        """Ends the permit of a run's agent, which is no longer alive, or not on the kernel `boot_id`."""
+        """Ends the permit of a run's agent that is no longer alive, or no longer on the kernel `boot_id`."""
         await self._done("agent_gone", AgentGone(token=self._token, run=run, boot_id=boot_id))
 
     async def repin(self, run: str, fingerprint_class: str, reason: str) -> None:
-        """Lets a run go on with workers of another fingerprint class."""
+        """Lets a run continue with workers of another fingerprint class."""
         message = RepinRun(token=self._token, run=run, fingerprint_class=fingerprint_class, reason=reason)
         await self._done("repin", message)
 
     async def recorded(
         self, run: str, split: Split, submit_index: int, *, timeout_s: float | None = None
     ) -> AsyncIterator[EpisodeOutcome]:
-        """Outcomes of a finished run as they were stored, in the order in which they came in.
+        """Stored outcomes of a finished run, in order of arrival.
 
-        RefusedError for a run that is not finished, or not known any more.
+        Raises RefusedError for a run that is unfinished or no longer known.
         """
         cursor = 0
         while True:
@@ -122,10 +122,11 @@ class OperatorClient:
             if page.finished:
                 return
 
-    # What is published.
+    # Publication.
 
     async def disclose(self, runs: tuple[str, ...]) -> None:
-        """Makes the cases of finished runs public; RefusedError while any run with cases of the same secret is open."""
+        """Makes the cases of finished runs public. Raises RefusedError while any run with cases of the same secret
+        is open."""
         await self._done("disclose", Disclose(token=self._token, runs=runs))
 
     async def journal(self) -> list[bytes]:
@@ -139,12 +140,12 @@ class OperatorClient:
                 return entries
 
     async def opening(self, run: str) -> RunOpening:
-        """What the coordinator committed to for a run that is disclosed."""
+        """What the coordinator committed to for a disclosed run."""
         message = OpeningRequest(token=self._token, run=run)
         return await self._requests.until_answered("opening", message, RunOpening, timeout_s=TIMEOUT_S)
 
     async def sign(self, digest: str) -> Signed:
-        """The coordinator's signature of a manifest, by its SHA-256."""
+        """The coordinator's signature of the manifest whose SHA-256 is `digest`."""
         message = SignRequest(token=self._token, digest=digest)
         return await self._requests.until_answered("sign", message, Signed, timeout_s=TIMEOUT_S)
 
@@ -153,9 +154,10 @@ class OperatorClient:
     async def evaluate(
         self, message: Evaluate
     ) -> AsyncGenerator[tuple[EpisodeOutcome | None, int, str], None]:
-        """Each outcome as it comes, with the number of episodes in all; every few seconds without one, what it waits for.
+        """Yields outcomes as they arrive; every few seconds without one, yields what the evaluation waits for.
 
-        Yields `(outcome, total, "")` or `(None, total, waits_for)`. What is not waited for to its end is cancelled.
+        Yields `(outcome, total, "")` or `(None, total, waits_for)`; `total` is the number of episodes. Cancels the
+        evaluation when the caller stops before its end.
         """
         asked = replace(message, token=self._token)
         started = await self._requests.until_answered(
@@ -182,15 +184,15 @@ class OperatorClient:
     # Blobs.
 
     async def upload(self, digest: str, data: bytes) -> None:
-        """Brings a blob to the coordinator."""
+        """Uploads a blob to the coordinator."""
         await self._requests.upload(_SENDER, self._token, digest, data)
 
     async def download(self, digest: str) -> bytes:
-        """A blob by its digest, checked."""
+        """Downloads a blob and checks it against its digest."""
         return await self._requests.download(_SENDER, self._token, digest)
 
     async def fetch(self, ref: BlobRef) -> bytes:
-        """The bytes that `ref` names, checked."""
+        """The bytes that `ref` names, checked against the digest."""
         return await self._requests.fetch(_SENDER, self._token, ref)
 
     async def _done(

@@ -1,4 +1,4 @@
-"""Where a coordinator that serves can be reached: what its `--ready-file` holds."""
+"""The endpoints of a serving coordinator, as its `--ready-file` holds them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ _LOOK_S = 0.02
 
 
 class Ready(msgspec.Struct, frozen=True, kw_only=True):
-    """A coordinator's whereabouts."""
+    """How to reach a coordinator."""
 
     cluster: str
     endpoints: tuple[str, ...]
-    """As processes of this machine dial them; those of `tls/`, which need certificates, come last."""
+    """Endpoints for processes of this machine; those of `tls/`, which need certificates, come last."""
     credentials: dict[Role, str]
     """Paths of this machine's credentials files by role."""
     state: str
     note: str = ""
-    """What its operator is to know of the cases of new runs; empty for nothing."""
+    """A note for the operator on the cases of new runs; empty for none."""
 
 
 async def read_ready(path: Path, failed: asyncio.Future[None]) -> Ready:
-    """Waits for the file and reads it. `failed` ends only with an error, which is raised here when it comes first."""
+    """Waits for the file and reads it. `failed` ends only with an error, which is raised here if it comes first."""
     while not path.exists():
         if failed.done():
             failed.result()

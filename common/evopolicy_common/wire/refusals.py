@@ -1,4 +1,4 @@
-"""Why a request is refused: the one list of words that the coordinator answers with and that all rooms decide by."""
+"""Reasons of refusals: the one list of codes that the coordinator replies with and all rooms decide by."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from enum import StrEnum
 
 
 class Refusal(StrEnum):
-    """A refusal's word on the wire; the text beside it is for people."""
+    """The code of a refusal on the wire; the message beside it is for people."""
 
-    # Whose the request is.
+    # The client has no right to make the request.
     BAD_TOKEN = "bad_token"
     REVOKED = "revoked"
     WRONG_KEY = "wrong_key"
 
-    # What is wrong with the request itself.
+    # The request itself is wrong.
     BAD_MESSAGE = "bad_message"
     BAD_REQUEST = "bad_request"
     BAD_BLOB = "bad_blob"
@@ -25,7 +25,7 @@ class Refusal(StrEnum):
     KEY_CONFLICT = "key_conflict"
     TOO_LARGE = "too_large"
 
-    # What it names is not there.
+    # The request names something that does not exist.
     DAMAGED = "damaged"
     MISSING_BLOB = "missing_blob"
     MISSING_BUNDLE = "missing_bundle"
@@ -36,23 +36,23 @@ class Refusal(StrEnum):
     UNKNOWN_SUBMIT = "unknown_submit"
     UNKNOWN_WORKER = "unknown_worker"
 
-    # The run takes no more.
+    # The run accepts no more requests.
     RUN_CANCELLED = "run_cancelled"
     RUN_CLOSED = "run_closed"
     RUN_FINISHED = "run_finished"
 
-    # A worker is not let in.
+    # A worker is not admitted.
     BAD_NAME = "bad_name"
     NAME_TAKEN = "name_taken"
     QUARANTINED = "quarantined"
     WRONG_PROTOCOL = "wrong_protocol"
 
-    # Not now.
+    # Temporary.
     NO_WORKER = "no_worker"
     UNAVAILABLE = "unavailable"
 
     OTHER = "other"
-    """A word of a newer version."""
+    """A code of a newer version."""
 
     @classmethod
     def _missing_(cls, value: object) -> Refusal:
@@ -68,10 +68,10 @@ RUN_OVER = frozenset(
         Refusal.UNKNOWN_RUN,
     }
 )
-"""To a run's gateway: nothing more of this run is served."""
+"""For a run's gateway: no further request of this run is served."""
 
 NOT_NOW = frozenset({Refusal.NO_WORKER, Refusal.UNAVAILABLE})
-"""Ask again: no worker has described the environment yet, or the coordinator's disk is full."""
+"""Retry: no worker has described the environment yet, or the coordinator's disk is full."""
 
 WRONG_SETTINGS = frozenset(
     {
@@ -81,4 +81,4 @@ WRONG_SETTINGS = frozenset(
         Refusal.INVALID_SETTINGS,
     }
 )
-"""To an operator: an option of the command is why."""
+"""For an operator: an option of the command is the cause."""

@@ -1,7 +1,8 @@
-"""Typed requests to the coordinator, with timeouts: what workers, gateways and operators ask through.
+"""Typed requests of workers, gateways and operators to the coordinator, with timeouts.
 
-Every request of ours may be sent again, so an answer that does not come is asked for again, with back-off, until it does
-or the caller's timeout passes. A refusal is an answer.
+All requests may be repeated. A request without a reply is sent again, with back-off, until the reply comes or the
+caller's
+timeout passes. A refusal counts as a reply.
 """
 
 from __future__ import annotations
@@ -32,28 +33,30 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 FIRST_PAUSE_S = 0.05
 LONGEST_PAUSE_S = 0.5
-"""So that whoever waits goes on within a second of the coordinator's return."""
+"""Clients resume within a second of the coordinator's return."""
 ANSWER_S = 5.0
-"""How long one request may go unanswered before it is sent again, beyond the time that a long poll asks for."""
+"""Timeout of one sending, beyond the time that a long poll requests."""
 WARN_AFTER_S = 10.0
-"""A request that has waited so long is logged, and again each time that it has waited twice as long."""
+"""A request that has waited this long is logged, and again whenever its waiting time has doubled."""
 
 
 class Requester(Generic[Reply]):
-    """Asks one speaker's requests over a link."""
+    """Sends one kind of client's requests over a link."""
 
     def __init__(
         self, link: Link, key_of: Callable[[str], str], replies: msgspec.msgpack.Decoder[Reply]
     ) -> None:
-        """`key_of` makes a verb (`lease`, `submit`) the full key; `replies` decodes this speaker's answers."""
+        """`key_of` maps a verb (`lease`, `submit`) to the full key; `replies` decodes the replies to this kind of
+        client."""
         self._link = link
         self._key_of = key_of
         self._replies = replies
 
     async def once(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
-        """The answer to one sending.
+        """Sends the message once and returns the reply.
 
-        `wait_s` is how long the message itself asks the coordinator to wait. Raises RefusedError, TransportError when no answer came, ProtocolError for another answer.
+        `wait_s` is how long the message itself lets the coordinator wait. Raises RefusedError for a refusal,
+        TransportError without a reply, ProtocolError for another reply.
         """
         with notify_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
             answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
@@ -68,7 +71,8 @@ class Requester(Generic[Reply]):
         wait_s: float = 0.0,
         timeout_s: float | None = None,
     ) -> Wanted:
-        """`once`, sent again until answered; TransportError when `timeout_s` seconds went by without (None: never)."""
+        """As `once`, repeated until a reply comes. Raises TransportError after `timeout_s` seconds without one
+        (None: never)."""
         pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
         started = time.monotonic()
         while True:
@@ -87,9 +91,9 @@ class Requester(Generic[Reply]):
             pause = min(LONGEST_PAUSE_S, pause * 2)
 
     async def upload(self, sender: str, token: str, digest: str, data: bytes) -> None:
-        """Brings a blob to the coordinator in acknowledged chunks; what it already has is not sent again.
+        """Uploads a blob in acknowledged chunks; chunks that the coordinator already has are skipped.
 
-        ProtocolError when it is larger than a blob may be.
+        Raises ProtocolError when the blob is too large.
         """
         if len(data) > codec.MAX_BLOB_BYTES:
             raise ProtocolError(f"a blob of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
@@ -106,7 +110,7 @@ class Requester(Generic[Reply]):
             offset = ack.have
 
     async def download(self, sender: str, token: str, digest: str) -> bytes:
-        """A blob from the coordinator, checked against its digest; ProtocolError when it is another, or too large."""
+        """Downloads a blob. Raises ProtocolError when it does not match its digest or is too large."""
         data = bytearray()
         while True:
             chunk = await self.until_answered(
@@ -124,7 +128,7 @@ class Requester(Generic[Reply]):
         return bytes(data)
 
     async def fetch(self, sender: str, token: str, ref: BlobRef) -> bytes:
-        """The bytes that `ref` names, checked."""
+        """Returns the bytes of `ref`, from the message or the coordinator, checked against the digest."""
         if ref.inline is None:
             return await self.download(sender, token, ref.digest)
         if digest_of(ref.inline) != ref.digest:
@@ -133,12 +137,12 @@ class Requester(Generic[Reply]):
 
 
 def operator_requests(link: Link) -> Requester[OperatorReply]:
-    """An operator's requests to the cluster of that link."""
+    """A requester for an operator's requests to the cluster of `link`."""
     return Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
 
 
 def expect(reply: object, wanted: type[Wanted]) -> Wanted:
-    """`reply` if it is a `wanted`; RefusedError when it is one, ProtocolError for any other message."""
+    """Returns `reply` if it is a `wanted`. Raises RefusedError for a refusal, ProtocolError for any other message."""
     if isinstance(reply, wanted):
         return reply
     if isinstance(reply, Refused):

@@ -1,13 +1,14 @@
-"""Zenoh sessions and the one pattern this project speaks over them: a query with one reply.
+"""Zenoh sessions and the only pattern this project uses over them: a query with one reply.
 
-Rules that this module keeps for everybody:
-- callbacks of Zenoh run on its threads and only hand over to the event loop;
-- nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire everyone's leases;
-- every declaration is held by an object, since dropping it undeclares it;
-- scouting is off and the admin space closed; who may say what is `access_control` below;
-- between machines it is mutual TLS: a machine has a certificate, a user name and a password of its own, and its rights
-  only where the certificate's common name and the user name are both its identity;
-- never fork a process that has a session open.
+Rules that this module owns:
+- Zenoh's callbacks run on its threads and only pass work to the event loop.
+- Nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire all leases.
+- Every declaration is held by an object, since dropping it undeclares it.
+- Scouting is off and the admin space is closed; `access_control` below grants the rights.
+- Machines connect over mutual TLS: each has a certificate, a user name and a password of its own. It has rights only if
+  the
+  certificate's common name and the user name both equal its identity.
+- No process forks while it has a session open.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8
 _CLOSE_S = 3.0
 STUCK_S = 2.0
-"""How much later than it should a session may end a query, before it is taken to be stuck."""
+"""Delay after a query's timeout at which the session is considered stuck, seconds."""
 
 
 class IncomingQuery:
-    """A request to be answered once, from any coroutine or thread."""
+    """A request, to be answered once, from any coroutine or thread."""
 
     __slots__ = ("_query", "_server", "arrived", "key", "payload")
 
@@ -51,25 +52,25 @@ class IncomingQuery:
         self._server = server
         self._query: zenoh.Query | None = query
         self.arrived = time.monotonic()
-        """When it came in, however late the event loop gets to it."""
+        """Time of arrival, independent of when the event loop handles it."""
         self.key = str(query.key_expr)
         self.payload = bytes(query.payload) if query.payload is not None else b""
 
     def reply(self, payload: bytes, lane: int = 0) -> None:
-        """Sends the one answer, off the event loop. Answers of one lane go in order; a stalled peer stalls its lane."""
+        """Sends the reply, off the event loop. Replies of one lane keep their order; a stalled peer stalls its lane."""
         query, self._query = self._query, None
         if query is not None:
             self._server.send(lane, query, self.key, payload)
 
     def drop(self) -> None:
-        """Ends the query without an answer: the asker hears so at once."""
+        """Ends the query without a reply; the client is notified at once."""
         query, self._query = self._query, None
         if query is not None:
             query.drop()  # type: ignore[no-untyped-call]
 
 
 class Server:
-    """A listening session whose queries arrive on the event loop in batches. Made by `serve`."""
+    """A listening session that delivers queries to the event loop in batches. Created by `serve`."""
 
     def __init__(
         self,
@@ -91,7 +92,7 @@ class Server:
             self._lanes.append(lane)
 
     def declare(self, expressions: Iterable[str]) -> None:
-        """Answers queries on these key expressions from now on."""
+        """Starts answering queries on these key expressions."""
         for expression in expressions:
             self._held.append(self._session.declare_queryable(expression, self._arrived, complete=True))
 
@@ -105,11 +106,11 @@ class Server:
         self._held.append(self._session.liveliness().declare_subscriber(expression, changed, history=True))
 
     def send(self, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
-        """Answers a query from the thread of its lane; the event loop never sends."""
+        """Sends a reply from the thread of its lane; the event loop never sends."""
         self._lanes[lane % _REPLY_LANES].put((query, key, payload))
 
     def close(self) -> None:
-        """Takes no more queries. What waits in a lane may go unanswered; the asker asks again."""
+        """Stops accepting queries. Replies waiting in a lane may be lost; clients send their requests again."""
         for lane in self._lanes:
             lane.put(None)
         self._held.clear()
@@ -122,7 +123,7 @@ class Server:
             if self._scheduled:
                 return
             self._scheduled = True
-        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is on its way out
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is exiting
             self._loop.call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
@@ -134,7 +135,7 @@ class Server:
 
 
 class Link:
-    """A client's session. Made by `connect`; reconnects by itself for as long as it is open."""
+    """A client's session. Created by `connect`; reconnects by itself while it is open."""
 
     def __init__(self, session: zenoh.Session, credentials: Credentials) -> None:
         self.credentials = credentials
@@ -144,14 +145,14 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """Whether a router is linked now; a hint for messages to people."""
+        """Whether a router is connected now; a hint for messages to people."""
         return bool(self._session.info.routers_zid())
 
     async def ask(self, key: str, payload: bytes, timeout_s: float) -> bytes:
-        """The answer to one query.
+        """Sends one query and returns its reply.
 
-        Raises TransportError when none came in `timeout_s` seconds, or at once when nobody answers on that key or the
-        access rules forbid it. The request may have been carried out all the same: all requests of ours are safe to
+        Raises TransportError when none came within `timeout_s` seconds, or at once when nobody serves that key or the
+        access rules forbid it. The request may have been carried out nevertheless: all our requests are safe to
         send again.
         """
         loop = asyncio.get_running_loop()
@@ -178,8 +179,8 @@ class Link:
         )
         try:
             await loop.run_in_executor(self._sender, send)
-            # Zenoh ends the query itself at `timeout_s`; the margin is for a session that is stuck. Not `wait_for`,
-            # which in Python 3.11 swallows a cancellation that comes together with the answer.
+            # Zenoh ends the query at `timeout_s`; the margin covers a stuck session. Not `wait_for`, which in Python
+            # 3.11 swallows a cancellation that coincides with the reply.
             async with asyncio.timeout(timeout_s + STUCK_S):
                 answer = await future
         except (zenoh.ZError, TimeoutError, RuntimeError) as error:
@@ -189,7 +190,7 @@ class Link:
         return answer
 
     def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
-        """`ask` for a thread of its own, such as the heartbeat's."""
+        """`ask` for a dedicated thread, such as the heartbeat's."""
         try:
             replies = self._session.get(
                 key, payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
@@ -202,11 +203,11 @@ class Link:
         raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
 
     def declare_alive(self, key: str) -> None:
-        """Holds a liveliness token on `key` for as long as this link is open."""
+        """Holds a liveliness token on `key` while this link is open."""
         self._held.append(self._session.liveliness().declare_token(key))
 
     def close(self) -> None:
-        """Gives the session back. Questions that wait get no answer."""
+        """Closes the session. Open requests get no reply."""
         self._held.clear()
         self._sender.shutdown(wait=False, cancel_futures=True)
         _close(self._session)
@@ -219,8 +220,9 @@ class Link:
 async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -> AsyncIterator[Link]:
     """A client session, open inside the `async with`.
 
-    Waits until a router lets it in; TransportError after `timeout_s` seconds (None: waits for ever), which is also what
-    a wrong password looks like: the router does not say.
+    Waits until a router accepts it. Raises TransportError after `timeout_s` seconds (None: waits forever); a wrong
+    password
+    has the same effect, as the router does not report it.
     """
     with notify_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
         session = await _open_client(credentials, timeout_s)
@@ -235,7 +237,8 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
 async def serve(
     config: zenoh.Config, on_queries: Callable[[list[IncomingQuery]], None]
 ) -> AsyncIterator[Server]:
-    """A listening session made from `server_config`, open inside the `async with`; `declare` what it answers."""
+    """A listening session with a configuration of `server_config`, open inside the `async with`; `declare` what it
+    serves."""
     try:
         session = await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
@@ -248,14 +251,15 @@ async def serve(
 
 
 def client_config(credentials: Credentials) -> zenoh.Config:
-    """The configuration of a worker's, gateway's or operator's session; ConfigError as `check_endpoints` says."""
+    """The configuration of a worker's, gateway's or operator's session. Raises ConfigError as `check_endpoints`
+    does."""
     check_endpoints(credentials)
     return _config(
         {
             **_COMMON,
             "mode": "client",
             "connect/endpoints": list(credentials.endpoints),
-            # One attempt: opening a client blocks its thread until it is in, so the timeout is `connect`'s.
+            # One attempt: opening a client blocks its thread until it is connected, so `connect` does the timeout.
             "connect/timeout_ms": 0,
             "transport/auth/usrpwd/user": credentials.user,
             "transport/auth/usrpwd/password": credentials.password,
@@ -267,9 +271,11 @@ def client_config(credentials: Credentials) -> zenoh.Config:
 def server_config(
     cluster: str, listen: Iterable[str], passwords: Path, users: dict[Role, str]
 ) -> zenoh.Config:
-    """The configuration of the coordinator's session for its own machine: a router that lets in who is in `passwords`.
+    """The configuration of the coordinator's session for its own machine: a router that admits the users in
+    `passwords`.
 
-    `passwords` holds a line `user:password` each; `users` tells the user name of each role, and the role its rights.
+    `passwords` is a file with one line `user:password` each; `users` maps each role to its user name, and roles have
+    rights.
     """
     return _router_config(listen, passwords, access_control(cluster, users))
 
@@ -283,7 +289,8 @@ def tls_server_config(
 ) -> zenoh.Config:
     """The configuration of the coordinator's session for other machines, over mutual TLS.
 
-    `machines` are roles and identities, as they stand in certificates and, as user names, in the file `passwords`.
+    `machines` are roles and identities: common names of certificates and, as user names, entries of the file
+    `passwords`.
     """
     settings = _router_config(listen, passwords, machine_access_control(cluster, machines))
     for key, value in _tls(tls, "listen").items():
@@ -292,9 +299,10 @@ def tls_server_config(
 
 
 def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
-    """Zenoh's access rules: each role asks on its own keys and hears the answers, and nothing else.
+    """Zenoh's access rules: each role sends requests on its own keys and receives the replies, and nothing else.
 
-    `declare_queryable` goes out to clients only: were it let in, one gateway could answer another's queries.
+    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer another's
+    queries.
     """
     subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
     return _access_control(cluster, subjects, [(role, role) for role in users])
@@ -303,10 +311,10 @@ def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
 def machine_access_control(
     cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
 ) -> dict[str, Any]:
-    """`access_control` of a session over TLS: each machine with its own name, of certificate and user alike.
+    """`access_control` of a session over TLS: each machine has one name, in its certificate and as its user name.
 
-    A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to hold them to these rules.
-    `uplink`: the common name of what such a router itself connects to, where questions go and answers come from.
+    A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to apply these rules to them.
+    `uplink`: the common name of the peer that such a router connects to; requests go there and replies come from it.
     """
     listed = list(machines)
     subjects = [
@@ -320,7 +328,7 @@ def machine_access_control(
             {**rule, "id": f"{rule['id']}_above", "flows": [opposite[flow] for flow in rule["flows"]]}
             for rule in rights["rules"]
         ]
-        # Who is connected to names no user: it is known by its certificate alone.
+        # The peer that a router connects to sends no user name; only its certificate identifies it.
         above = {"id": "uplink", "cert_common_names": [uplink], "link_protocols": ["tls"]}
         rights["subjects"].append(above)
         rights["policies"].append({"subjects": ["uplink"], "rules": [rule["id"] for rule in mirrored]})
@@ -339,7 +347,7 @@ def site_router_settings(
     user: str,
     password: str,
 ) -> dict[str, Any]:
-    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, one way up to `uplink`.
+    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, and one uplink.
 
     `user` and `password` are its own; `passwords` and the files of `tls` are paths on its host.
     """
@@ -400,7 +408,7 @@ _COMMON: dict[str, Any] = {
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     "adminspace": {"enabled": False},
-    # A router that went is looked for by Zenoh itself: so often that whoever it served is back within a second.
+    # Zenoh itself reconnects to a lost router, often enough that its clients are back within a second.
     "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
 }
 
@@ -425,7 +433,7 @@ def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:
         f"{prefix}/{side}_private_key": tls.private_key,
         f"{prefix}/enable_mtls": True,
         f"{prefix}/verify_name_on_connect": True,
-        # An open link ends with the certificate that it was opened with.
+        # A link closes when the certificate with which it was opened expires.
         f"{prefix}/close_link_on_expiration": True,
     }
 
@@ -467,12 +475,12 @@ def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]
     while (item := lane.get()) is not None:
         query, key, payload = item
         try:
-            # The answer is sent as the question was: blocking, never dropped.
+            # The reply is sent like the request: blocking, never dropped.
             query.reply(key, payload)
         except zenoh.ZError:
-            pass  # the asker may be gone: it asks again if not
+            pass  # the client may be gone; otherwise it sends the request again
         except Exception:
-            # Whatever is wrong with one answer, those behind it are sent.
+            # An error in one reply must not stop the replies behind it.
             log.exception("an answer cannot be sent", key=key)
         with contextlib.suppress(Exception):
             query.drop()  # type: ignore[no-untyped-call]
@@ -480,7 +488,7 @@ def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]
 
 
 def _close(session: zenoh.Session) -> None:
-    """Closes the session, but waits no longer than `_CLOSE_S`: with a frozen peer it can take many seconds."""
+    """Closes the session, waiting at most `_CLOSE_S`: with a frozen peer closing can take many seconds."""
 
     def close() -> None:
         with contextlib.suppress(zenoh.ZError):
