@@ -1,8 +1,10 @@
 """Bytes on disk under the SHA-256 of their content.
 
-Rules: a blob that is there is whole (written beside, fsynced, then renamed); bytes are checked against their digest when
-read back; writing what is already there changes nothing. Chunked writes of one blob go in order and may be given up and
-begun again at any time.
+Rules: a stored blob is complete (written under another name, fsynced, then renamed). Bytes are checked against their
+digest
+when read. Storing an existing blob changes nothing. The chunks of a blob are written in order; an upload may be
+abandoned and
+restarted at any time.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from pathlib import Path
 from evopolicy_common.errors import StorageError
 
 MAX_UNFINISHED = 16
-"""Uploads that one sender may have begun and not finished; beyond that its oldest is given up."""
+"""Most unfinished uploads of one sender; beyond it the sender's oldest is dropped."""
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
@@ -30,7 +32,7 @@ def digest_of(data: bytes) -> str:
 
 
 def is_digest(text: str) -> bool:
-    """Whether `text` can be a digest; anything else must never reach a path."""
+    """Whether `text` has the form of a digest; any other text must never become part of a path."""
     return _DIGEST.fullmatch(text) is not None
 
 
@@ -44,9 +46,9 @@ def fsync_directory(path: Path) -> None:
 
 
 def sync_filesystem(path: Path) -> None:
-    """Makes all that was written so far on the file system that holds the directory durable: one flush for many files.
+    """Makes all earlier writes to the directory's file system durable, with one flush for many files.
 
-    OSError when something could not be written.
+    Raises OSError when something could not be written.
     """
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -62,9 +64,9 @@ def sync_filesystem(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: bool = True) -> None:
-    """Replaces `path` by a file with `data`: readers see the old bytes or the new, never a part.
+    """Replaces `path` by a file with `data`: readers see either the old bytes or the new, never a part.
 
-    Raises StorageError naming the path when the disk refuses.
+    Raises StorageError with the path when the file cannot be written.
     """
     try:
         fd, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
@@ -86,7 +88,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: boo
 
 
 class BlobStore:
-    """A folder of blobs. Safe for several threads and processes, as every write ends in a rename."""
+    """A folder of blobs. Safe for several threads and processes, as every write ends with a rename."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -94,17 +96,17 @@ class BlobStore:
         self._parts.mkdir(parents=True, exist_ok=True)
 
     def path(self, digest: str) -> Path:
-        """Where the blob is or would be; ValueError for what is no digest."""
+        """The blob's path, stored or not. Raises ValueError for an invalid digest."""
         if not is_digest(digest):
             raise ValueError(f"not a SHA-256 digest: {digest[:80]!r}")
         return self._root / digest[:2] / digest
 
     def has(self, digest: str) -> bool:
-        """Whether the blob is stored, whole."""
+        """Whether the complete blob is stored."""
         return self.path(digest).is_file()
 
     def size(self, digest: str) -> int:
-        """Size in bytes; StorageError when the blob is not there."""
+        """Size in bytes. Raises StorageError when the blob is not stored."""
         try:
             return self.path(digest).stat().st_size
         except OSError as error:
@@ -120,7 +122,7 @@ class BlobStore:
         return digest
 
     def read(self, digest: str) -> bytes:
-        """The blob's bytes, checked; StorageError when it is missing or damaged (and then set aside)."""
+        """The blob's bytes, checked. Raises StorageError when it is missing or damaged (a damaged file is renamed)."""
         path = self.path(digest)
         try:
             data = path.read_bytes()
@@ -132,7 +134,7 @@ class BlobStore:
         return data
 
     def read_chunk(self, digest: str, offset: int, n: int) -> bytes:
-        """At most `n` bytes from `offset` on, unchecked: the receiver checks the whole."""
+        """At most `n` bytes from `offset` on, unchecked: the receiver checks the whole blob."""
         try:
             with self.path(digest).open("rb") as file:
                 file.seek(offset)
@@ -149,14 +151,14 @@ class BlobStore:
         data: bytes,
         on_whole: Callable[[], None] | None = None,
     ) -> int:
-        """Adds one chunk of a blob that `sender` is uploading and returns how many bytes are there now.
+        """Appends one chunk of a blob that `sender` uploads and returns the number of bytes received so far.
 
-        A chunk that does not continue what is there changes nothing: the answer tells where to go on. The last one
-        checks the digest and puts the blob in place; StorageError when the bytes are another blob's.
-        `on_whole` is called once the sender has sent all bytes of the blob; with it, what is here already counts for nothing.
+        A chunk that does not continue them changes nothing; the returned offset is where to continue. The last chunk
+        checks the digest and stores the blob; StorageError when the digest does not match.
+        `on_whole` is called once the sender has sent the whole blob; with it, a copy stored before is ignored.
         """
         if on_whole is None and self.has(digest):
-            # Young again: who collects what nobody names leaves the young alone.
+            # Refresh its age: garbage collection spares young blobs.
             with contextlib.suppress(OSError):
                 os.utime(self.path(digest))
             return size
@@ -185,12 +187,12 @@ class BlobStore:
         return have
 
     def drop_unfinished(self) -> None:
-        """Forgets uploads that were begun and not finished; their senders begin again."""
+        """Deletes unfinished uploads; their senders start again."""
         for part in self._parts.iterdir():
             part.unlink(missing_ok=True)
 
     def delete(self, digest: str) -> int:
-        """Removes the blob and returns the bytes freed; 0 when it was not there."""
+        """Deletes the blob and returns the bytes freed; 0 when it was not stored."""
         path = self.path(digest)
         try:
             size = path.stat().st_size
@@ -200,13 +202,13 @@ class BlobStore:
         return size
 
     def digests(self) -> Iterator[str]:
-        """All blobs, in no particular order."""
+        """The digests of all blobs, in no particular order."""
         for folder in self._root.iterdir():
             if len(folder.name) == 2:
                 yield from (path.name for path in folder.iterdir() if is_digest(path.name))
 
     def _make_room(self, part: Path) -> None:
-        """Gives up the oldest unfinished uploads of a sender that has begun too many."""
+        """Drops a sender's oldest unfinished uploads when it has too many."""
         begun = [each for each in self._parts.glob(f"{part.name.partition('-')[0]}-*") if each != part]
         for old in sorted(begun, key=lambda each: each.stat().st_mtime)[
             : max(0, len(begun) + 1 - MAX_UNFINISHED)

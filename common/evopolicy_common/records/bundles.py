@@ -1,8 +1,11 @@
-"""Policy bundles: a snapshot of `system/` as one blob, and that blob as a folder again.
+"""Policy bundles: packs a snapshot of `system/` into one blob, and unpacks that blob into a folder.
 
 A bundle is the msgpack list of `[path, executable, bytes]`, sorted by path, so equal folders give equal bytes and an
-equal digest (not compressed: the digest must not depend on a compressor's version). Both directions treat the other side as hostile: a snapshot opens every component without following links and takes regular
-files only; unpacking accepts plain relative paths only.
+equal digest. It is not compressed, as the digest must not depend on a compressor's version. Both directions treat their
+input as
+hostile: a snapshot opens every path component without following links and takes regular files only; unpacking accepts
+plain
+relative paths only.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from evopolicy_common.records.blobs import digest_of
 
 MAX_FILES = 2000
 MAX_ENTRIES = 5000
-"""Files and folders that are looked at, those that are left out too: empty folders without end would hold up a snapshot."""
+"""Most files and folders in a snapshot's folder, ignored ones included: countless empty folders would stall a
+snapshot."""
 MAX_BYTES = 64 << 20
 """Sum of the files' sizes, bytes."""
 MAX_DEPTH = 16
@@ -28,7 +32,7 @@ MAX_PATH_BYTES = 240
 IGNORED_FOLDERS = frozenset(
     {"__pycache__", ".git", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".ipynb_checkpoints"}
 )
-"""Folders that tools leave behind; never part of a bundle."""
+"""Folders that tools create; never part of a bundle."""
 
 
 class BundleFile(msgspec.Struct, frozen=True, array_like=True):
@@ -41,7 +45,7 @@ class BundleFile(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Bundle(msgspec.Struct, frozen=True):
-    """A snapshot: its digest (SHA-256 of `packed`), its bytes and what is in it."""
+    """A snapshot: its digest (SHA-256 of `packed`), its bytes and its files."""
 
     digest: str
     packed: bytes
@@ -52,10 +56,11 @@ _files_decoder = msgspec.msgpack.Decoder(tuple[BundleFile, ...])
 
 
 def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
-    """The bundle of `folder` as it is now, without its entries of these names.
+    """The bundle of `folder` now, without its top-level entries named in `leave_out`.
 
-    Raises BundleError naming the path, the value and the limit for links, devices, sockets, names that cannot travel,
-    and what is over a limit. Nothing outside `folder` is read, whatever is changed in it meanwhile.
+    Raises BundleError with the path, the value and the limit for links, devices, sockets, file names that are not
+    portable,
+    and exceeded limits. Nothing outside `folder` is read, even if `folder` changes meanwhile.
     """
     reader = _Reader(leave_out)
     try:
@@ -70,14 +75,14 @@ def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
 
 
 def pack(files: list[BundleFile]) -> Bundle:
-    """The bundle of these files; the order in which they are given does not matter."""
+    """The bundle of these files; their order does not matter."""
     ordered = tuple(sorted(files, key=lambda file: file.path))
     packed = msgspec.msgpack.encode(ordered)
     return Bundle(digest_of(packed), packed, ordered)
 
 
 def load(packed: bytes, digest: str) -> Bundle:
-    """The bundle in `packed`; BundleError when it is damaged, too big, or not the one that `digest` names."""
+    """The bundle in `packed`. Raises BundleError when it is damaged, too large, or does not match `digest`."""
     if digest_of(packed) != digest:
         raise BundleError(f"bundle is not {digest}")
     try:
@@ -89,7 +94,7 @@ def load(packed: bytes, digest: str) -> Bundle:
 
 
 def unpack(bundle: Bundle, folder: Path) -> None:
-    """Writes the bundle's files below `folder`, which must not exist yet; files are read-only to be copied from."""
+    """Writes the bundle's files below `folder`, which must not exist yet."""
     _check(bundle.files)
     folder.mkdir(parents=True)
     for file in bundle.files:
@@ -163,7 +168,7 @@ class _Reader:
 
 
 def _open(name: str, folder_fd: int, path: PurePosixPath, flags: int) -> int:
-    # O_NOFOLLOW: between the look and the opening, a hostile agent may put a link in its place.
+    # O_NOFOLLOW: a hostile agent may replace the entry with a link between the stat and the open.
     try:
         return os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder_fd)
     except OSError as error:

@@ -1,8 +1,10 @@
-"""`checkpoints/submit_NNN/`: a submitted policy's files with `_meta.json` and `metrics.json` beside them.
+"""`checkpoints/submit_NNN/`: a submitted policy's files, with `_meta.json` and `metrics.json` beside them.
 
-The layout is the published one. A file of the policy's own that has the name of one of the two is kept in `_meta.json`
-(`shadowed_files`), so that the bundle can be had from the folder again. Checkpoints of earlier versions had the policy in
-`system/`, and in `metrics.json` what is in `_meta.json` now; they are read too.
+The layout is the published one. If a policy has a file with one of these two names, `_meta.json` keeps it
+(`shadowed_files`),
+so that the bundle can be restored from the folder. Checkpoints of earlier versions have the policy in `system/`, and
+the
+content of `_meta.json` in `metrics.json`; they are read too.
 """
 
 from __future__ import annotations
@@ -23,16 +25,16 @@ from evopolicy_common.simulators import SIMULATORS
 META = "_meta.json"
 METRICS = "metrics.json"
 METADATA = frozenset({META, METRICS})
-"""What is in a checkpoint's folder beside the policy's files."""
+"""Files in a checkpoint's folder besides the policy's."""
 
 
 class ImportScan(msgspec.Struct, frozen=True, kw_only=True):
-    """The import statements of a policy's files, read and not run."""
+    """The import statements of a policy's files, parsed without running them."""
 
     imports: tuple[str, ...]
     """Top-level names, sorted."""
     denied: tuple[str, ...]
-    """Those of them that a policy may not import."""
+    """Those of `imports` that a policy may not import."""
 
 
 class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,29 +43,30 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     schema_version: str = PUBLISHED_SCHEMA
     submit_index: int
     submit_time: str
-    """When the submit was accepted; empty where an older file does not tell."""
+    """Time of acceptance; empty when unknown from an older file."""
     n_episodes_requested: int
     remaining_budget_before: int
     remaining_budget_after: int
     snapshot_size_bytes: int = 0
     snapshot_files: Any = ()
-    """Paths of the policy's files. Not relied on where other software has written it, nor is `import_scan`."""
+    """Paths of the policy's files. Other software may have written this field or `import_scan`, so nothing relies on
+    them."""
     import_scan: Any = None
-    """`ImportScan`."""
+    """An `ImportScan`."""
     validation_status: str
-    """The status in the submit's summary."""
+    """The status of the submit's summary."""
     bundle: str = ""
-    """Digest of the bundle; empty where `system/` could not be one, or other software has written the file."""
+    """Digest of the bundle; empty when `system/` could not be bundled, or other software wrote the file."""
     mean_return: float | None = None
-    """Visible train mean; None when not ok."""
+    """Visible mean return over the train episodes; None when not ok."""
     val_mean: float | None = None
     """Hidden validation mean; None when not ok or not eligible."""
     shadowed_files: tuple[BundleFile, ...] = ()
-    """The policy's own files in whose place the metadata are: path, whether it is executable, base64 of its bytes."""
+    """The policy's own files that the metadata replace: path, whether it is executable, base64 of its bytes."""
 
 
 class _OldMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """`metrics.json` as earlier versions wrote it."""
+    """`metrics.json` in the format of earlier versions."""
 
     schema_version: int
     submit_index: int
@@ -86,7 +89,8 @@ _old_metrics = msgspec.json.Decoder(_OldMetrics)
 
 
 def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None) -> CodeMetrics:
-    """Makes `folder` anew and returns the metrics in it. `meta` tells of the submit; what it tells of files is filled in."""
+    """Creates `folder` anew and returns the metrics written to it. `meta` describes the submit; its fields on files
+    are filled in here."""
     if folder.exists():
         shutil.rmtree(folder)
     files = () if bundle is None else bundle.files
@@ -111,19 +115,19 @@ def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None) -> CodeMetr
 
 
 def without_metadata(files: tuple[BundleFile, ...]) -> Bundle:
-    """The bundle of the files that do not have a metadata file's name."""
+    """The bundle of the files without a metadata file's name."""
     return bundles.pack([file for file in files if file.path not in METADATA])
 
 
 def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
-    """What the checkpoint in `folder` tells of its submit; None when it tells nothing. ProtocolError when it is damaged."""
+    """The metadata of the checkpoint in `folder`; None when it has none. Raises ProtocolError when they are damaged."""
     for name in (META, METRICS):
         try:
             data = (folder / name).read_bytes()
             if name == META:
                 return _meta.decode(data)
             if _header.decode(data).schema_version == PUBLISHED_SCHEMA:
-                return None  # the file of that name that is written now, without its neighbour
+                return None  # the current `metrics.json`, without its `_meta.json`
             return _upgraded(_old_metrics.decode(data), episode_budget)
         except FileNotFoundError:
             continue
@@ -151,13 +155,13 @@ def _upgraded(old: _OldMetrics, episode_budget: int) -> CheckpointMeta:
 
 
 def policy_folder(folder: Path) -> Path:
-    """Where the policy's files are: in `folder` itself, or in its `system/` where an earlier version wrote it."""
+    """The folder of the policy's files: `folder` itself, or its `system/` if an earlier version wrote it."""
     old = not any((folder / name).exists() for name in (META, "policy.py")) and (folder / "system").is_dir()
     return folder / "system" if old else folder
 
 
 def bundle_of(folder: Path) -> Bundle:
-    """The bundle that was submitted. BundleError when the folder holds none that can be read."""
+    """The submitted bundle. Raises BundleError when the folder has none that can be read."""
     if not (folder / META).exists():
         return bundles.snapshot(policy_folder(folder))
     try:

@@ -1,7 +1,8 @@
-"""`metrics.json`: how large and how branched a policy's source is, by the published definitions. Nothing is run.
+"""`metrics.json`: size and branching of a policy's source, by the published definitions. No code is run.
 
-Sources are an agent's, so the work is bounded: beyond `MAX_PARSED_BYTES` of Python source in one policy, and where the
-parser would need memory by the square of the length, a file counts as one that cannot be parsed.
+Sources come from an agent, so the work is bounded. A file counts as unparsable beyond `MAX_PARSED_BYTES` of Python
+source in
+one policy, and where the parser's memory would grow with the square of its length.
 """
 
 from __future__ import annotations
@@ -16,43 +17,44 @@ from pathlib import PurePosixPath
 import msgspec
 
 PUBLISHED_SCHEMA = "0.1"
-"""`schema_version` of the published software's files, and of ours, which hold their fields and more."""
+"""`schema_version` of the published software's files and of ours, which extend their fields."""
 MAX_PARSED_BYTES = 8 << 20
 _UNCOUNTED_NAMES = frozenset({".keep", "_meta.json", "metrics.json"})
 _UNCOUNTED_FOLDERS = frozenset({"__pycache__", ".pytest_cache", ".mypy_cache", ".ruff_cache"})
 
-# CPython's parser makes a new text of each beginning of `a.a.a…`: gigabytes for an import of fifty thousand parts.
+# CPython's parser copies every prefix of `a.a.a…`: gigabytes for an import of fifty thousand parts.
 _ENDLESS_NAME = re.compile(rb"\b(?:\w++[ \t\f\r\n\\]*+\.[ \t\f\r\n\\]*+){100}")
 
 
 class CodeMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """The whole of `metrics.json`."""
+    """The content of `metrics.json`."""
 
     schema_version: str = PUBLISHED_SCHEMA
     files: int
     python_files: int
     bytes: int
-    """Of all files."""
+    """Size of all files."""
     policy_bytes: int
-    """Of `policy.py`; 0 without one."""
+    """Size of `policy.py`; 0 without one."""
     lines: int
-    """Of the Python files."""
+    """Lines of the Python files."""
     source_lines: int
-    """Lines that are neither blank nor begin with `#`."""
+    """Lines that are neither blank nor start with `#`."""
     classes: int
     functions: int
     imports: tuple[str, ...]
     """Top-level names of absolute imports, sorted."""
     import_count: int
     cyclomatic_total: int
-    """Sum over all functions, nested ones counted in their parents too; of the module where a file has no function."""
+    """Sum over all functions, nested ones counted in their parents too; for a file without functions, the module's
+    value."""
     cyclomatic_max: int
     parse_errors: tuple[str, ...]
     """Paths of the Python files that cannot be parsed."""
     test_files: int
-    """Python files whose name begins with `test_`."""
+    """Python files whose name starts with `test_`."""
     tree_hash: str
-    """`sha256:` of, for each file in path order, its path, NUL, its bytes, NUL."""
+    """`sha256:` of the concatenation, over all files in path order, of path, NUL, bytes, NUL."""
 
 
 TREND = (
@@ -64,11 +66,11 @@ TREND = (
     "cyclomatic_max",
     "tree_hash",
 )
-"""What `code_metrics_trend` follows over the submits."""
+"""Fields that `code_metrics_trend` follows over the submits."""
 
 
 def code_metrics(files: Mapping[str, bytes]) -> CodeMetrics:
-    """The metrics of a policy's files, by their path relative to `system/`."""
+    """The metrics of a policy's files, given by their path relative to `system/`."""
     counted = {path: data for path, data in sorted(files.items()) if _counts(PurePosixPath(path))}
     sources = {
         path: data.decode("utf-8", "replace") for path, data in counted.items() if path.endswith(".py")
@@ -109,7 +111,7 @@ def code_metrics(files: Mapping[str, bytes]) -> CodeMetrics:
 
 
 def parse(source: bytes | str) -> ast.Module | None:
-    """The module's tree, or None when this Python cannot parse it, or only with memory by the square of its length."""
+    """The module's tree; None when this Python cannot parse it, or only with memory quadratic in its length."""
     data = source if isinstance(source, bytes) else source.encode()
     if _ENDLESS_NAME.search(data) is not None:
         return None
@@ -126,15 +128,15 @@ def _counts(path: PurePosixPath) -> bool:
 
 
 class _Shape:
-    """What one walk over a module finds. The walk keeps its own stack: an agent's nesting has no bound."""
+    """The counts of one module, from one walk. The walk keeps its own stack: an agent's code may nest without bound."""
 
     def __init__(self, tree: ast.Module) -> None:
         self.classes = self.functions = 0
         self.imports: set[str] = set()
         self.complexities: list[int] = []
-        """Of each function; of the module where it has none."""
+        """Complexity of each function; of the module if it has none."""
         points = 0
-        # A function's points are those that the walk finds between its beginning and its end.
+        # A function's points are those found between its start and its end.
         stack: list[tuple[ast.AST, int | None]] = [(tree, None)]
         while stack:
             node, before = stack.pop()
@@ -156,7 +158,7 @@ class _Shape:
 
 
 def _points(node: ast.AST) -> int:
-    """What a node adds to the complexity of what it is in."""
+    """What a node adds to the complexity of its function."""
     match node:
         case ast.If() | ast.For() | ast.AsyncFor() | ast.While() | ast.IfExp() | ast.ExceptHandler():
             return 1

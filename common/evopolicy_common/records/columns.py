@@ -1,7 +1,8 @@
-"""The columns of a trajectory's block: the values of one leaf over its rows, as msgpack and back.
+"""Columns of a trajectory's block: the values of one leaf over its rows, to and from msgpack.
 
-Numbers come back bit for bit. What msgpack has no form for (arrays, integers beyond 64 bits, half surrogates) is an
-extension or readable text.
+Numbers are restored bit for bit. Values that msgpack cannot represent (arrays, integers beyond 64 bits, lone
+surrogates)
+become an extension or readable text.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ import zstandard
 from numpy.typing import NDArray
 
 MAX_COLUMN_BYTES = 1 << 28
-"""A column of pictures that claims to be larger is not decoded."""
+"""Limit of a column of pictures, bytes; a column that claims more is not decoded."""
 MAX_ROWS = 16384
-"""Rows of one block."""
+"""Most rows of one block."""
 MAX_AXES = 32
-"""Axes of one array."""
+"""Most axes of one array."""
 MAX_EMPTY = 1 << 16
-"""An array without numbers, such as one of shape (n, 0), is at most so many empty lists when it is written as lists."""
+"""Limit for an array without numbers, such as one of shape (n, 0): the number of empty lists that represent it."""
 
 _EXT_ARRAY, _EXT_INT = 1, 2
 _ZSTD_BLOCK_BYTES, _ZSTD_LEAST_BYTES = 128 << 10, 4
@@ -31,7 +32,7 @@ _ZSTD_BLOCK_BYTES, _ZSTD_LEAST_BYTES = 128 << 10, 4
 
 
 def pack(values: list[Any]) -> list[Any]:
-    """Rows of one leaf as a list for msgpack: the kind of column, then its values together."""
+    """Packs the rows of one leaf as a list for msgpack: the kind of column, then all its values."""
     n = len(values)
     first = values[0]
     kind = type(first)
@@ -65,7 +66,7 @@ def pack(values: list[Any]) -> list[Any]:
 
 
 class Pictures:
-    """A column of large arrays, all of one shape and dtype, compressed one by one."""
+    """A column of large arrays of one shape and dtype, compressed one by one."""
 
     def __init__(self, first: NDArray[Any]) -> None:
         _check_shape(first.shape)
@@ -76,7 +77,7 @@ class Pictures:
         self._pieces: list[bytes] = []
 
     def add(self, picture: Any, /) -> bool:
-        """Take one more; False, and nothing is changed, when it is not like the first."""
+        """Adds a picture. Returns False, without a change, when its shape or dtype differs from the first."""
         if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
             return False
         piece = self._stream.compress(np.ascontiguousarray(picture).data)
@@ -86,7 +87,7 @@ class Pictures:
         return True
 
     def packed(self) -> list[Any]:
-        """The column. Nothing is added afterwards."""
+        """The packed column. Nothing may be added afterwards."""
         data = b"".join([*self._pieces, self._stream.flush()])
         return ["pictures", self._n, self._dtype.str, list(self._shape), data]
 
@@ -96,15 +97,15 @@ class Column(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """How many rows there are."""
+        """The number of rows."""
 
     @abstractmethod
     def row(self, t: int) -> Any:
-        """What the leaf, dict or tuple was at row t."""
+        """The value of the leaf, dict or tuple in row t."""
 
     @abstractmethod
     def values(self) -> Any:
-        """The column in the form that `Trajectory.obs` promises."""
+        """The column in the form described at `Trajectory.obs`."""
 
     def rows(self) -> list[Any]:
         """All rows, one by one."""
@@ -129,7 +130,7 @@ class Arrays(Column):
 
 
 class Values(Column):
-    """Anything, a value a row."""
+    """Arbitrary values, one per row."""
 
     def __init__(self, items: list[Any]) -> None:
         self._items = items
@@ -145,7 +146,7 @@ class Values(Column):
 
 
 class Dicts(Column):
-    """Rows that are dicts of the same keys, a column a key."""
+    """Rows that are dicts of the same keys, with one column per key."""
 
     def __init__(self, parts: dict[str, Column], n: int) -> None:
         self.parts = parts
@@ -163,7 +164,7 @@ class Dicts(Column):
 
 
 class Tuples(Column):
-    """Rows that are tuples of one length, a column a place."""
+    """Rows that are tuples of one length, with one column per position."""
 
     def __init__(self, parts: list[Column], n: int) -> None:
         self.parts = parts
@@ -181,7 +182,8 @@ class Tuples(Column):
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of `Column.values()` by their path: keys and positions joined by `/`; that of a single leaf is empty."""
+    """The leaves of `Column.values()` with their paths: keys and positions joined by `/`; a single leaf has an empty
+    path."""
     if isinstance(values, dict):
         for key, item in values.items():
             yield from leaves(item, f"{path}/{key}" if path else str(key))
@@ -198,7 +200,7 @@ def _require_equal(n: int, parts: list[Column]) -> None:
 
 
 def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
-    """The column of what `pack` or, with `pictures`, `Pictures.packed` gave; ValueError when it is none."""
+    """Unpacks the output of `pack` or, with `pictures`, of `Pictures.packed`. Raises ValueError for anything else."""
     kind = packed[0]
     if kind == "array":
         _, n, dtype, shape, data = packed
@@ -226,7 +228,7 @@ def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
 
 
 def join(columns: list[Column]) -> Column:
-    """The columns of successive blocks as one."""
+    """Joins the columns of successive blocks."""
     first = columns[0]
     if len(columns) == 1:
         return first
@@ -248,18 +250,18 @@ def join(columns: list[Column]) -> Column:
     return Values([item for column in columns for item in column.rows()])
 
 
-# Values that msgpack has no form for.
+# Values that msgpack cannot represent.
 
 
 def most_of(compressed: bytes | memoryview) -> int:
-    """The most bytes that a zstd frame can hold, whatever it claims: what it claims is allocated at once."""
+    """Upper bound of the content of a zstd frame, bytes. Needed because the claimed size is allocated at once."""
     return (len(compressed) // _ZSTD_LEAST_BYTES + 1) * _ZSTD_BLOCK_BYTES
 
 
 def count_values(packed: bytes, most: int) -> int:
-    """How many values a msgpack text is made of, as far as `most` and one; each may become an object of 72 bytes.
+    """Number of values in a msgpack text, counted up to `most` + 1; each may become an object of 72 bytes.
 
-    A run through the text: values follow each other, however they nest.
+    One pass suffices: values follow each other in the text, however they nest.
     """
     n, at, end = 0, 0, len(packed)
     while at < end and n <= most:
@@ -275,14 +277,13 @@ def count_values(packed: bytes, most: int) -> int:
 
 
 _SIZES = [(0, 0)] * 256
-"""By a value's first byte: how many bytes follow it, and how long the number is that counts others."""
+"""By a value's first byte: the number of bytes that follow it, and the width of a length field that counts further
+bytes."""
 for _head, _fixed in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
     _SIZES[_head] = _fixed, 0
 for _head, _fixed in zip(range(0xD4, 0xD9), (2, 3, 5, 9, 17), strict=True):
     _SIZES[_head] = _fixed, 0
-for _head, _fixed in zip(
-    range(0xDC, 0xE0), (2, 4, 2, 4), strict=True
-):  # lists and maps: what is in them follows
+for _head, _fixed in zip(range(0xDC, 0xE0), (2, 4, 2, 4), strict=True):  # lists and maps: their items follow
     _SIZES[_head] = _fixed, 0
 for _first, _extra in ((0xC4, 0), (0xC7, 1), (0xD9, 0)):
     for _k, _counted in enumerate((1, 2, 4)):
@@ -290,7 +291,7 @@ for _first, _extra in ((0xC4, 0), (0xC7, 1), (0xD9, 0)):
 
 
 def _check_shape(shape: Sequence[int]) -> None:
-    """ValueError for a shape that no array of ours has: too many axes, or nothing but endless empty lists."""
+    """Raises ValueError for a shape with too many axes, or with too many empty lists."""
     if len(shape) > MAX_AXES or any(type(n) is not int or n < 0 for n in shape):
         raise ValueError(f"an array of shape {str(list(shape))[:200]}")
     if 0 in shape and math.prod(max(1, n) for n in shape) > MAX_EMPTY:
@@ -298,7 +299,7 @@ def _check_shape(shape: Sequence[int]) -> None:
 
 
 def _shaped(array: NDArray[Any], shape: Sequence[int], n: int) -> NDArray[Any]:
-    """`array` as `n` rows of that shape."""
+    """`array` reshaped to `n` rows of that shape. Raises ValueError when it cannot be."""
     if type(n) is not int or not 0 <= n <= MAX_ROWS:
         raise ValueError(f"a column of {n} rows; {MAX_ROWS:,} are the limit")
     _check_shape(shape)
@@ -341,11 +342,11 @@ decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
 def encode(block: dict[str, Any]) -> bytes:
-    """The bytes of a block."""
+    """Encodes a block."""
     try:
         return encoder.encode(block)
     except (OverflowError, UnicodeEncodeError, TypeError):
-        # Only hostile policies return what msgpack cannot say: integers beyond 64 bits, half surrogates.
+        # Only hostile policies return values that msgpack cannot represent: integers beyond 64 bits, lone surrogates.
         return encoder.encode(_portable(block))
 
 

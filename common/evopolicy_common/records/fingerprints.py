@@ -1,8 +1,10 @@
-"""What of two runs' fingerprints must agree for their scores to stand side by side. Pure.
+"""The parts of runs' fingerprints that must be equal for their scores to be comparable. Pure.
 
-Since fingerprints are of one environment, a run tells its `adapter` (`REVISION+DIGEST`) and its `definition`. The revision
-counts; the digest and `evopolicy-worker`, the digest of all of the worker's code, keep workers of one run apart and no more.
-Runs from before told the packages of all environments and no adapter: they were played by revision `FIRST`.
+A run's fingerprint has its environment's `adapter` (`REVISION+DIGEST`) and `definition`. The revision counts here; the
+digest and
+`evopolicy-worker`, the digest of all of the worker's code, only distinguish workers within a run. Runs of earlier
+versions
+list the packages of all environments and no adapter: revision `FIRST` played them.
 """
 
 from __future__ import annotations
@@ -10,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 FIRST = "1.1"
-"""Revision of the adapters that played the runs which tell none."""
+"""Revision of the adapters of runs that list none."""
 _CODE = "evopolicy-worker"
 
 
 def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
-    """The parts that count of runs of one environment, in their order; equal dicts may be compared."""
+    """The relevant parts of the fingerprints of runs of one environment, in their order; runs with equal dicts are
+    comparable."""
     told = [each for each in fingerprints if "adapter" in each]
     names = {name for each in told for name in each}
     definitions = {each.get("definition", "") for each in told}
@@ -26,7 +29,7 @@ def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]
             del parts[_CODE]
             parts["adapter"] = parts["adapter"].partition("+")[0]
         elif told and parts:
-            # Packages of other environments decide nothing here, and a package that is missing here was not told there.
+            # Packages of other environments are irrelevant here, and the older run did not list what is missing here.
             parts = {name: value for name, value in parts.items() if name in names and name != _CODE}
             parts |= {"adapter": FIRST, "definition": min(definitions)}
         found.append(parts)

@@ -1,15 +1,16 @@
-"""The coordinator's journal: what it commits to when a run is opened, and what became of each run. Pure.
+"""The coordinator's journal: its commitment to each opened run, and the end of each run. Pure.
 
 Rules that this module owns:
-- A journal is a list of entries, each the bytes of a JSON object. Entries are only ever added.
-- The hash of a journal, its *head*, is that of the empty one (`EMPTY_HEAD`) carried through every entry:
+- A journal is an append-only list of entries, each the bytes of a JSON object.
+- The hash of a journal, its *head*, starts with that of the empty journal (`EMPTY_HEAD`) and is updated by every entry:
   head(n) = SHA-256("evopolicy journal 1" NUL | head(n - 1) | SHA-256(entry n)).
-- A commitment is SHA-256("evopolicy commitment 1" NUL | salt | document). The salt is 32 random bytes, so that nobody can
-  try out documents; the document (`Opening`) holds all three splits and all settings of a run.
+- A commitment is SHA-256("evopolicy commitment 1" NUL | salt | document). The salt is 32 random bytes, so that
+  documents
+  cannot be guessed; the document (`Opening`) holds all three splits and all settings of a run.
 - The entry that ends a run holds the SHA-256 of its result (`Result`).
 
-Documents and entries are kept and published as the bytes that were hashed, and never encoded again: fields that a later
-version adds change nothing of what is stored.
+Documents and entries are stored and published as the bytes that were hashed, and never encoded again: fields added by a
+later version do not change stored data.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ _EPOCH = b"evopolicy epoch 1\0"
 
 
 class Opened(msgspec.Struct, frozen=True, kw_only=True, tag="opened", tag_field="kind"):
-    """A run was opened, before its agent could start."""
+    """A run was opened. Written before its agent could start."""
 
     run: Word
     commitment: Word
     """SHA-256 (hex)."""
     epoch: Word
     entry: Word
-    """Name of the agent; with `exp_id`, `env` and `repeat` it says which place in an experiment the run was opened for."""
+    """Name of the agent; with `exp_id`, `env` and `repeat` it identifies the run's place in an experiment."""
     model: Word
     env: Word
     exp_id: Word
@@ -51,7 +52,7 @@ class Opened(msgspec.Struct, frozen=True, kw_only=True, tag="opened", tag_field=
 
 
 class Ended(msgspec.Struct, frozen=True, kw_only=True, tag="ended", tag_field="kind"):
-    """A run is over."""
+    """A run ended."""
 
     run: Word
     status: Word
@@ -62,7 +63,7 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True, tag="ended", tag_field="k
 
 
 class Revealed(msgspec.Struct, frozen=True, kw_only=True, tag="revealed", tag_field="kind"):
-    """Runs of an epoch were published: its cases are no secret any more."""
+    """Runs of an epoch were published: its cases are no longer secret."""
 
     epoch: Word
     runs: Many[Word]
@@ -73,7 +74,7 @@ Entry = Opened | Ended | Revealed
 
 
 class Opening(msgspec.Struct, frozen=True, kw_only=True):
-    """What a commitment is of."""
+    """The document of a commitment."""
 
     run: Word
     epoch: Word
@@ -86,16 +87,16 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     validation: Many[Case]
     heldout: Many[Case]
     cases_secret: bool
-    """Whether nobody could guess the hidden cases."""
+    """Whether the hidden cases are unpredictable."""
     allowed_imports: Many[Word]
     denied_imports: Many[Word]
     audit_share: Number
     policy_seeds: Word
-    """SHA-256 (hex) of the secret that the policies' random seeds derive from."""
+    """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
 
 
 class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One accepted submit."""
+    """The result of one accepted submit."""
 
     submit_index: Int
     status: SubmitStatus
@@ -107,7 +108,7 @@ class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run came to, as far as numbers go."""
+    """The numbers of a run's result."""
 
     run: Word
     status: Word
@@ -124,7 +125,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def result_of(finished: RunFinished) -> Result:
-    """The part of a finished run that its last entry fixes."""
+    """The part of a finished run that its last entry commits to."""
     return Result(
         run=finished.run,
         status=finished.status,
@@ -152,7 +153,7 @@ def result_of(finished: RunFinished) -> Result:
 
 
 def document(content: Entry | Opening | Result) -> bytes:
-    """The bytes that are hashed and kept."""
+    """The bytes of a document or entry, as they are hashed and stored."""
     return msgspec.json.encode(content, order="sorted")
 
 
@@ -160,7 +161,7 @@ _entries: msgspec.json.Decoder[Entry] = msgspec.json.Decoder(Entry)
 
 
 def read_entry(data: bytes) -> Entry:
-    """ProtocolError for bytes that are no entry which this version knows."""
+    """Decodes an entry. Raises ProtocolError for bytes that this version does not know as an entry."""
     try:
         return _entries.decode(data)
     except (*DECODE_ERRORS, ValueError) as error:
@@ -168,7 +169,7 @@ def read_entry(data: bytes) -> Entry:
 
 
 def commitment(salt: bytes, opening: bytes) -> str:
-    """SHA-256 (hex) of a document with its salt."""
+    """Commitment (SHA-256, hex) to a document with its salt."""
     return hashlib.sha256(_COMMITMENT + salt + opening).hexdigest()
 
 
@@ -178,7 +179,7 @@ def digest(data: bytes) -> str:
 
 
 def head_after(head: str, entry: bytes) -> str:
-    """The journal's head (hex) once `entry` is added to one whose head is `head`."""
+    """The journal's head (hex) after `entry` is appended to a journal with the head `head`."""
     return hashlib.sha256(_LINK + bytes.fromhex(head) + hashlib.sha256(entry).digest()).hexdigest()
 
 
@@ -192,26 +193,27 @@ def heads(entries: Iterable[bytes]) -> list[str]:
 
 
 def epoch_of(secret: bytes) -> str:
-    """The public name of the epoch whose cases derive from `secret` (256 random bits, which the name does not tell)."""
+    """The public name of the epoch whose cases derive from `secret` (256 random bits, which the name does not
+    reveal)."""
     return hashlib.sha256(_EPOCH + secret).hexdigest()[:16]
 
 
 class Epoch(msgspec.Struct, frozen=True, kw_only=True):
-    """What a journal says of an epoch."""
+    """An epoch, as a journal describes it."""
 
     epoch: str
     opened: int
-    """Runs opened on its cases."""
+    """Number of runs opened on its cases."""
     ended: int
-    """Of those, how many are over."""
+    """Number of those that have ended."""
     began_at: float
-    """When the first run was opened, Unix seconds."""
+    """Opening of the first run, Unix time, seconds."""
     revealed_at: float | None
-    """When its cases became public; None while they are secret."""
+    """Time at which its cases became public, Unix time, seconds; None while they are secret."""
 
 
 def epochs(entries: Iterable[Entry]) -> tuple[Epoch, ...]:
-    """The epochs that a journal tells of, in the order of their first runs."""
+    """The epochs in a journal, in the order of their first runs."""
     runs: dict[str, str] = {}
     began: dict[str, float] = {}
     revealed: dict[str, float] = {}

@@ -1,7 +1,7 @@
-"""Values as JSON, the same bytes every time.
+"""Encodes values as JSON, with the same bytes every time.
 
-JSON has no NaN and no infinities, so they are the texts `"NaN"`, `"Inf"` and `"-Inf"` wherever a number may stand.
-numpy numbers are written in the shortest form that reads back as the same number of their own dtype.
+JSON has no NaN and no infinities, so they become the texts `"NaN"`, `"Inf"` and `"-Inf"` wherever a number may stand.
+numpy numbers are written in the shortest form that parses to the same number of their own dtype.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ import orjson
 
 
 def json_bytes(value: Any) -> bytes:
-    """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and odd objects as text."""
+    """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and unknown objects as text."""
     try:
         data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
     except orjson.JSONEncodeError:
         pass
     else:
-        # orjson writes NaN and infinities as null: without one there was none. Nearly every row ends here.
+        # orjson writes NaN and infinities as null, so output without null contains none. Nearly every row returns here.
         if b"null" not in data:
             return data
     told = plain(value)
     try:
         return orjson.dumps(told, option=orjson.OPT_SERIALIZE_NUMPY)
     except orjson.JSONEncodeError:
-        # What a hostile policy can make: lone surrogates, integers of more than 64 bits.
+        # Hostile policies can produce such values: lone surrogates, integers of more than 64 bits.
         return json.dumps(_odd(told), ensure_ascii=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def plain(value: Any) -> Any:
-    """`value` with every number that JSON cannot say as text; arrays stay arrays where all of them are finite."""
+    """`value` with every number that JSON cannot represent as text; arrays without such numbers stay arrays."""
     if isinstance(value, float):
         return value if math.isfinite(value) else _name(value)
     if value is None or isinstance(value, str | bool | int):
@@ -82,7 +82,7 @@ def _name(value: float) -> str:
 
 
 def _odd(value: Any) -> Any:
-    """For the standard library's encoder: numpy as lists."""
+    """Converts numpy values to lists for the standard library's encoder."""
     if isinstance(value, dict):
         return {key: _odd(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -106,9 +106,9 @@ def rows_text(
     truncated: Iterable[bool],
     infos: Iterable[Any],
 ) -> bytes:
-    """Lines of `trajectory.jsonl` from step `first` on: the same bytes as `json_bytes` makes of each, in one go.
+    """Lines of `trajectory.jsonl` from step `first` on: the same bytes as `json_bytes` of each row, encoded at once.
 
-    `obs` None: they are stored beside it.
+    `obs` None: observations are stored in a file of their own.
     """
     columns = (itertools.repeat(None) if obs is None else obs, actions, rewards, terminated, truncated, infos)
     rows = [
@@ -127,8 +127,8 @@ def rows_text(
         text = orjson.dumps(rows, option=orjson.OPT_SERIALIZE_NUMPY)
     except orjson.JSONEncodeError:
         text = b""
-    # What looks like the border of two rows may be a policy's text: then there are more of them than borders. The same
-    # goes for null, which stands for NaN too.
+    # A policy's text may look like the border of two rows; then there are more matches than borders. Likewise null may
+    # be text, or stand for NaN.
     nulls = len(rows) if obs is None else 0
     if text and text.count(_BETWEEN) == len(rows) - 1 and text.count(b"null") == nulls:
         return text[1:-1].replace(_BETWEEN, b'}\n{"t":') + b"\n"
@@ -136,7 +136,7 @@ def rows_text(
 
 
 def as_lists(value: Any) -> Any:
-    """What a policy that asked for lists received."""
+    """`value` in the form that policies with `observations` "lists" receive."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, dict):

@@ -1,9 +1,10 @@
-"""`.npz` files that are written as their arrays' rows come, which `numpy.load` reads.
+"""`.npz` files for `numpy.load`, written while their arrays' rows arrive.
 
 Rules that this module owns:
-- Rows are compressed at once; an array is never in memory as a whole. The same rows give the same bytes with one zlib.
-- A member's header tells how many rows there are, which is known at the end only: it is a compressed block of its own, put
-  before the others.
+- Rows are compressed at once; memory never holds a whole array. With one zlib, the same rows give the same bytes.
+- A member's header contains the number of rows, which is known only at the end. So the header is a compressed block of
+  its
+  own, placed before the others.
 """
 
 from __future__ import annotations
@@ -19,26 +20,27 @@ from numpy.typing import NDArray
 from evopolicy_common.errors import ProtocolError
 
 LEVEL = 1
-"""Of zlib. Of CarRacing's pictures 1,870 bytes a frame remain of 27,648; level 6 makes it 1,160 and takes 2.6 times as long."""
+"""zlib level. Level 1 reduces CarRacing's frames from 27,648 to 1,870 bytes; level 6 reaches 1,160 and takes 2.6
+times as long."""
 MAX_BYTES = (1 << 32) - (1 << 20)
-"""Of a member, unpacked, and of the file: no larger one is made, so that no reader needs ZIP64."""
+"""Limit of a member, unpacked, and of the file, bytes; readers need no ZIP64."""
 
 _LOCAL = struct.Struct("<4sHHHHHLLLHH")
 _CENTRAL = struct.Struct("<4sHHHHHHLLLHHHHHLL")
 _END = struct.Struct("<4sHHHHLLH")
 _VERSION, _UTF8, _DEFLATED, _DAY = 20, 0x800, 8, 0x21
-"""Dated 1980-01-01 whatever the clock says."""
+"""Constants of the ZIP headers. The date is always 1980-01-01."""
 
 
 class NpzWriter:
-    """One file. Not thread-safe."""
+    """Writes one file. Not thread-safe."""
 
     def __init__(self) -> None:
         self._members: dict[str, _Member] = {}
         self._texts: dict[str, list[Any]] = {}
 
     def add(self, name: str, rows: NDArray[Any] | list[Any]) -> None:
-        """More rows of an array, n × its shape, or of texts. ProtocolError where they are not like those before."""
+        """Adds rows of an array (n × its shape) or texts. Raises ProtocolError when they do not match earlier rows."""
         if isinstance(rows, list):
             self._texts.setdefault(name, []).extend(rows)
             return
@@ -48,7 +50,7 @@ class NpzWriter:
         member.add(rows)
 
     def finish(self) -> bytes:
-        """The file's bytes. The writer is not used afterwards."""
+        """The file's bytes. The writer must not be used afterwards."""
         for name, texts in self._texts.items():
             kind = np.str_ if all(isinstance(text, str) for text in texts) else None
             self.add(name, np.array(texts, dtype=kind))
@@ -67,7 +69,7 @@ class NpzWriter:
 
 
 class _Member:
-    """One array."""
+    """One array of the file."""
 
     def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         if dtype.hasobject:
@@ -96,7 +98,7 @@ class _Member:
         self._pieces.append(self._stream.compress(data))
 
     def finish(self) -> tuple[int, int, bytes]:
-        """Checksum and size of the `.npy` file, and its bytes, deflated."""
+        """CRC-32 and size (bytes) of the `.npy` file, and its deflated bytes."""
         out = io.BytesIO()
         told = {
             "descr": np.lib.format.dtype_to_descr(self._dtype),
@@ -106,7 +108,7 @@ class _Member:
         np.lib.format.write_array_header_1_0(out, told)
         header = out.getvalue()
         first = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
-        # Flushed to a whole byte and not ended: what follows goes on from there.
+        # Flushed to a whole byte but not ended: the next block follows in the same stream.
         packed = b"".join(
             [first.compress(header), first.flush(zlib.Z_FULL_FLUSH), *self._pieces, self._stream.flush()]
         )
@@ -115,9 +117,10 @@ class _Member:
 
 
 def crc_of_both(first: int, second: int, n: int) -> int:
-    """CRC-32 of two texts one after the other, from that of each and the bytes of the second.
+    """CRC-32 of two concatenated texts, from their CRCs and the second one's length `n` in bytes.
 
-    To append n bytes is to multiply by x^8n modulo the polynomial; coefficients stand in reverse, the highest bit is x^0.
+    Appending n bytes multiplies by x^8n modulo the polynomial. Coefficients are in reverse order: the highest bit is
+    x^0.
     """
     factor, power = 1 << 31, 1 << 23  # x^0 and x^8
     while n:

@@ -1,13 +1,15 @@
-"""An episode as its feedback files, made where it was played: whoever writes them to disk only unpacks and checks them.
+"""An episode as its feedback files, rendered where it was played: the receiver only checks and unpacks them.
 
 Rules that this module owns:
-- The same steps give the same bytes. The rows are those of `json_text.rows_text`; observations that are stored outside
-  them are one `.npz` file.
-- Beside the files stands the log of actions, rewards and flags, as a trajectory with record "actions": from it an audit takes
-  the actions, bit for bit as they were returned. Nothing in it is not in the files too.
-- Rows and pictures are compressed as they come.
-- Nothing is believed of what comes from elsewhere: sizes are held to the limits before anything is unpacked, and the rows to
-  the length and the return that were declared.
+- The same steps give the same bytes. The rows are those of `json_text.rows_text`; observations outside the rows are one
+  `.npz` file.
+- Beside the files is the log of actions, rewards and flags, as a trajectory with record "actions". Audits take the
+  actions
+  from it, bit for bit as they were returned. The log contains nothing that the files do not.
+- Rows and pictures are compressed as they arrive.
+- Received bytes are not trusted: sizes are checked against the limits before anything is unpacked, and the rows against
+  the
+  declared length and return.
 - Layout: `magic, {length, header}, {length, log}, {length, file}…`.
 """
 
@@ -34,21 +36,21 @@ MAGIC = b"evofeed1"
 ROWS: Final = "trajectory.jsonl"
 OBSERVATIONS: Final = "observations.npz"
 SINGLE = "observations"
-"""Name of the array of observations that are one array a step."""
+"""Array name for observations that are one array per step."""
 MAX_ROWS_BYTES = 256 << 20
-"""Of `trajectory.jsonl`. Actions alone cannot make so many: see `ResourceLimits.episode_action_bytes`."""
+"""Limit of `trajectory.jsonl`, bytes. Actions alone cannot reach it: see `ResourceLimits.episode_action_bytes`."""
 MAX_OBSERVATIONS_BYTES = 1 << 30
-"""Of `observations.npz`."""
+"""Limit of `observations.npz`, bytes."""
 MAX_ARRAYS = 4096
-"""In it."""
+"""Most arrays in `observations.npz`."""
 MIN_PICTURE_SIDE = 16
-"""Height × width of bytes is a picture from this side on; smaller ones are symbols."""
+"""Least height and width of a picture; smaller arrays of bytes count as symbols."""
 
 _LENGTH = struct.Struct("<I")
 _MAX_HEADER_BYTES = 4096
 _STEPS_AT_ONCE = 256
 _ROWS_AT_ONCE = 1 << 20
-"""Bytes of rows that are checked at once."""
+"""Bytes of rows checked at once."""
 _ODD = (
     *DECODE_ERRORS,
     zstandard.ZstdError,
@@ -65,32 +67,32 @@ class File(msgspec.Struct, frozen=True, kw_only=True):
 
     name: Literal["trajectory.jsonl", "observations.npz"]
     size: int
-    """Bytes of the file."""
+    """Size of the unpacked file, bytes."""
     packed: Literal["zstd", "as it is"]
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
-    """What follows it."""
+    """The container's header."""
 
     observations: ObservationForm
     n: int
-    """Steps."""
+    """Number of steps."""
     files: tuple[File, ...]
     left_out: str = ""
-    """Why there are no files; empty where there are."""
+    """Why there are no files; empty when there are."""
 
 
 _headers = msgspec.msgpack.Decoder(Header)
 
 
 class Renderer(Recorder):
-    """A `Recorder` whose bytes are the feedback files and the log of actions."""
+    """A `Recorder` that produces the feedback files and the log of actions."""
 
     def __init__(self, observations: ObservationForm, storage: ObsStorage) -> None:
-        """`storage`: where observations are kept; all but "inline" is `observations.npz`."""
+        """`storage`: where observations are kept; every value except "inline" means `observations.npz`."""
         super().__init__("actions", observations)
         self._form: ObservationForm = observations
-        # Kept for a block, until they are rendered.
+        # Observations are kept for a block, until they are rendered.
         self._full = True
         self._npz = None if storage == "inline" else NpzWriter()
         self._compressor = zstandard.ZstdCompressor(level=1).compressobj()
@@ -99,7 +101,7 @@ class Renderer(Recorder):
         self._left_out = ""
 
     def finish(self) -> bytes:
-        """The container's bytes. The recorder is not used afterwards."""
+        """The container's bytes. The recorder must not be used afterwards."""
         log = super().finish()
         files: list[tuple[File, bytes]] = []
         if not self._left_out:
@@ -129,7 +131,7 @@ class Renderer(Recorder):
 
     def _begin_block(self, obs: Any) -> None:
         super()._begin_block(obs)
-        # Arrays that are stored outside are compressed at once: a block of pictures would be large.
+        # Arrays stored outside the rows are compressed at once: a block of pictures would be large.
         is_single = self._npz is not None and isinstance(obs, np.ndarray)
         self._pictures = _Single(self._put_observations) if is_single else None
 
@@ -141,7 +143,7 @@ class Renderer(Recorder):
         self._clear()
 
     def _render(self, first: int, block: dict[str, Any]) -> None:
-        """Adds the text of the block's rows, and its observations where they are stored beside them."""
+        """Renders the block's rows as text, and its observations where they are stored outside the rows."""
         obs: list[Any] | None = self._obs
         if self._npz is not None:
             if self._obs:
@@ -176,7 +178,7 @@ class Renderer(Recorder):
 
 
 class _Rows(NamedTuple):
-    """Steps, a list for each part of them."""
+    """Steps, as one list per field."""
 
     obs: list[Any] | None
     actions: Sequence[Any]
@@ -186,9 +188,10 @@ class _Rows(NamedTuple):
     infos: list[dict[str, Any]]
 
     def texts(self, first: int, size: int) -> Iterator[bytes]:
-        """The lines from step `first` on, some at a time; ProtocolError where they and the `size` before are too large.
+        """Yields the lines from step `first` on in portions. Raises ProtocolError when `size` plus their bytes exceeds
+        the limit.
 
-        Not all at once: an action may be few bytes, and its text many.
+        Portions are needed because a short action may have a long text.
         """
         for at in range(0, len(self.rewards), _STEPS_AT_ONCE):
             part = [None if column is None else column[at : at + _STEPS_AT_ONCE] for column in self]
@@ -202,13 +205,13 @@ class _Rows(NamedTuple):
 
 
 class _Single:
-    """Takes the observations of a block that are one array a step."""
+    """Receives a block's observations when they are one array per step."""
 
     def __init__(self, put: Callable[[str, Any], None]) -> None:
         self._put = put
 
     def add(self, obs: Any, /) -> bool:
-        """False, and nothing is done, where it is no array."""
+        """Stores one observation. Returns False, without a change, when it is not an array."""
         if not isinstance(obs, np.ndarray):
             return False
         self._put(SINGLE, obs[np.newaxis])
@@ -216,7 +219,7 @@ class _Single:
 
 
 class Container:
-    """The parts of a rendered episode. ProtocolError where `data` is none; nothing is unpacked yet."""
+    """The parts of a rendered episode, still packed. Raises ProtocolError when `data` is not a rendered episode."""
 
     def __init__(self, data: bytes) -> None:
         try:
@@ -232,7 +235,8 @@ class Container:
         self._files = dict(zip(self.header.files, parts[2:], strict=True))
 
     def files(self) -> dict[str, bytes]:
-        """The files by name; ProtocolError where they are left out, too large, or not as large as is said."""
+        """The unpacked files by name. Raises ProtocolError when they are missing, too large, or not of the declared
+        size."""
         if self.header.left_out or not self._files:
             raise ProtocolError(self.header.left_out or "a rendered episode without files")
         try:
@@ -242,19 +246,19 @@ class Container:
 
 
 def is_rendered(data: bytes) -> bool:
-    """Whether these are the bytes of a rendered episode, by their mark; a trajectory has another."""
+    """Whether `data` is a rendered episode, by its magic bytes; a trajectory has others."""
     return data[: len(MAGIC)] == MAGIC
 
 
 def decode(data: bytes) -> Trajectory:
-    """The episode in a trajectory's bytes or a rendered one's; ProtocolError when it is none."""
+    """Decodes a trajectory or a rendered episode. Raises ProtocolError when `data` is neither."""
     if not is_rendered(data):
         return trajectory.decode(data)
     container = Container(data)
     log = trajectory.decode(container.log)
     if log.n != container.header.n:
         raise ProtocolError(f"a rendered episode of {container.header.n} steps has a log of {log.n}")
-    # Without files the log is all there is.
+    # Without files only the log remains.
     files = {} if container.header.left_out else container.files()
     return msgspec.structs.replace(
         log, record="full" if files else "actions", observations=container.header.observations, files=files
@@ -262,7 +266,7 @@ def decode(data: bytes) -> Trajectory:
 
 
 def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, bytes]:
-    """The feedback files of a rendered episode; ProtocolError where they are not those of one of that length and return."""
+    """The feedback files of a rendered episode. Raises ProtocolError when they do not match that length and return."""
     files = Container(data).files()
     n, total = 0, 0.0
     rows = memoryview(files.get(ROWS, b""))
@@ -277,7 +281,7 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
             if row.t != n:
                 raise ProtocolError(f"row {n} of {ROWS} says that it is of step {row.t}")
             n += 1
-            # In the order in which the worker has added them up.
+            # Summed in the same order as on the worker, as floating-point sums depend on it.
             total += row.reward
         at = end or len(rows)
     if (n, total) != (length, episode_return):
@@ -288,7 +292,7 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
 
 
 class _Told(msgspec.Struct):
-    """What is checked of a row; the rest is skipped."""
+    """The checked fields of a row; the rest is skipped."""
 
     t: int
     reward: float
@@ -298,9 +302,9 @@ _told = msgspec.json.Decoder(_Told)
 
 
 def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes]:
-    """The feedback files of an episode, made here unless they were made already.
+    """The feedback files of an episode, rendered here if they were not rendered before.
 
-    `storage` None: as the observations themselves suggest. ProtocolError for more than `trajectory.jsonl` may hold.
+    `storage` None: chosen by the observations themselves. Raises ProtocolError beyond the limit of `trajectory.jsonl`.
     """
     if episode.files:
         return episode.files
@@ -324,7 +328,8 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
 
 
 def is_picture(shape: tuple[int, ...], dtype: str) -> bool:
-    """Whether arrays of this shape and dtype are pictures: bytes of height × width, with channels or stacked, or both."""
+    """Whether arrays of this shape and dtype are pictures: uint8 of height × width, optionally stacked, with
+    channels, or both."""
     if dtype != "uint8" or not 2 <= len(shape) <= 4:
         return False
     channels = len(shape) > 2 and shape[-1] < MIN_PICTURE_SIDE
@@ -374,7 +379,7 @@ def _unpacked(file: File, data: memoryview) -> bytes:
 
 
 def _check_archive(data: bytes) -> None:
-    """Whoever loads the arrays needs no more memory than an episode's may take."""
+    """Raises ValueError when loading the arrays would need more memory than an episode may."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
     size = sum(member.file_size for member in members)

@@ -1,8 +1,10 @@
-"""Where two run directories differ, leaving out the published list of what may: `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
+"""Differences between two run directories, except for the published lists `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
 
-What is left must be equal byte for byte, JSON files up to the excluded fields: the same agent on the same cases comes to
-the same run whatever the number of workers, their order, and the failures on the way. A run that an earlier version wrote is
-compared with one of this version up to `OLD_FILES` and `OLD_FIELDS`, which only one of the two tells.
+All else must be equal byte for byte, JSON files except for the excluded fields: the same agent on the same cases gives
+the
+same run, independent of the number of workers, their order, and failures. When exactly one of the two runs was written
+by
+an earlier version, `OLD_FILES` and `OLD_FIELDS` are excluded too.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",
     "workspace/AGENTS.md": "names the gateway's port and its random token",
 }
-"""Patterns of paths in a run directory that are not compared, and why."""
+"""Path patterns in a run directory that are not compared, with the reason."""
 
 EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "run.json": {
@@ -46,7 +48,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "errors.txt": {"timestamp": "a time"},
     "error.txt": {"timestamp": "a time"},
 }
-"""Fields that are not compared, by the name of their file, and why. The text files hold JSON lines."""
+"""Fields that are not compared, by the name of their file, with the reason. The text files hold JSON lines."""
 
 OLD_FILES = ("checkpoints/*/_meta.json", "checkpoints/*/metrics.json")
 OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
@@ -55,25 +57,25 @@ OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
     "errors.txt": ("schema_version",),
     "error.txt": ("schema_version",),
 }
-"""What earlier versions wrote otherwise. Fields that only one of the two runs has are left out too."""
+"""Fields that earlier versions wrote differently. Fields that only one of the two runs has are excluded too."""
 
 _OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
 
 MAX_PARSED_BYTES = 64 << 20
-"""A file above this is an agent's, whatever its name, and compared as it is."""
+"""Larger files, in bytes, come from an agent, whatever their name, and are compared as plain bytes."""
 MAX_COMPARED_BYTES = 1 << 30
-"""An agent may leave files of any size that take no room."""
+"""Larger files, in bytes, are not compared: an agent may leave huge sparse files."""
 
 
 def left_out() -> list[str]:
-    """The published list, a line for each: what is not compared, and why."""
+    """The published list, one line per exclusion, with its reason."""
     files = [f"{pattern}: {why}" for pattern, why in EXCLUDED_FILES.items()]
     fields = EXCLUDED_FIELDS.items()
     return files + [f"{file}, {name}: {why}" for file, names in fields for name, why in names.items()]
 
 
 def differences(left: Path, right: Path) -> list[str]:
-    """One line for each file or field in which two run directories differ; empty when they are the same run."""
+    """One line per file or field in which two run directories differ; empty when they are the same run."""
     old = _is_old(left) != _is_old(right)
     ours, theirs = _files(left, old), _files(right, old)
     found = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
@@ -84,7 +86,8 @@ def differences(left: Path, right: Path) -> list[str]:
 
 
 def shortened(found: Sequence[str], left: Path, right: Path) -> list[str]:
-    """The lines of `differences(left, right)` for people: scores first, and folders in place of files that one run lacks."""
+    """The lines of `differences(left, right)` for people: scores first, and folders in place of files that one run
+    lacks."""
     ends = tuple(f": only in {side}" for side in (left, right))
     scores = [line for line in found if line.startswith("run.json: outcome.")]
     scores.sort(key=lambda line: not line.startswith("run.json: outcome.final_score:"))
@@ -112,7 +115,7 @@ def _is_old(root: Path) -> bool:
 
 
 def _files(root: Path, old: bool) -> dict[str, Path]:
-    """Regular files by their path in the run, those that are excluded aside. `old`: one of the two runs is old."""
+    """The compared files by their path in the run. `old`: one of the two runs is from an earlier version."""
     paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
     if old and _is_old(root):
         paths = {_OLD_SYSTEM.sub(r"\1", name): path for name, path in paths.items()}
@@ -169,7 +172,7 @@ def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any,
         return found
     if _objects(left) and _objects(right) and len(left) == len(right):
         return [found for a, b in zip(left, right, strict=True) for found in _value_differences(path, a, b)]
-    # NaN is no JSON here, so equality is exact.
+    # JSON here contains no NaN, so equality is exact.
     return [] if type(left) is type(right) and left == right else [(path, left, right)]
 
 

@@ -1,4 +1,4 @@
-"""Where finished runs are below some folders, and which submits a run's folder holds."""
+"""Finds finished runs below folders, and the submits of a run's folder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ _SUBMIT = re.compile(r"submit_([0-9]{1,9})")
 
 
 def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
-    """Run directories at or under `paths`, sorted, without repeats, and those of `paths` under which there is none.
+    """Run directories at or under `paths`, sorted and distinct, and those of `paths` that contain none.
 
-    A folder with a `run.json`, or one that was begun (`workspace/` beside `logs/` or `checkpoints/`), is a run
-    directory, and is not searched further. Links below the given paths are not followed.
+    A run directory is a folder with a `run.json`, or one of a started run (`workspace/` beside `logs/` or
+    `checkpoints/`);
+    it is not searched further. Links below the given paths are not followed.
     """
     found: set[Path] = set()
     without: list[Path] = []
@@ -38,7 +39,7 @@ def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def submit_indices(folder: Path) -> set[int]:
-    """Of the folders `submit_NNN` in `folder`; empty where there is none."""
+    """Indices of the folders `submit_NNN` in `folder`; empty if it has none or does not exist."""
     if not folder.is_dir():
         return set()
     matches = (_SUBMIT.fullmatch(child.name) for child in folder.iterdir())

@@ -1,10 +1,14 @@
-"""`run.json`: what a run leaves behind, typed.
+"""`run.json`: the typed record of a run.
 
-The run's finaliser writes it, reports and `verify` read it. It is written once, last, after the agent and its children are
-gone: it holds hidden scores. It has the published fields in their published meaning, and more. Reading skips unknown
-fields and a field added later has a default; a file whose `record_version` is higher than ours is refused. Files of version
-1, whose `schema_version` is the number 1, are read as if they were of this version. Paths are relative to the run directory.
-Instants are UTC texts as `summary.utc_text` writes them; durations are seconds.
+The run's finaliser writes it; reports and `verify` read it. It is written once and last, after the agent and its
+children
+have ended, because it holds hidden scores. It has the published fields in their published meaning, and more. Readers
+skip
+unknown fields, and a field added later has a default; a file with a higher `record_version` than ours is refused. Files
+of
+version 1, whose `schema_version` is the number 1, are converted on reading. Paths are relative to the run directory.
+Times are
+UTC texts as `summary.utc_text` writes them; durations are seconds.
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation, Run
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 RECORD_VERSION = 2
-"""Of the fields that are ours. Raised only when an older reader would misunderstand a file; fields may be added without it."""
+"""Version of our own fields. Incremented only when an older reader would misunderstand a file; adding fields does
+not need it."""
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
@@ -33,19 +38,19 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Token use of the whole run, as the paper's appendix on token accounting defines it. Counts, not millions."""
 
     input_noncached: int
-    """Input tokens that no cache served (for streams that count cached ones in: input minus cached)."""
+    """Input tokens not served from a cache (for streams that include cached ones: input minus cached)."""
     cache_read: int
     cache_creation: int
     output: int
-    """Output tokens, reasoning included."""
+    """Output tokens, including reasoning."""
     reasoning: int | None = None
-    """How much of `output` was reasoning; None when the stream does not tell."""
+    """Reasoning tokens within `output`; None when the stream does not report them."""
     cost: float | None = None
-    """US dollars; None without prices."""
+    """Cost in US dollars; None without prices."""
 
 
 class Agent(msgspec.Struct, frozen=True, kw_only=True):
-    """Who played: one leaderboard entry."""
+    """The agent of the run: one leaderboard entry."""
 
     entry: str
     """Name of the leaderboard entry: model and harness, or the operator's name for it."""
@@ -53,18 +58,18 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
     cli_version: str | None = None
     model_string: str | None = None
-    """What the harness was told to use; None for agents without a model."""
+    """The model that the harness was configured with; None for agents without a model."""
     settings: dict[str, Any] = {}
-    """What else it was started with: effort, extra arguments, retry base; no secrets."""
+    """Other start settings: effort, extra arguments, retry base; no secrets."""
     retries: int = 0
-    """Times the session was resumed after a provider's or harness's failure."""
+    """How often the session was resumed after a provider's or harness's failure."""
     turns: int = 0
     tokens: Tokens | None = None
-    """None when the agent tells nothing of tokens."""
+    """None when the agent reports no tokens."""
 
 
 class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
-    """What defines the experiment beside agent and environment; runs that differ here are not one comparison."""
+    """What defines the experiment besides agent and environment; runs that differ here are not comparable."""
 
     episode_budget: int
     min_episodes_per_submit: int
@@ -77,43 +82,45 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     video: VideoOption = "off"
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
-    """Whether the agent's rules let it simulate the environment. Runs from before this was recorded had no rule against it."""
+    """Whether the agent's rules allow it to simulate the environment. Runs from before this was recorded had no rule
+    against it."""
     finish: FinishRule = "early"
-    """Whether a run whose agent stops before its budget is spent is scored (`early`) or an error (`budget`)."""
+    """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
     step_limit: StepLimit = "natural"
-    """Where episodes are cut: as the published software cuts them, or by their environment's own limit alone, as all runs
-    from before this was recorded."""
+    """Where episodes are cut: where the published software cuts them, or only by their environment's own limit, as
+    in all runs from before this was recorded."""
     profile: Profile = "own"
-    """`published`: all choices of the published protocol together, its public case files among them."""
+    """`published`: all choices of the published protocol together, including its public case files."""
     hidden_cases: HiddenCases = "shared"
-    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run`, which allows no pairing."""
+    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run`, which allows no paired
+    statistics."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the wall time went. The phases need not add up to `wall_time_seconds`."""
+    """How the wall time was spent. The phases need not add up to `wall_time_seconds`."""
 
     start_time: str
     end_time: str
     wall_time_seconds: float
     """From the run's opening to `run.json`."""
     agent_s: float = 0.0
-    """Agent alone: no submit of it in flight."""
+    """Only the agent worked: no submit was in flight."""
     queue_s: float = 0.0
     """A submit waited and none of its episodes ran."""
     rollout_s: float = 0.0
     """At least one train episode ran."""
     feedback_s: float = 0.0
-    """From the last episode's result to the submit's answer."""
+    """From the last episode's result to the reply to the submit."""
     held_s: float = 0.0
-    """A submit waited because hidden episodes had the machines; in none of the phases and against no limit."""
+    """A submit waited because hidden episodes occupied the machines; part of no phase, and counted against no limit."""
     permit_s: float = 0.0
-    """The agent's start waited until its machine played no hidden episodes that its run shares; in none of the phases."""
+    """The agent's start waited while its machine played hidden episodes of related runs; part of no phase."""
     finalise_s: float = 0.0
     """From the agent's end to `run.json`."""
 
 
 class PolicyFailureRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A policy failed in one hidden episode (train failures are in the feedback)."""
+    """A policy's failure in one hidden episode (train failures are in the feedback)."""
 
     split: Split
     submit_index: int
@@ -125,28 +132,28 @@ class PolicyFailureRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Uniform random actions on this run's own held-out cases."""
+    """The score of uniform random actions on this run's own held-out cases."""
 
     mean_return: float
     std_return: float
     """Population standard deviation."""
     returns: tuple[float, ...] = ()
     seeded_by: Literal["case", "run"] = "run"
-    """What the actions follow from: `case` for split and case alone, the same numbers in every run on the split. `run` for
-    a run's own secret, in runs of earlier versions: those differ from run to run."""
+    """What determines the actions. `case`: only split and case, so the numbers are the same in every run on the
+    split. `run`: a run's own secret, as in runs of earlier versions, which differ from run to run."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run came to. Every score is None unless `status` is `completed`, but for `final_score`."""
+    """The result of the run. Every score except `final_score` is None unless `status` is `completed`."""
 
     status: RunEnd
     error: str | None = None
     """Why the status is `error` or `cancelled`, for the operator."""
     final_score: float | None = None
-    """The held-out mean return: the run's number in the paper's table. As published, 0.0 for `no_ok_submit`, where it means
-    nothing; see `score`."""
+    """The held-out mean return: the run's number in the paper's table. As published, 0.0 for `no_ok_submit`, where
+    it is meaningless; see `score`."""
     best_submit_index: int | None = None
-    """The selected checkpoint's submit."""
+    """Index of the submit of the selected checkpoint."""
     val_scores: dict[str, float] | None = None
     """Submit index (decimal text) to mean return on validation, for every eligible `ok` checkpoint."""
     heldout_mean_return: float | None = None
@@ -156,14 +163,15 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """In the order of the split's cases."""
     policy_failures: tuple[PolicyFailureRecord, ...] = ()
     quarantined_submits: tuple[int, ...] = ()
-    """`ok` checkpoints that brought their slot down in hidden evaluation: not eligible."""
+    """`ok` checkpoints that made their slot fail in hidden evaluation: not eligible."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
-    """Why no more submits were taken: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""
+    """Why no more submits were accepted: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
+    `cancelled`."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}
-    """`code_metrics_best`, `code_metrics_by_submit` and `code_metrics_trend` as published, and counts of ours."""
+    """`code_metrics_best`, `code_metrics_by_submit` and `code_metrics_trend` as published, and our own counts."""
 
     @property
     def score(self) -> float | None:
@@ -172,12 +180,13 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def random_score(self) -> float | None:
-        """The mean return of uniform random actions on the same cases; None where they were not played."""
+        """The mean return of uniform random actions on the same cases; None when they were not played."""
         return None if self.random_reference is None else self.random_reference.mean_return
 
     @property
     def agent_never_played(self) -> bool:
-        """The agent failed before it used any budget, such as a CLI that did not start: this is no run of that agent."""
+        """Whether the agent failed before it used any budget, such as a CLI that did not start: this is no run of
+        that agent."""
         return (
             self.status == "no_ok_submit" and self.closed_reason == "agent_failed" and self.budget_used == 0
         )
@@ -187,17 +196,17 @@ RejectedStatus = Literal["budget_invalid", "invalid_env_instance", "run_closed"]
 
 
 class RejectedSubmit(msgspec.Struct, frozen=True, kw_only=True):
-    """A request that was refused before the snapshot and cost nothing."""
+    """A request that was refused before the snapshot and was not charged."""
 
     status: RejectedStatus
     message: str
     at: str = ""
     after_submits: int = 0
-    """Accepted submits before it."""
+    """Number of accepted submits before it."""
 
 
 class Replay(msgspec.Struct, frozen=True, kw_only=True):
-    """A recorded episode: a video, a rendered frame a row."""
+    """A recorded episode: a video with one rendered frame per row."""
 
     path: str
     """`video.mp4` under the run directory, such as `replays/heldout_000/video.mp4`."""
@@ -207,13 +216,13 @@ class Replay(msgspec.Struct, frozen=True, kw_only=True):
     submit_index: int
     episode_return: float | None = None
     length: int | None = None
-    """Steps."""
+    """Number of steps."""
     filmstrip: str | None = None
-    """A PNG with a few of its frames side by side; None when there is none."""
+    """A PNG with some of its frames side by side; None when it does not exist."""
 
 
 class Artifacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Where things are, relative to the run directory; what this run does not have is left out (None)."""
+    """Paths relative to the run directory; artifacts that this run lacks are omitted (None)."""
 
     workspace: str | None = None
     feedback: str | None = None
@@ -224,36 +233,36 @@ class Artifacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Versions(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run was made with. Hashes are `sha256:` and lowercase hex; empty where unknown."""
+    """Versions of the run's components. Hashes are `sha256:` and lowercase hex; empty where unknown."""
 
     harness: str
     """Version of this software."""
     env: str
-    """Name and version of what was played, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
+    """Name and version of the simulated environment, such as `Acrobot-v1 (gymnasium 1.4.0)`."""
     agents_md_hash: str
-    """Of `AGENTS.md` as it was put into the workspace, with this run's URLs."""
+    """Hash of `AGENTS.md` in the workspace, with this run's URLs."""
     data_train_hash: str
-    """Of the bytes of `train.json`; where cases come from no file, of the cases as canonical JSON."""
+    """Hash of the bytes of `train.json`; for cases that come from no file, of the cases as canonical JSON."""
     data_valid_hash: str
     data_heldout_hash: str
     rules_hash: str = ""
-    """Of `AGENTS.md` with placeholders for its URLs: equal for runs with equal rules."""
+    """Hash of `AGENTS.md` with placeholders for its URLs: equal for runs with equal rules."""
     cases_hashes: dict[Split, str] = {}
-    """Of the cases that the run had, as canonical JSON, by split."""
+    """Hashes of the run's cases as canonical JSON, by split."""
     fingerprint: dict[str, str] = {}
-    """Library to version, as the workers that it began with reported."""
+    """Library to version, as reported by the workers with which the run started."""
     fingerprint_overrides: tuple[str, ...] = ()
-    """`CLASS → CLASS: why` for each time an operator let it go on with workers of other versions; empty where one class
-    played it all."""
+    """`CLASS → CLASS: why` for each time an operator let the run continue with workers of other versions; empty when
+    one class played all of it."""
     data_secret: bool = True
-    """False when the splits came from a small public seed."""
+    """False when the splits derive from a small public seed."""
     initial_policy_hash: str | None = None
-    """Of the `policy.py` that the workspace started with."""
+    """Hash of the initial `policy.py` of the workspace."""
     env_deterministic: bool = True
     """False when the environment does not repeat an episode from its seed and actions."""
 
     def cases_hash(self, split: Split) -> str:
-        """What tells apart the cases of a split: `cases_hashes`, or the file's where that is all there is."""
+        """The hash that identifies a split's cases: `cases_hashes`, or the file's hash if that is missing."""
         files: dict[Split, str] = {
             "train": self.data_train_hash,
             "validation": self.data_valid_hash,
@@ -263,28 +272,28 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """The whole of `run.json`."""
+    """The content of `run.json`."""
 
     schema_version: str = PUBLISHED_SCHEMA
     record_version: int = RECORD_VERSION
     protocol_version: str = PROTOCOL_VERSION
     model: str
     env: str
-    """Suite id."""
+    """Suite id of the environment."""
     exp_id: str
     repeat: int = 0
-    """Counts the repeats of one agent on one environment from 0."""
+    """Number of the repeat of one agent on one environment, from 0."""
     attempt: int = 0
-    """Times the operator started this run again from nothing."""
+    """How often the operator restarted this run from scratch."""
     run: str = ""
-    """The coordinator's own name of the run, by which it finds what it stored of it; empty in older files."""
+    """The coordinator's own name of the run, which identifies its stored data there; empty in older files."""
     agent: Agent
     sandbox_tier: Tier
     jail: str
-    """How the agent was confined: `bwrap` or `none`; `bwrap+open-network` when asked for."""
+    """How the agent was confined: `bwrap` or `none`; `bwrap+open-network` on request."""
     hidden_isolation: HiddenIsolation = "unknown"
-    """Whether hidden episodes and agents shared a kernel: `exclusive` never, `shared` they could, `waived` the operator
-    vouched for where the agent was, `unknown` the run is from before this was recorded."""
+    """Whether hidden episodes and agents could share a kernel. `exclusive`: never. `shared`: possible. `waived`: the
+    operator vouched for where the agent was. `unknown`: the run is from before this was recorded."""
     experiment_dimensions: ExperimentDimensions
     timing: Timing
     outcome: Outcome
@@ -293,13 +302,13 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     replays: tuple[Replay, ...] = ()
     versions: Versions
     audit: AuditRecord | None = None
-    """What was played again on other workers; None where nothing was."""
+    """Result of the audits on other workers; None without audits."""
     committed: Committed | None = None
-    """What the coordinator fixed before the agent began; None for runs from before it kept a journal."""
+    """What the coordinator committed to before the agent started; None for runs from before it kept a journal."""
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):
-    """What tells who has written a `run.json`, and when."""
+    """The fields that identify the writer and version of a `run.json`."""
 
     schema_version: int | str
     record_version: int | None = None
@@ -315,7 +324,8 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 
 def decode_run_record(data: bytes) -> RunRecord:
-    """The record in `data`; ProtocolError when it is none that this version reads, such as the published software's."""
+    """The record in `data`. Raises ProtocolError when this version cannot read it, such as a file of the published
+    software."""
     try:
         header = _headers.decode(data)
         if header.schema_version == 1:
@@ -335,12 +345,13 @@ def decode_run_record(data: bytes) -> RunRecord:
 
 
 def sha256_text(digest: str) -> str:
-    """A hash as `versions` tells it, of its hex digits; empty for an unknown one."""
+    """A hash in the form of `versions`, from its hex digits; empty for an unknown one."""
     return f"sha256:{digest}" if digest else ""
 
 
 def upgraded(old: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a `run.json` of version 1 as this version has them. AttributeError, TypeError or ValueError where it is none."""
+    """Converts the fields of a version 1 `run.json` to this version. Raises AttributeError, TypeError or ValueError
+    when it is none."""
     timing, artifacts, versions = (dict(old.get(name) or {}) for name in ("timing", "artifacts", "versions"))
     outcome = dict(old.get("outcome") or {})
     if outcome.get("status") == "no_ok_submit":

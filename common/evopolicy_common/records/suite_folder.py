@@ -1,8 +1,8 @@
-"""Names in a sweep's folder that several rooms know."""
+"""Names of files in a sweep's folder that several rooms use."""
 
 from __future__ import annotations
 
 INDEX = "suite.json"
-"""What the sweep has come to, run by run."""
+"""State of the sweep, run by run."""
 PAUSED = "paused"
-"""While this file is there, no further run of the sweep begins, on any host that shares the folder."""
+"""While this file exists, no host that shares the folder starts another run of the sweep."""

@@ -1,9 +1,11 @@
-"""`feedback/submit_NNN/summary.json`: what an agent is told of one submit, field by field and in this order.
+"""`feedback/submit_NNN/summary.json`: the result of one submit for its agent, field by field and in this order.
 
 The gateway writes it last in a submit's folder and answers `POST /submit` with the same bytes; the analysis reads it.
-Nothing in it is hidden: no seed, no hidden score. A submit that is not `ok` has every array and aggregate null, while
-`env_instances`, `n_episodes` and `remaining_budget` still tell what was asked for and charged. Earlier versions wrote
-`schema_version` 1, and null for `env_instances` in its place; their summaries are read too.
+It contains nothing hidden: no seed, no hidden score. In the summary of a submit that is not `ok`, all arrays and
+aggregates are
+null, while `env_instances`, `n_episodes` and `remaining_budget` still give the request and the charge. Earlier versions
+wrote
+`schema_version` 1, and null for `env_instances` in such summaries; these are read too.
 """
 
 from __future__ import annotations
@@ -21,28 +23,28 @@ _READ = (SCHEMA_VERSION, 1)
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One submit's summary. Fields with defaults may be left out."""
+    """One submit's summary. Fields with defaults may be missing."""
 
     schema_version: str | int
     submit_index: int
-    """Counts accepted submits from 0."""
+    """Index among the accepted submits, from 0."""
     env: str
     """Suite id, such as `gym/acrobot`."""
     status: SubmitStatus
     n_episodes: int
     """Episodes charged; 0 when `cancelled`."""
     first_global_episode: int | None
-    """Number of its first episode, counting attempted episodes through the run from 0; null when not ok."""
+    """Number of its first episode among the run's attempted episodes, from 0; null when not ok."""
     env_instances: tuple[int, ...] | None
     """Train ids in request order, repeats kept."""
     remaining_budget: int
     """Episodes left after this submit."""
     submit_started_at: str
-    """When it was accepted: UTC, ISO 8601 as `utc_text` writes it."""
+    """Time of acceptance: UTC, ISO 8601 as `utc_text` writes it."""
     submit_completed_at: str
     wall_time_seconds: float
     returns: tuple[float, ...] | None
-    """Return of each episode, request order."""
+    """Return of each episode, in request order."""
     mean_return: float | None
     std_return: float | None
     """Population standard deviation (divides by n)."""
@@ -56,22 +58,22 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     errors: tuple[int, ...] | None
     """Local indices of the episodes whose policy failed, time limits included."""
     reward_components_mean: dict[str, float] | None = None
-    """Mean over episodes of each component's sum; left out when the environment reports none."""
+    """Mean over episodes of each component's sum; missing when the environment reports no components."""
     reward_components_per_episode: tuple[dict[str, float], ...] | None = None
-    """Each episode's sums, request order; left out likewise."""
+    """Each episode's sums, in request order; missing in the same case."""
     successes: tuple[bool | None, ...] | None = None
-    """Whether each episode solved the task, by the environment's own word; left out where it tells none."""
+    """Whether each episode solved the task, as the environment reports it; missing where it reports nothing."""
     policy_failures: int | None = None
-    """How many episodes the policy failed in; left out when not ok, and in files of earlier versions."""
+    """Number of episodes in which the policy failed; missing when not ok, and in files of earlier versions."""
     warning: str | None = None
-    """How it failed, in words for the agent; left out when it did not."""
+    """How the policy failed, in words for the agent; missing when it did not."""
 
 
 _decoder = msgspec.json.Decoder(Summary)
 
 
 def decode_summary(data: bytes) -> Summary:
-    """The summary in `data`, unknown fields skipped; ProtocolError when it is none that this version reads."""
+    """The summary in `data`; unknown fields are skipped. Raises ProtocolError when this version cannot read it."""
     try:
         summary = _decoder.decode(data)
     except DECODE_ERRORS as error:
@@ -84,5 +86,6 @@ def decode_summary(data: bytes) -> Summary:
 
 
 def utc_text(unix_s: float) -> str:
-    """`unix_s` (seconds since 1970, UTC) as `2026-01-31T12:00:00.123456Z`; always microseconds, so texts sort."""
+    """`unix_s` (seconds since 1970, UTC) as `2026-01-31T12:00:00.123456Z`; always with microseconds, so that texts
+    sort."""
     return datetime.fromtimestamp(unix_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

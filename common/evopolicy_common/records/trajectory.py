@@ -1,10 +1,10 @@
-"""An episode as bytes: what the policy received and returned, and what came of it, step by step.
+"""An episode as bytes: observation, action and outcome of every step.
 
 Rules that this module owns:
-- The same rows give the same bytes; every number comes back bit for bit, NaN and infinities included.
-- Rows are packed in blocks; pictures are compressed one by one as they come, and never lie in memory uncompressed.
-- A block is columns, one for each leaf of the observation: `magic, header, {length, zstd(msgpack block)}…, 0`.
-- Bytes that are not a whole trajectory of this version raise ProtocolError, whatever they are.
+- The same rows give the same bytes; every number is restored bit for bit, including NaN and infinities.
+- Rows are packed in blocks; pictures are compressed one by one on arrival and never accumulate uncompressed in memory.
+- A block consists of columns, one per leaf of the observation: `magic, header, {length, zstd(msgpack block)}…, 0`.
+- Decoding raises ProtocolError for any bytes that are not a complete trajectory of this version.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from evopolicy_common.records.json_text import as_lists
 
 MAGIC = b"evotraj1"
 BLOCK_BYTES = 4 << 20
-"""Observations of about so many bytes make a block."""
+"""Approximate size of the observations in a block, bytes."""
 PICTURE_BYTES = 4096
-"""Arrays of this size or more are compressed as they come."""
+"""Arrays of at least this size, in bytes, are compressed on arrival."""
 PICTURES_BLOCK_BYTES = 64 << 20
-"""A block of pictures, uncompressed."""
+"""Size of a block of pictures, uncompressed, bytes."""
 BLOCK_ROWS = columns.MAX_ROWS
 MAX_BLOCK_BYTES = 1 << 28
-"""No larger block is made or decoded."""
+"""Limit of a block, encoding and decoding, bytes."""
 MAX_ROWS = 1 << 22
-"""Steps of an episode."""
+"""Most steps of an episode."""
 MAX_BYTES = 4 << 30
-"""No trajectory is decoded whose blocks and pictures come to more, unpacked. 27,000 frames of Atari are 2.7 GB."""
+"""Limit of a decoded trajectory's blocks and pictures, unpacked, bytes. 27,000 frames of Atari take 2.7 GB."""
 MAX_VALUES = 1 << 23
-"""The same for the values in its blocks, arrays counting as one: Python's objects take more than bytes do."""
+"""Limit of the values in its blocks, an array counting as one: Python's objects need more memory than their bytes."""
 _MAX_HEADER_BYTES = 4096
 _UNCOUNTED_BYTES = 4 << 20
-"""The first blocks, up to so many bytes, are decoded without a count of their values."""
+"""The first blocks, up to this many bytes, are decoded without counting their values."""
 
 _LENGTH = struct.Struct("<I")
 TERMINATED, TRUNCATED = 1, 2
-"""Flags of a row."""
+"""Bit flags of a row."""
 _QUICK_BYTES = 256 << 10
-"""Blocks above this are compressed at level 1: pictures, for which speed matters more."""
+"""Larger blocks, in bytes, are compressed at level 1: they hold pictures, for which speed matters more."""
 
 
 class Row(NamedTuple):
-    """One step. `obs` is what the policy received before it, `action` what it returned."""
+    """One step. `obs` is the observation before it, `action` what the policy returned for it."""
 
     t: int
     obs: Any
     """numpy array, int, str, dict or tuple (nested lists in place of arrays and tuples with `observations` "lists");
     None when observations are not recorded."""
     action: Any
-    """As the policy returned it, before repair: array, plain number, string, list, dict, None (a tuple as a list where
-    actions differ in form)."""
+    """As the policy returned it, before repair: array, plain number, string, list, dict, None (a tuple becomes a
+    list when actions differ in form)."""
     reward: float
     terminated: bool
     truncated: bool
@@ -72,29 +72,29 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
 
     n: int
     record: Record
-    """With "actions" there are no observations and no infos, and actions are those played, after repair."""
+    """With "actions" there are no observations and no infos, and actions are those applied, after repair."""
     observations: ObservationForm
     """The form in which the policy received them."""
     obs: Any
-    """Columns in the shape of the observation: a numpy array (n × the leaf's shape), or a list of strings, for each
-    leaf, in dicts and tuples; None when observations are not recorded or there is no step."""
+    """Columns in the structure of the observation (dicts, tuples): for each leaf a numpy array (n × the leaf's
+    shape) or a list of strings. None when observations are not recorded or there are no steps."""
     actions: Sequence[Any] | NDArray[Any]
-    """n actions; an array (n × shape) where all are arrays of one shape and dtype, else a list."""
+    """n actions: an array (n × shape) if all are arrays of one shape and dtype, else a list."""
     rewards: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     infos: list[dict[str, Any]]
     obs_at: Callable[[int], Any]
-    """The observation of one step, as `Row.obs`."""
+    """The observation of one step, in the form of `Row.obs`."""
     files: dict[str, bytes] = {}
-    """Of an episode that was rendered where it was played (`records.rendered`): its feedback files, which alone hold the
-    observations and infos of its steps then."""
+    """Feedback files of an episode that was rendered where it was played (`records.rendered`); then only they
+    contain its observations and infos."""
 
     def rows(self) -> Iterator[Row]:
         """The steps in order."""
         arrays = isinstance(
             self.actions, np.ndarray
-        )  # of which indexing makes scalars where they have no axes
+        )  # indexing such an array without axes per action yields scalars
         for t in range(self.n):
             yield Row(
                 t,
@@ -114,7 +114,7 @@ class PictureSink(Protocol):
 
 
 class Recorder:
-    """Takes an episode's steps one by one and packs them. Not thread-safe."""
+    """Records an episode's steps one by one. Not thread-safe."""
 
     def __init__(self, record: Record = "full", observations: ObservationForm = "arrays") -> None:
         self._full = record == "full"
@@ -128,14 +128,14 @@ class Recorder:
     def append(
         self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
     ) -> None:
-        """Record one step. `obs` and arrays in `action` are kept, not copied: they must not change afterwards."""
+        """Records one step. `obs` and arrays in `action` are kept, not copied: they must not change afterwards."""
         if self._full:
             if not self._rewards:
                 self._begin_block(obs)
             if self._pictures is None:
                 self._obs.append(obs)
             elif not self._pictures.add(obs):
-                # Not the shape of those before: a new block, of whatever this is.
+                # Shape or dtype differs from the pictures before: start a new block of the kind that fits.
                 self._flush()
                 self._begin_block(obs)
                 if self._pictures is None or not self._pictures.add(obs):
@@ -150,13 +150,13 @@ class Recorder:
             self._flush()
 
     def finish(self) -> bytes:
-        """The trajectory's bytes. The recorder is not used afterwards."""
+        """The trajectory's bytes. The recorder must not be used afterwards."""
         if self._rewards:
             self._flush()
         return b"".join([*self._parts, _LENGTH.pack(0)])
 
     def _begin_block(self, obs: Any) -> None:
-        """What the next block is. Decided by the block's first row alone, so that equal rows give equal bytes."""
+        """Starts a block. Its first row alone decides its kind, so that equal rows give equal bytes."""
         size = max(1, _size(obs))
         is_picture = isinstance(obs, np.ndarray) and size >= PICTURE_BYTES
         self._pictures = columns.Pictures(obs) if is_picture else None
@@ -178,7 +178,7 @@ class Recorder:
         self._clear()
 
     def _add_block(self, obs: list[Any] | None, infos: list[dict[str, Any]] | int) -> bytes:
-        """The block of the rows so far as it was packed, before compression."""
+        """Packs the rows so far as a block, stores it compressed, and returns it uncompressed."""
         block = {
             "obs": obs,
             "actions": columns.pack(self._actions),
@@ -207,7 +207,7 @@ class Recorder:
 
 
 def decode(data: bytes, max_bytes: int = MAX_BYTES) -> Trajectory:
-    """The episode in `data`; ProtocolError when it is none, or more than `max_bytes` unpacked."""
+    """The episode in `data`. Raises ProtocolError when it is not a trajectory, or larger than `max_bytes` unpacked."""
     try:
         return _decode(data, max_bytes)
     except (
@@ -272,7 +272,7 @@ class _Block(NamedTuple):
 
 
 def _blocks(frames: Iterator[bytes], full: bool, max_bytes: int) -> list[_Block]:
-    """The blocks in `frames`, of which nothing is taken at its word: sizes and counts are held to the limits first."""
+    """Decodes the blocks in `frames`. Claimed sizes and counts are not trusted but checked against the limits first."""
     decompressor = zstandard.ZstdDecompressor()
     blocks: list[_Block] = []
     n_bytes = n_values = n_rows = 0
@@ -330,7 +330,7 @@ def _frames(data: bytes) -> Iterator[bytes]:
 
 
 def _size(obs: Any) -> int:
-    """Bytes of an observation, roughly."""
+    """Approximate size of an observation, bytes."""
     if isinstance(obs, np.ndarray):
         return int(obs.nbytes)
     if isinstance(obs, dict):
