@@ -1,8 +1,7 @@
 """Python packages that simulate: only a worker's environment process may have them.
 
 With one of them a policy could look ahead, and an agent could train outside its budget. The sandboxes of policies and
-the
-jails of agents hide them.
+the jails of agents hide them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 Texts of policies, agents, exceptions and file names reach a terminal. An escape sequence in one of them could clear the
 screen, forge a link or overwrite earlier output; square brackets could be taken for markup. So no markup is
-interpreted, and
-every unprintable character is shown as U+FFFD. `tests/unit/test_rooms.py` enforces this in all rooms.
+interpreted, and every unprintable character is shown as U+FFFD. `tests/unit/test_rooms.py` enforces this in all rooms.
 """
 
 from __future__ import annotations

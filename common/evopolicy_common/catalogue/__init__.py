@@ -1,9 +1,9 @@
-"""The catalogue: which environments ship with this software, what each is called, and how suites group them; and the
-environments that files and installed packages add here.
+"""The catalogue: the environments that ship with this software, their names, and their suites; and the environments
+that files and installed packages add.
 
-Data without any simulator, so every room may read it. What needs the simulator (spaces, task text) is described by a worker:
-see `messages.EnvironmentDescription`. `catalogue.toml` has Core16 and the toys, `families/*.toml` a family each, a row an
-environment.
+It is data without any simulator, so that every room may read it. A worker describes what needs the simulator (spaces,
+task text): see `messages.EnvironmentDescription`. `catalogue.toml` has Core16 and the toys; each file of
+`families/*.toml` has one family, one row per environment.
 """
 
 from __future__ import annotations
@@ -47,17 +47,18 @@ __all__ = [
 ]
 
 ENTRY_POINTS = "evopolicy.environments"
-"""Group of entry points by which a package offers environments: `name = "package:FILE.toml"`, an environment file in it."""
+"""Group of entry points by which a package offers environments: `name = "package:FILE.toml"`, an environment file in
+it."""
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A named list of environments with the numbers that runs of it use."""
+    """A named list of environments with the default numbers of their runs."""
 
     name: str
     title: str
     environments: tuple[str, ...]
     budget: int = 128
-    """Train episodes a run may spend."""
+    """Train episodes that a run may spend."""
     min_episodes_per_submit: int = 1
     max_episodes_per_submit: int = 128
     n_train: int = 64
@@ -66,7 +67,7 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 OTHER = Suite(name="other", title="Other", environments=())
-"""Of the environments that no suite has."""
+"""The suite of environments that belong to no other suite."""
 
 
 class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,7 +77,8 @@ class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of `families/`: its environments are `prefix` and a key each, which is Gymnasium's id unless a row says so."""
+    """A file of `families/`. An environment's id is `prefix` plus its key, which is Gymnasium's id unless the row
+    sets another."""
 
     family: str
     title: str
@@ -84,9 +86,9 @@ class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     environments: dict[str, dict[str, Any]]
     prefix: str = "gymnasium/"
     defaults: dict[str, Any] = {}
-    """Fields of `Entry` that all rows have unless they say otherwise."""
+    """Defaults of `Entry` fields for all rows."""
     suite: tuple[Suite, ...] = ()
-    """Further suites; the family is one by its own name."""
+    """Further suites; the family itself is a suite of its own name."""
 
     def entries(self) -> Iterable[Entry]:
         shared = {"family": self.family, "adapter": self.adapter, **self.defaults}
@@ -131,22 +133,22 @@ def _table(text: str) -> dict[str, Any]:
 
 @cache
 def digests() -> dict[str, str]:
-    """By id the first digits of the digest of the definition that ships (`EnvironmentDescription.digest`)."""
+    """By id, the first digits of the digest of the definition that ships (`EnvironmentDescription.digest`)."""
     text = files(__package__).joinpath("digests.json").read_text("utf-8")
     return msgspec.json.decode(text, type=dict[str, str])
 
 
 _pinned: dict[str, str] = {}
-"""By id the digest that was named with it here, as `ID@DIGEST`."""
+"""By id, the digest given in this process as `ID@DIGEST`."""
 
 
 def pinned(env_id: str) -> str:
-    """The first digits of the definition's digest that an environment was named with here; empty for none."""
+    """The first digits of the definition's digest given in this process for an environment; empty for none."""
     return _pinned.get(env_id, "")
 
 
 _added: dict[str, tuple[Entry, str]] = {}
-"""By id what files that were named here define, and the file."""
+"""By id, the environments of files given in this process, with the file's path."""
 
 
 def entries() -> dict[str, Entry]:
@@ -171,9 +173,9 @@ def is_shipped(env_id: str) -> bool:
 
 @cache
 def plugins() -> dict[str, tuple[Entry, str]]:
-    """By id the environments of installed packages, and the file; nothing of theirs is imported to find out.
+    """By id, the environments of installed packages, with the file's path; no package is imported.
 
-    ConfigError for a package whose file is not there or is no environment file.
+    Raises ConfigError for a package whose file is missing or is no environment file.
     """
     found: dict[str, tuple[Entry, str]] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
@@ -193,7 +195,7 @@ def plugins() -> dict[str, tuple[Entry, str]]:
 
 
 def add(path: Path) -> list[str]:
-    """The ids of an environment file, which this process knows from now on. ConfigError for what is wrong in it."""
+    """Adds an environment file to this process and returns its ids. Raises ConfigError for errors in it."""
     found = _checked(read_file(path), path)
     _added.update((entry.id, (entry, str(path.absolute()))) for entry in found)
     return [entry.id for entry in found]
@@ -211,12 +213,12 @@ def _checked(found: tuple[Entry, ...], path: Path) -> tuple[Entry, ...]:
 
 
 def source_of(env_id: str) -> str:
-    """What a worker's `--env` takes for the environment: the file that defines it here, or else its id."""
+    """The value of a worker's `--env` for the environment: the file that defines it, or else its id."""
     return _added[env_id][1] if env_id in _added else env_id
 
 
 def known(env_id: str) -> Entry | None:
-    """What is known here of an environment, without asking a worker; None for nothing."""
+    """The entry of an environment, without asking a worker; None if it is unknown here."""
     found = _load().entries.get(env_id)
     if found is None and env_id in _added:
         found = _added[env_id][0]
@@ -228,14 +230,14 @@ def known(env_id: str) -> Entry | None:
 
 
 def is_foreign(env_id: str) -> bool:
-    """Whether an id can be that of an environment which does not ship: `module:Id`, or with a prefix of its own."""
+    """Whether an id can belong to an environment that does not ship: `module:Id`, or an id with a prefix of its own."""
     prefix, slash, _ = env_id.partition("/")
     return valid_id(env_id) and (":" in prefix or (bool(slash) and prefix not in _load().prefixes))
 
 
 def entry(env_id: str) -> Entry:
-    """What is known here of `env_id`, for a foreign one perhaps no more than the id; ConfigError naming what is near when
-    there can be none."""
+    """The entry of `env_id`, for a foreign one perhaps only its id. Raises ConfigError, with similar names, for an
+    impossible id."""
     found = known(env_id)
     if found is not None:
         return found
@@ -245,17 +247,18 @@ def entry(env_id: str) -> Entry:
 
 
 def suite_of(env_id: str) -> Suite:
-    """The first suite that holds `env_id`: its numbers are the defaults of a run on it."""
+    """The first suite that contains `env_id`: its numbers are the defaults of a run on it. Raises ConfigError as
+    `entry` does."""
     entry(env_id)
     return next((suite for suite in suites().values() if env_id in suite.environments), OTHER)
 
 
 def resolve(patterns: Iterable[str]) -> list[str]:
-    """Suite ids named by `patterns`, without repeats: shipped ones in catalogue order, then the others as they were named.
+    """Suite ids named by `patterns`, distinct: shipped ones in catalogue order, then the others in the given order.
 
     A pattern is a suite name (`core16`), a suite id (`gym/acrobot`), a glob over suite ids (`gymnasium/MiniGrid-*`), an
-    environment file (`lander.toml`), or the id of an environment that does not ship: `module:Id`, or one with a prefix of its
-    own. ConfigError for one that names nothing.
+    environment file (`lander.toml`), or the id of an environment that does not ship: `module:Id`, or one with a prefix
+    of its own. Raises ConfigError for one that matches nothing.
     """
     wanted: dict[str, None] = {}
     for given in patterns:
@@ -284,7 +287,7 @@ def resolve(patterns: Iterable[str]) -> list[str]:
 
 
 def near(name: str, others: Iterable[str] = ()) -> str:
-    """Names like `name`, in words to be appended to an error; `others`: ids beside the catalogue's."""
+    """Names similar to `name`, as a suffix for an error text; `others`: ids besides the catalogue's."""
     known_ids = [*_load().entries, *others, *suites()]
     lowered = {item.lower(): item for item in known_ids}
     close = [lowered[hit] for hit in difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)]

@@ -1,7 +1,7 @@
-"""What defines an environment: a row of the catalogue, or an environment file of anyone's. Read, never run.
+"""Definitions of environments: rows of the catalogue, or anyone's environment files. Parsed, never run.
 
-An environment file is TOML, one environment with the keys of `Entry`, or several under `[[environment]]`. `task_file` names a
-text beside it, in place of `task`.
+An environment file is TOML: one environment with the keys of `Entry`, or several under `[[environment]]`. `task_file`,
+in place of `task`, names a text file beside it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ ObservationKind = Literal["state", "image", "symbolic", "dict"]
 ActionKind = Literal["discrete", "continuous"]
 
 USUAL_STEPS = 1000
-"""Step limit of an environment that states none, as the published software has it."""
+"""Step limit of an environment that states none, as in the published software."""
 USUAL_STEP_BYTES = 1000
-"""What a step takes of a run directory where nobody has measured it."""
+"""Bytes of one step in a run directory, where no measurement exists."""
 MAX_STEPS = 1 << 22
 MAX_TASK_CHARACTERS = 64 << 10
 MAX_FILE_BYTES = 1 << 20
@@ -43,59 +43,60 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """One environment of the catalogue, or of an environment file."""
 
     id: str
-    """Suite id: what users, runs and cases name it by, such as `gym/acrobot`."""
+    """Suite id by which users, runs and cases name it, such as `gym/acrobot`."""
     gymnasium_id: str | None = None
-    """What `gymnasium.make` takes, `module:Id` for one that a module registers when it is imported; None for environments of
-    our own (`toy/…`)."""
+    """The argument of `gymnasium.make`, `module:Id` for one that a module registers on import; None for our own
+    environments (`toy/…`)."""
     family: str = "other"
-    """Key of the family the environment's scores are averaged in, such as `gym_box2d`."""
+    """Key of the family in which the environment's scores are averaged, such as `gym_box2d`."""
     title: str = ""
     """Short name for tables, such as `Acrobot`; empty: the id."""
     max_episode_steps: int = 0
-    """Upper bound on an episode's length, in steps; 0: as Gymnasium registers it, and `USUAL_STEPS` where it states none."""
+    """Upper bound on an episode's length, steps; 0: as Gymnasium registers it, or `USUAL_STEPS` if it states none."""
     published_steps: int | None = None
-    """Where the published software cuts an episode, and what it tells as the limit; None: as here. It takes 1,000 where
-    Gymnasium has no limit registered, though all but one of these environments end earlier by themselves."""
+    """Where the published software cuts an episode, steps, and which limit it reports; None: as here. It uses 1,000
+    where Gymnasium registers no limit, though all but one of these environments end earlier by themselves."""
     step_bytes: int = USUAL_STEP_BYTES
-    """About what a step takes of a run directory in a train episode's feedback, without video; as measured."""
+    """Approximate measured size of one step in a train episode's feedback, without video, bytes."""
     observation: ObservationKind | None = None
-    """What an observation is: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
+    """Form of an observation: a vector, a picture, a grid of symbols, or a dictionary of arrays."""
     action: ActionKind | None = None
     demand: Demand | None = None
-    """Task-demand group of the paper's mechanism section; None when the paper does not place it."""
+    """Task-demand group of the paper's mechanism section; None when the paper does not assign one."""
     adapter: str = "foreign"
     """Module of the worker's environments that plays it."""
     kwargs: dict[str, Any] = {}
-    """For `gymnasium.make`."""
+    """Keyword arguments of `gymnasium.make`."""
     wrappers: tuple[Wrapper, ...] = ()
-    """Around what it makes, the innermost first."""
+    """Wrappers around the environment, the innermost first."""
     task: str = ""
-    """Markdown for agents; empty: what is written for the id, or else made of its documentation and its spaces."""
+    """Markdown for agents; empty: the text written for the id, or else one generated from its documentation and
+    spaces."""
     reward_components: dict[str, str] = {}
     """Names under which `info`, or its `rewards`, reports parts of the reward, and what each stands for."""
     reward_vector: tuple[str, ...] = ()
-    """Names of the elements of a reward that is a vector."""
+    """Names of the elements of a vector reward."""
     reward_weights: dict[str, float] = {}
-    """How its elements are weighted in the return; empty: each counts 1."""
+    """Weights of these elements in the return; empty: each counts 1."""
     success: str = ""
-    """Key in `info` that tells whether the task was solved; empty where nothing tells."""
+    """Key in `info` that reports whether the task was solved; empty when no key does."""
     success_at: Literal["end", "any"] = "end"
-    """Whether the last step's word counts, or that of any."""
+    """Whether only the last step's value counts, or a true value at any step."""
     deterministic: bool = True
-    """False where even a fresh environment does not repeat an episode from its seed and actions."""
+    """False when even a fresh environment does not repeat an episode from its seed and actions."""
 
     @property
     def label(self) -> str:
-        """Its short name for tables."""
+        """Short name for tables."""
         return self.title or self.id
 
     def feedback_bytes(self, episodes: int) -> int:
-        """What the feedback of so many train episodes takes of a run directory when all are as long as can be."""
+        """Size of the feedback of that many train episodes in a run directory if all have maximal length, bytes."""
         return episodes * (self.max_episode_steps or USUAL_STEPS) * self.step_bytes
 
 
 _SHIPPED_ONLY = ("published_steps", "step_bytes", "observation", "action", "demand", "adapter")
-"""Fields that environment files do not have."""
+"""Fields that environment files may not set."""
 
 
 class _Many(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,12 +104,12 @@ class _Many(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def valid_id(env_id: str) -> bool:
-    """Whether an id can stand in messages and in the name of a folder."""
+    """Whether an id is valid in messages and as the name of a folder."""
     return len(env_id) <= _MAX_ID and _ID.fullmatch(env_id) is not None
 
 
 def read_file(path: Path) -> tuple[Entry, ...]:
-    """The environments of a file. ConfigError that names file, environment and field, and the remedy."""
+    """The environments of a file. Raises ConfigError that names file, environment, field and remedy."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -174,7 +175,7 @@ def _task(where: str, path: Path, told: dict[str, Any], task_file: object) -> st
 
 
 def _faults(entry: Entry) -> list[tuple[bool, str]]:
-    """What may be wrong with a definition of anyone's, each with the words for it."""
+    """Possible faults of a foreign definition: whether each is present, and its error text."""
     unknown = sorted(entry.reward_weights.keys() - set(entry.reward_vector))
     return [
         (

@@ -1,1 +1,1 @@
-"""Processes and the machine: children, temporary folders, checks before a command begins."""
+"""Child processes, temporary folders, and the checks of a machine before a command starts."""

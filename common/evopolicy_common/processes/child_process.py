@@ -1,6 +1,6 @@
-"""Child processes of a command: with a parent-death signal, in a session of their own, with their log in a file.
+"""Child processes of a command: with a parent-death signal, a session of their own, and a log file.
 
-They are in sessions of their own so that Ctrl-C reaches the command alone, which then ends them in order.
+They have sessions of their own so that Ctrl-C reaches only the command, which then ends them in order.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from evopolicy_common.processes.parent_death import ending_with_parent
 _LINE_LIMIT = 4 << 20
 
 live: set[int] = set()
-"""Ids of the running children of this process, which a search for orphans leaves alone."""
+"""Ids of this process's running children, which a search for orphans skips."""
 
 _locks: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = weakref.WeakKeyDictionary()
 
 
 def starting() -> asyncio.Lock:
-    """Held while a child is started: between its birth and its place in `live` it would be taken for an orphan."""
+    """Lock held while a child is started: between its start and its entry in `live` it would be taken for an orphan."""
     return _locks.setdefault(asyncio.get_running_loop(), asyncio.Lock())
 
 
 class ChildProcess:
-    """A running child. Start it on the main thread: it gets its signal when that thread ends."""
+    """A running child. Start it on the main thread: its parent-death signal comes when that thread ends."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
         self._process = process
@@ -41,7 +41,7 @@ class ChildProcess:
 
     @classmethod
     async def start(cls, program: Sequence[str], log: Path, *, talks: bool = False) -> Self:
-        """Starts `program` with stderr appended to `log`; `talks`: its standard input and output are pipes to us."""
+        """Starts `program` with stderr appended to `log`. `talks`: its stdin and stdout are pipes to this process."""
         log.parent.mkdir(parents=True, exist_ok=True)
         pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
         with log.open("ab") as out:
@@ -68,17 +68,17 @@ class ChildProcess:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
+        """The exit status; None while it runs."""
         return self._process.returncode
 
     async def ended(self) -> int:
-        """Its exit status."""
+        """Waits for its end and returns the exit status."""
         code = await self._process.wait()
         live.discard(self.pid)
         return code
 
     async def end(self, grace_s: float) -> None:
-        """SIGTERM, and SIGKILL after `grace_s` seconds. Nothing when it is gone already."""
+        """Sends SIGTERM, and SIGKILL after `grace_s` seconds. Does nothing if it has ended already."""
         if self._process.returncode is None:
             self._signal(signal.SIGTERM)
             try:
@@ -94,7 +94,7 @@ class ChildProcess:
 
 
 def last_words(log: Path) -> str:
-    """The last line of a log, for a message about why its process ended; empty where there is none."""
+    """The last line of a log, to explain why its process ended; empty if there is none."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - 4096))
@@ -110,7 +110,7 @@ class _LogLine(msgspec.Struct):
 
 
 def _said(line: str) -> str:
-    """A log line for people: of a JSON line what happened and why."""
+    """A log line for people: the event and the error of a JSON line."""
     try:
         entry = msgspec.json.decode(line, type=_LogLine)
     except DECODE_ERRORS:

@@ -1,4 +1,5 @@
-"""What to install or set on this machine's distribution: its package manager by name, and the kernel setting that forbids."""
+"""Remedies for this machine's distribution: its install command, and the kernel setting that forbids user
+namespaces."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ _INSTALL = {
     "alpine": "sudo apk add",
     "nixos": "nix-env -iA",
 }
-"""Commands by family, as `ID` and `ID_LIKE` of os-release name it."""
+"""Install commands by family, as `ID` and `ID_LIKE` of os-release name it."""
 _KIN = {"ubuntu": "debian", "rhel": "fedora", "centos": "fedora", "opensuse": "suse", "manjaro": "arch"}
 _PACKAGES = {
     "bubblewrap": {"nixos": "nixos.bubblewrap"},
@@ -27,7 +28,7 @@ _PACKAGES = {
     },
     "chromium": {"nixos": "nixos.chromium"},
 }
-"""Names of packages by family, where they are not the key."""
+"""Package names by family, where they differ from the key."""
 _SETTINGS = (
     ("user/max_user_namespaces", "0", "sudo sysctl -w user.max_user_namespaces=15000"),
     ("kernel/unprivileged_userns_clone", "0", "sudo sysctl -w kernel.unprivileged_userns_clone=1"),
@@ -37,13 +38,13 @@ _SETTINGS = (
         "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with `userns,`",
     ),
 )
-"""Files below `/proc/sys`, the value that forbids user namespaces, and what permits them (until the next start, without a
+"""Files below `/proc/sys`, the value that forbids user namespaces, and the remedy (effective until reboot without a
 file in `/etc/sysctl.d`)."""
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 
 
 def install(what: str, os_release: Path | None = None) -> str:
-    """How to install `bubblewrap`, `egl` or `chromium` here; on a distribution that is not known, with two examples."""
+    """The command that installs `bubblewrap`, `egl` or `chromium` here; two examples on an unknown distribution."""
     family = _family(os_release)
     if family is None:
         return f"{_command('debian', what)} (Debian, Ubuntu), {_command('fedora', what)} (Fedora)"
@@ -72,7 +73,7 @@ def _family(os_release: Path | None) -> str | None:
 
 
 def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
-    """How to permit user namespaces here: the setting that forbids them, by its present value; else all that could."""
+    """How to permit user namespaces: the settings that forbid them now, or else all settings that could."""
     found = [remedy for name, forbids, remedy in _SETTINGS if _value(settings / name) == forbids]
     if found:
         return "; ".join(found)

@@ -1,4 +1,4 @@
-"""Names the kernel that this process runs on, so that hidden episodes and agents are kept on different ones.
+"""Identifies the kernel of this process, so that hidden episodes and agents run on different ones.
 
 Namespaces and containers share their kernel's counters, so the unit is the kernel, not the host name.
 """
@@ -14,11 +14,11 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MACHINE_ID = Path("/etc/machine-id")
 
 NO_BOOT_ID = f"the kernel does not tell its boot id: mount /proc so that {_BOOT_ID} can be read"
-"""Why a worker plays no hidden episodes, and why an agent counts as being on every machine."""
+"""Why a worker plays no hidden episodes, and why an agent counts as being on every kernel."""
 
 
 def boot_id() -> str:
-    """The running kernel's id, new at every boot and the same in all its containers; empty where there is none."""
+    """The running kernel's id, new at every boot and equal in all its containers; empty if it is not available."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
@@ -32,7 +32,7 @@ def boot_id() -> str:
 
 
 def machine_id() -> str:
-    """16 hex digits that stay the same over reboots; empty where the machine has no id of its own.
+    """16 hex digits, stable over reboots; empty if the machine has no id of its own.
 
     The host name is part of it, since machines cloned from one image may share `/etc/machine-id`.
     """

@@ -1,7 +1,7 @@
-"""The files that a program which nobody trusts has left in a folder, found without being led astray.
+"""Safely lists the files that an untrusted program left in a folder.
 
-Links are not followed, pipes and devices are left out, and folders that nest deeper than `MAX_DEPTH` (or than a path may be
-long) are not gone into: `os.walk` recurses, and a path that leads to a pipe is opened for ever.
+Links are not followed, and pipes and devices are skipped, as opening a pipe can block forever. Folders nested deeper
+than `MAX_DEPTH`, or beyond the system's longest path, are not entered; `os.walk` would recurse into them.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ MAX_DEPTH = 64
 
 
 def left_files(root: Path, enter: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[Path, int]]:
-    """Regular files below `root` with their sizes: a folder's own by name, then those of its folders, by name.
+    """Yields regular files below `root` with their sizes (bytes): first a folder's own, then those of its folders, by
+    name.
 
-    `enter` tells by its name whether a folder is gone into. What cannot be read is left out.
+    `enter` decides by its name whether a folder is entered. Unreadable entries are skipped.
     """
     waiting = [(str(root), 0)]
     while waiting:

@@ -1,7 +1,7 @@
-"""A cluster of this machine's own, for as long as a command runs: a coordinator and its workers as child processes.
+"""A cluster on this machine for the duration of a command: a coordinator and its workers as child processes.
 
-Rules: they end with the command, whatever ends it; workers first, so that they hand back what they hold. One that dies is
-started again, as both sides go on where they were; one that refuses its options, or dies again and again, is an error.
+Rules: they end with the command, however it ends; workers end first, so that they return their leases. A process that
+dies is restarted and resumes its work. One that refuses its options, or dies repeatedly, is an error.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ END_GRACE_S = 10.0
 _RESTART_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 5.0
 _MAX_DEATHS = 10
-"""In a row, each within `_SOON_S` of the start before."""
+"""Number of successive deaths, each within `_SOON_S` seconds of its start, that counts as an error."""
 _SOON_S = 60.0
 
 
 WORKERS_ENDED = "workers-ended"
-"""File in a kept state folder: every worker of its last command has ended, so the next coordinator expects none of them."""
+"""File in a kept state folder: all workers of its last command have ended, so the next coordinator expects none of
+them."""
 
 
 class Workers(NamedTuple):
-    """What a local cluster's workers offer: see `LocalCluster.start_workers`."""
+    """The options of a local cluster's workers; see `LocalCluster.start_workers`."""
 
     env_ids: Sequence[str]
     slots: int
@@ -51,33 +52,33 @@ class Workers(NamedTuple):
 
 
 class LocalCluster:
-    """A running coordinator, and the means to give it workers."""
+    """A running coordinator, with methods that start its workers."""
 
     def __init__(
         self, ready: Ready, processes: _Processes, *, audited: bool, kept: Path | None = None
     ) -> None:
         self.operator_file = Path(ready.credentials["operator"])
         self.failed = processes.failed
-        """Done only with the ConfigError that tells which process cannot be kept up, and why."""
+        """Completes only with a ConfigError, which names the process that cannot be kept running, and the reason."""
         self._worker_file = ready.credentials["worker"]
         self._processes = processes
         self._audited = audited
         self._kept = kept
-        """Folder of what `opened` remembers; None where the state is thrown away."""
+        """Folder of the records of `opened`; None for a temporary state folder."""
         self.note = ready.note
-        """What the operator is to know of the cases of new runs; empty for nothing."""
+        """A note for the operator on the cases of new runs; empty for none."""
 
     def opened(self, run: str, locks: Sequence[Path]) -> None:
-        """Remembers who watches over the agent of a run: it is alive only as long as one of these locks is held."""
+        """Records the locks of a run's agent supervisors: the agent is alive only while one of them is held."""
         if self._kept is not None:
             write_atomically(self._kept / run, "\n".join(map(str, locks)).encode(), mode=0o600)
 
     async def start_workers(
         self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
     ) -> None:
-        """A worker that offers these environments; of an audited cluster two, which divide the slots between them.
+        """Starts a worker that offers these environments; in an audited cluster two, which divide the slots.
 
-        `tiers`: sandbox tiers that will be asked for. Where one does not work here the cluster fails with the remedy.
+        `tiers`: sandbox tiers that will be used. If one does not work here, the cluster fails with the remedy.
         """
         wanted = Workers(env_ids, slots, tiers)
         await _start_workers(
@@ -88,7 +89,7 @@ class LocalCluster:
 async def _start_workers(
     processes: _Processes, wanted: Workers, credentials: Sequence[str], *, audited: bool
 ) -> None:
-    # Who starts this cluster is the one who chooses the tiers of what it plays.
+    # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
     program = [*_module("evopolicy_worker.cli"), "--grace", "1", "--unsandboxed", *credentials]
     for env_id in wanted.env_ids:
         program += ["--env", catalogue.source_of(env_id)]
@@ -111,19 +112,19 @@ async def local_cluster(
     unjailed: bool = False,
     workers: Workers | None = None,
 ) -> AsyncIterator[LocalCluster]:
-    """A coordinator inside the `async with`; it and its workers are taken down at its end. Enter it on the main thread.
+    """A coordinator, open inside the `async with`; it and its workers are ended on exit. Enter it on the main thread.
 
-    `kind` names its logs and its folder. `state` None: a folder that is thrown away. `audit`: share of the episodes that
-    a second worker plays again. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
-    read the folder; see the coordinator's `--unjailed-agents`. `workers`: those that are started at once, beside the coordinator. ConfigError when the coordinator does not come up (the folder
-    may be in use).
+    `kind` names its logs and its folder. `state` None: a temporary folder. `audit`: share of the episodes that a second
+    worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
+    read the folder; see the coordinator's `--unjailed-agents`. `workers`: workers to start at once, in parallel with
+    the coordinator. Raises ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
-        check_scratch()  # where workers keep their sandboxes
+        check_scratch()  # workers keep their sandboxes there
         check_writable(root, "--state")
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Of this process alone: the folder may be in use, and the file that is there another's.
+        # Named after this process: the folder may be in use, and another command's file in it.
         ready_file = root / f"{kind}-{os.getpid()}.json"
         for left in root.glob(f"{kind}-[0-9]*.json"):
             if not Path("/proc", left.stem.rpartition("-")[2]).exists():
@@ -147,7 +148,7 @@ async def local_cluster(
         try:
             await processes.keep_up("coordinator", coordinator)
             if workers is not None:
-                # Beside the coordinator: they import simulators, and try sandboxes, while it starts.
+                # In parallel with the coordinator: meanwhile they import simulators and test sandboxes.
                 await _start_workers(
                     processes, workers, ("--ready-file", str(ready_file)), audited=bool(audit)
                 )
@@ -169,15 +170,15 @@ async def local_cluster(
         finally:
             with notify_if_slow("the local cluster to end"):
                 await processes.end()
-            # Not where the coordinator never served: the folder may be another command's, whose workers are alive.
+            # Only if the coordinator served: otherwise the folder may be another command's, with live workers.
             if served and state is not None:
                 write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
 
 
 async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
-    """Tells the coordinator that agents of commands that were killed are gone, so that no later run waits for them.
+    """Ends the permits of agents whose commands were killed, so that no later run waits for them.
 
-    The kernel ends a jailed agent with the process that watches over it, and that one with its command.
+    The kernel ends a jailed agent with its agent supervisor, and the supervisor with its command.
     """
     watched = {path.name: path.read_text().splitlines() for path in kept.iterdir()}
     gone = [run for run, locks in watched.items() if not any(_is_held(Path(lock)) for lock in locks)]
@@ -207,7 +208,8 @@ def _is_held(lock: Path) -> bool:
 
 
 async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:
-    """Waits for `work`; when the local cluster fails first, its error. `failed` None: the cluster is not ours."""
+    """Waits for `work`; raises the local cluster's error if that comes first. `failed` None: the cluster is not
+    ours."""
     try:
         await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
         if failed is not None and failed.done() and not work.done():
@@ -220,7 +222,7 @@ async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] |
 
 
 class _Processes:
-    """Programs that are kept running until all of them are ended."""
+    """Programs that are restarted until all of them are ended."""
 
     def __init__(self, logs: Path, kind: str) -> None:
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -230,7 +232,7 @@ class _Processes:
         self._restarting: list[asyncio.Task[None]] = []
 
     def log(self, name: str) -> Path:
-        """Where that process writes."""
+        """The log file of that process."""
         return self._logs / f"{self._kind}-{name}.log"
 
     async def keep_up(self, name: str, program: Sequence[str]) -> None:
@@ -244,7 +246,7 @@ class _Processes:
             task.cancel()
         await asyncio.gather(*self._restarting, return_exceptions=True)
         if not self.failed.cancel():
-            self.failed.exception()  # looked at, so that asyncio does not complain that nobody did
+            self.failed.exception()  # retrieved, so that asyncio does not report it as never retrieved
         for child in reversed(self._running):
             await child.end(END_GRACE_S)
 

@@ -1,4 +1,4 @@
-"""A command that waits says for what, once that has taken longer than three seconds."""
+"""Notices for commands that wait for longer than three seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ AFTER_S = 3.0
 
 @contextlib.contextmanager
 def notify_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
-    """Warns that `what` is waited for if the inside takes longer than `after_s` seconds. On an event loop."""
+    """Warns that the command waits for `what` if the body takes longer than `after_s` seconds. Needs a running event
+    loop."""
     timer = asyncio.get_running_loop().call_later(after_s, lambda: log.warning(f"waiting for {what}"))
     try:
         yield
@@ -24,23 +25,23 @@ def notify_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
 
 
 class Waiting:
-    """What something waits for, told again and again: said when it is new and has been waited for long enough."""
+    """Filters repeated reports of what something waits for: new reasons are shown once, after a long enough wait."""
 
     def __init__(self) -> None:
         self._since = asyncio.get_running_loop().time()
         self._said = ""
 
     def goes_on(self) -> None:
-        """It waits no longer."""
+        """The wait is over."""
         self._since = asyncio.get_running_loop().time()
         self._said = ""
 
     def worth_saying(self, what: str) -> bool:
-        """Whether people should hear now that it waits for `what`; empty: for nothing."""
+        """Whether to report now that it waits for `what`; an empty `what` means that it does not wait."""
         if not what:
             self.goes_on()
             return False
-        # Whoever asks does so every few seconds: a moment too early would be a whole round too late.
+        # 0.9: callers poll every few seconds, so a check just before the limit would delay the notice by a whole round.
         slow = asyncio.get_running_loop().time() - self._since > 0.9 * AFTER_S
         if not slow or what == self._said:
             return False

@@ -1,7 +1,7 @@
-"""Starts a program that ends when its parent does: `python -I -S parent_death.py PARENT_PID SIGNAL PROGRAM…`.
+"""Starts a program that ends with its parent: `python -I -S parent_death.py PARENT_PID SIGNAL PROGRAM…`.
 
-Sets the parent-death signal, which survives exec, and becomes the program. A program of its own because code between fork
-and exec is not safe in a process with threads or a Zenoh session.
+Sets the parent-death signal, which survives exec, and then executes the program. It is a program of its own because
+code between fork and exec is not safe in a process with threads or a Zenoh session.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ _PR_SET_PDEATHSIG = 1
 
 
 def ending_with_parent(program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM) -> list[str]:
-    """The arguments that start `program` so that it ends with this process.
+    """The command that starts `program` so that it ends with this process.
 
-    The child must be started from this process's main thread: the kernel means the parent's thread.
+    The child must be started from this process's main thread: the signal is bound to the parent's thread.
     """
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(death_signal)), *program]
 
 
 def end_with_parent(death_signal: signal.Signals) -> None:
-    """The kernel sends this process `death_signal` when the thread that started it ends; also after an exec."""
+    """Makes the kernel send this process `death_signal` when the thread that started it ends; it stays set after an
+    exec."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, death_signal, 0, 0, 0)
 
 
 def main(arguments: list[str]) -> None:
-    """Becomes the program; exit code 1 when the parent is gone already, 127 when there is no such program."""
+    """Executes the program; exit code 1 when the parent is gone already, 127 when the program cannot be started."""
     parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
     end_with_parent(death_signal)
     if os.getppid() != parent:
-        # It died before we asked to be told.
+        # It died before the signal was set.
         print(f"not starting {program[0]}: process {parent}, which wanted it, is gone", file=sys.stderr)
         raise SystemExit(1)
     try:

@@ -1,4 +1,4 @@
-"""What a command needs of its machine, checked before it begins anything: places to write, names to tell, a port to bind."""
+"""Checks of the machine before a command starts: writable folders, valid path names, a port to bind."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
 LOOPBACK = "127.0.0.1"
 LEAST_BYTES = 1 << 20
 LEAST_SCRATCH_BYTES = 16 << 20
-"""For a temporary folder: a throw-away cluster keeps its state there, and sandboxes their files."""
+"""For a temporary folder, bytes: a temporary cluster keeps its state there, and sandboxes their files."""
 LEAST_INODES = 64
 _LOOPBACK_S = 10.0
 
@@ -36,15 +36,15 @@ _REMEDIES = {
     errno.EADDRNOTAVAIL: "this machine does not have that address",
     errno.EADDRINUSE: "something else listens there",
 }
-"""The machine's faults that a user can mend, and what to do."""
+"""Faults of the machine that a user can fix, with the remedy."""
 _MAY_PASS = frozenset(
     {errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO}
 )
-"""Those that may be over when the program is started again."""
+"""Faults that may have passed when the program is restarted."""
 
 
 def explained(error: OSError) -> str | None:
-    """The machine's fault with path and remedy, in a line; None when it is not of that kind, but perhaps a bug of ours."""
+    """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug of ours."""
     remedy = _REMEDIES.get(error.errno or 0)
     if remedy is None:
         return None
@@ -53,19 +53,19 @@ def explained(error: OSError) -> str | None:
 
 
 def foreseen(error: Exception) -> str | None:
-    """Why something failed, in a line, where that is one of our errors or the machine's fault; None for a bug."""
+    """One line that explains one of our errors or a fault of the machine; None for a bug."""
     if isinstance(error, OSError):
         return explained(error)
     return str(error) if isinstance(error, EvopolicyError) else None
 
 
 def refused(error: OSError, message: str) -> ConfigError:
-    """`message` as the error of a place that cannot be used: MachineError where it may be usable later."""
+    """An error with `message` for an unusable place: MachineError if it may become usable, else ConfigError."""
     return (MachineError if error.errno in _MAY_PASS else ConfigError)(message)
 
 
 def check_text(path: Path, choose: str) -> None:
-    """ConfigError for a path that is not UTF-8: messages, URLs and records that name it are text."""
+    """Raises ConfigError for a path that is not UTF-8: messages, URLs and records that contain it are text."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError as error:
@@ -77,10 +77,11 @@ def check_text(path: Path, choose: str) -> None:
 def check_writable(
     folder: Path, choose: str, *, least_bytes: int = LEAST_BYTES, may_be_full: bool = False
 ) -> None:
-    """ConfigError unless files can be made in `folder`, which is made later if it is not there: MachineError where the disk
+    """Raises ConfigError unless files can be created in `folder`, which need not exist yet; MachineError when the disk
     refuses.
 
-    `choose`: the option or variable that names another folder. `may_be_full`: for who waits for room, or makes it.
+    `choose`: the option or variable that names another folder. `may_be_full`: for callers that wait for space or free
+    it.
     """
     folder = Path(os.path.abspath(folder))
     check_text(folder, choose)
@@ -108,7 +109,7 @@ def check_writable(
 
 
 def check_scratch() -> None:
-    """MachineError when the system's temporary folder is full or read-only, or there is none."""
+    """Raises MachineError when the system's temporary folder is full, read-only or missing."""
     try:
         folder = Path(tempfile.gettempdir())
     except FileNotFoundError as error:
@@ -119,19 +120,19 @@ def check_scratch() -> None:
 
 
 def check_loopback() -> None:
-    """ConfigError when nothing can listen on the loopback address."""
+    """Raises ConfigError when nothing can listen on the loopback address."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
             sock.bind((LOOPBACK, 0))
             sock.listen()
-            # An interface that is down has its address, and nothing reaches it.
+            # An interface that is down still has its address, but is unreachable.
             socket.create_connection(sock.getsockname(), timeout=_LOOPBACK_S).close()
     except OSError as error:
         raise ConfigError(no_loopback(error)) from error
 
 
 def no_loopback(error: OSError) -> str:
-    """Why nothing can listen on the loopback address, with the remedy."""
+    """An error text for a loopback address that cannot be used, with the remedy."""
     return (
         f"cannot listen on {LOOPBACK}, where the agent's service is: {error.strerror or error}; bring IPv4 loopback up with"
         " `ip link set lo up` (in a container: give it a network)"
@@ -150,18 +151,18 @@ EXTRAS = {
     "mujoco": "worker",
     "av": "worker",
 }
-"""Which extra of the package brings a module that its base does without."""
+"""Modules that the base package lacks, with the extra that installs them."""
 
 
 def check_installed(extra: str) -> None:
-    """ConfigError with what to install where a module of the package's extra is missing."""
+    """Raises ConfigError, with the install command, when a module of the package's extra is missing."""
     for module, its in EXTRAS.items():
         if its == extra and importlib.util.find_spec(module) is None:
             raise ConfigError(missing(extra, module))
 
 
 def missing(extra: str, module: str) -> str:
-    """The error for a module of an extra that is not installed, with the remedy."""
+    """The error text for a missing module of an extra, with the remedy."""
     return (
         f"the {extra} part of evopolicy is not installed here (no module {module!r}):"
         f" pip install 'evopolicy[{extra}]'"

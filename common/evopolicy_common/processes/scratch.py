@@ -1,8 +1,8 @@
-"""Folders in the system's temporary folder that are thrown away, also after their owner was killed.
+"""Folders in the system's temporary folder that are deleted even if their owner was killed.
 
-Rules: a folder belongs to the process that holds the lock on its file `owner`, from before that file has its name; it goes
-with the owner, or at the next start of anything of its kind by the same user. One whose maker was killed before it had that
-file goes once it is a minute old. Short paths, for unix sockets.
+Rules: a folder belongs to the process that holds the lock on its file `owner`; the lock is taken before the file gets
+that name. The folder is deleted by its owner, or at the next start of a command of the same kind and user. A folder
+without the file, whose creator was killed early, is deleted once it is a minute old. Paths are short, for unix sockets.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from evopolicy_common.processes.preflight import check_scratch
 
 _OWNER = "owner"
 _MAKING_S = 60.0
-"""More than it takes from the folder to its file."""
+"""More than the time between creation of the folder and its file, seconds."""
 
 
 @contextlib.contextmanager
 def scratch_folder(kind: str) -> Iterator[Path]:
-    """A new private folder `evopolicy-<kind>-…` inside the `with`; clears away what killed owners have left.
+    """A new private folder `evopolicy-<kind>-…` inside the `with`; deletes what killed owners have left.
 
-    ConfigError when the system's temporary folder is full.
+    Raises MachineError as `check_scratch` does, such as when the system's temporary folder is full.
     """
     check_scratch()
     clear_stale(kind)
@@ -46,7 +46,7 @@ def scratch_folder(kind: str) -> Iterator[Path]:
 
 
 def clear_stale(kind: str) -> int:
-    """Removes this user's folders of that kind whose owner is gone, and returns how many."""
+    """Deletes this user's folders of that kind whose owner is gone, and returns their number."""
     cleared = 0
     for root in Path(tempfile.gettempdir()).glob(f"evopolicy-{kind}-*"):
         with contextlib.suppress(OSError):
@@ -69,10 +69,10 @@ def clear_stale(kind: str) -> int:
 
 
 def remove_tree(folder: Path) -> None:
-    """Removes a folder with all that is in it, as far as this user may; never raises for what is in it.
+    """Deletes a folder and its content, as far as this user may; never raises for its content.
 
-    A program that was locked up in it may have nested folders deeper than Python recurses, or taken away its own rights.
-    Nobody may be changing the folder meanwhile.
+    A sandboxed program may have nested folders deeper than Python recurses, or removed its own permissions.
+    Nothing may change the folder meanwhile.
     """
     with contextlib.suppress(RecursionError):
         shutil.rmtree(folder, ignore_errors=True)
@@ -82,9 +82,9 @@ def remove_tree(folder: Path) -> None:
 
 
 def give_back_rights(folder: Path) -> None:
-    """Lets this user list, enter and write to its own folder again, where a program that worked in it took that away.
+    """Restores this user's permissions to list, enter and write its own folder, which a program may have removed.
 
-    What is not there is no error.
+    A missing folder is no error.
     """
     with contextlib.suppress(FileNotFoundError):
         mode = stat.S_IMODE(folder.stat().st_mode)
@@ -93,7 +93,7 @@ def give_back_rights(folder: Path) -> None:
 
 
 def _flatten_away(folder: Path) -> None:
-    """Brings what is in folders up into `folder`, level by level, and removes it there."""
+    """Deletes nested folders without recursion: moves their content up into `folder`, level by level."""
     folder.chmod(0o700)
     root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
@@ -109,7 +109,7 @@ def _flatten_away(folder: Path) -> None:
             try:
                 for child in os.listdir(inner):
                     if _is_folder(child, inner):
-                        # To give a folder another parent is to write to it.
+                        # Moving a folder to another parent needs write permission on the folder.
                         os.chmod(child, 0o700, dir_fd=inner)
                     os.rename(child, here := next(names), src_dir_fd=inner, dst_dir_fd=root)
                     left.append(here)
@@ -126,7 +126,7 @@ def _is_folder(name: str, parent: int) -> bool:
 
 
 def _own(root: Path) -> int:
-    """The lock on the folder, held until it is closed."""
+    """Creates and locks the folder's owner file; returns the lock's descriptor."""
     unnamed = root / f".{_OWNER}"
     lock = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     fcntl.flock(lock, fcntl.LOCK_EX)

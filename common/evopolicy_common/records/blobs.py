@@ -1,10 +1,8 @@
 """Bytes on disk under the SHA-256 of their content.
 
 Rules: a stored blob is complete (written under another name, fsynced, then renamed). Bytes are checked against their
-digest
-when read. Storing an existing blob changes nothing. The chunks of a blob are written in order; an upload may be
-abandoned and
-restarted at any time.
+digest when read. Storing an existing blob changes nothing. The chunks of a blob are written in order; an upload may be
+abandoned and restarted at any time.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 
 A bundle is the msgpack list of `[path, executable, bytes]`, sorted by path, so equal folders give equal bytes and an
 equal digest. It is not compressed, as the digest must not depend on a compressor's version. Both directions treat their
-input as
-hostile: a snapshot opens every path component without following links and takes regular files only; unpacking accepts
-plain
-relative paths only.
+input as hostile: a snapshot opens every path component without following links and takes regular files only; unpacking
+accepts plain relative paths only.
 """
 
 from __future__ import annotations
@@ -59,8 +57,7 @@ def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
     """The bundle of `folder` now, without its top-level entries named in `leave_out`.
 
     Raises BundleError with the path, the value and the limit for links, devices, sockets, file names that are not
-    portable,
-    and exceeded limits. Nothing outside `folder` is read, even if `folder` changes meanwhile.
+    portable, and exceeded limits. Nothing outside `folder` is read, even if `folder` changes meanwhile.
     """
     reader = _Reader(leave_out)
     try:

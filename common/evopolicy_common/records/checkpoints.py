@@ -1,10 +1,8 @@
 """`checkpoints/submit_NNN/`: a submitted policy's files, with `_meta.json` and `metrics.json` beside them.
 
 The layout is the published one. If a policy has a file with one of these two names, `_meta.json` keeps it
-(`shadowed_files`),
-so that the bundle can be restored from the folder. Checkpoints of earlier versions have the policy in `system/`, and
-the
-content of `_meta.json` in `metrics.json`; they are read too.
+(`shadowed_files`), so that the bundle can be restored from the folder. Checkpoints of earlier versions have the policy
+in `system/`, and the content of `_meta.json` in `metrics.json`; they are read too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """`metrics.json`: size and branching of a policy's source, by the published definitions. No code is run.
 
 Sources come from an agent, so the work is bounded. A file counts as unparsable beyond `MAX_PARSED_BYTES` of Python
-source in
-one policy, and where the parser's memory would grow with the square of its length.
+source in one policy, and where the parser's memory would grow with the square of its length.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Columns of a trajectory's block: the values of one leaf over its rows, to and from msgpack.
 
 Numbers are restored bit for bit. Values that msgpack cannot represent (arrays, integers beyond 64 bits, lone
-surrogates)
-become an extension or readable text.
+surrogates) become an extension or readable text.
 """
 
 from __future__ import annotations

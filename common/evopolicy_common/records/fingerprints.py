@@ -1,10 +1,8 @@
 """The parts of runs' fingerprints that must be equal for their scores to be comparable. Pure.
 
 A run's fingerprint has its environment's `adapter` (`REVISION+DIGEST`) and `definition`. The revision counts here; the
-digest and
-`evopolicy-worker`, the digest of all of the worker's code, only distinguish workers within a run. Runs of earlier
-versions
-list the packages of all environments and no adapter: revision `FIRST` played them.
+digest and `evopolicy-worker`, the digest of all of the worker's code, only distinguish workers within a run. Runs of
+earlier versions list the packages of all environments and no adapter: revision `FIRST` played them.
 """
 
 from __future__ import annotations

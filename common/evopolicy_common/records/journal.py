@@ -5,8 +5,7 @@ Rules that this module owns:
 - The hash of a journal, its *head*, starts with that of the empty journal (`EMPTY_HEAD`) and is updated by every entry:
   head(n) = SHA-256("evopolicy journal 1" NUL | head(n - 1) | SHA-256(entry n)).
 - A commitment is SHA-256("evopolicy commitment 1" NUL | salt | document). The salt is 32 random bytes, so that
-  documents
-  cannot be guessed; the document (`Opening`) holds all three splits and all settings of a run.
+  documents cannot be guessed; the document (`Opening`) holds all three splits and all settings of a run.
 - The entry that ends a run holds the SHA-256 of its result (`Result`).
 
 Documents and entries are stored and published as the bytes that were hashed, and never encoded again: fields added by a

@@ -3,8 +3,7 @@
 Rules that this module owns:
 - Rows are compressed at once; memory never holds a whole array. With one zlib, the same rows give the same bytes.
 - A member's header contains the number of rows, which is known only at the end. So the header is a compressed block of
-  its
-  own, placed before the others.
+  its own, placed before the others.
 """
 
 from __future__ import annotations

@@ -4,12 +4,10 @@ Rules that this module owns:
 - The same steps give the same bytes. The rows are those of `json_text.rows_text`; observations outside the rows are one
   `.npz` file.
 - Beside the files is the log of actions, rewards and flags, as a trajectory with record "actions". Audits take the
-  actions
-  from it, bit for bit as they were returned. The log contains nothing that the files do not.
+  actions from it, bit for bit as they were returned. The log contains nothing that the files do not.
 - Rows and pictures are compressed as they arrive.
 - Received bytes are not trusted: sizes are checked against the limits before anything is unpacked, and the rows against
-  the
-  declared length and return.
+  the declared length and return.
 - Layout: `magic, {length, header}, {length, log}, {length, file}…`.
 """
 

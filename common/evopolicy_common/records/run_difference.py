@@ -1,10 +1,8 @@
 """Differences between two run directories, except for the published lists `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
 
 All else must be equal byte for byte, JSON files except for the excluded fields: the same agent on the same cases gives
-the
-same run, independent of the number of workers, their order, and failures. When exactly one of the two runs was written
-by
-an earlier version, `OLD_FILES` and `OLD_FIELDS` are excluded too.
+the same run, independent of the number of workers, their order, and failures. When exactly one of the two runs was
+written by an earlier version, `OLD_FILES` and `OLD_FIELDS` are excluded too.
 """
 
 from __future__ import annotations

@@ -14,8 +14,7 @@ def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     """Run directories at or under `paths`, sorted and distinct, and those of `paths` that contain none.
 
     A run directory is a folder with a `run.json`, or one of a started run (`workspace/` beside `logs/` or
-    `checkpoints/`);
-    it is not searched further. Links below the given paths are not followed.
+    `checkpoints/`); it is not searched further. Links below the given paths are not followed.
     """
     found: set[Path] = set()
     without: list[Path] = []

@@ -2,10 +2,8 @@
 
 The gateway writes it last in a submit's folder and answers `POST /submit` with the same bytes; the analysis reads it.
 It contains nothing hidden: no seed, no hidden score. In the summary of a submit that is not `ok`, all arrays and
-aggregates are
-null, while `env_instances`, `n_episodes` and `remaining_budget` still give the request and the charge. Earlier versions
-wrote
-`schema_version` 1, and null for `env_instances` in such summaries; these are read too.
+aggregates are null, while `env_instances`, `n_episodes` and `remaining_budget` still give the request and the charge.
+Earlier versions wrote `schema_version` 1, and null for `env_instances` in such summaries; these are read too.
 """
 
 from __future__ import annotations

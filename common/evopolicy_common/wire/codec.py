@@ -1,10 +1,8 @@
 """Encodes and decodes messages: msgpack by msgspec, with one decoder for each client's union.
 
 A decoder checks types, required fields and the bounds of `messages.bounds`: lengths of texts and lists, nesting of
-plain
-values, finite numbers. `encode` applies the same checks to its output. Unknown fields are skipped, so a newer peer may
-send
-fields that an older one does not know.
+plain values, finite numbers. `encode` applies the same checks to its output. Unknown fields are skipped, so a newer
+peer may send fields that an older one does not know.
 """
 
 from __future__ import annotations

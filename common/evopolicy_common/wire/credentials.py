@@ -1,12 +1,10 @@
 """Credentials for a cluster, as files: `STATE/credentials/<role>.json`, mode 0600, never an argument or a variable.
 
 The coordinator writes them for its own machine. It also records their folder in the user's registry folder, by
-endpoint:
-a command with `--connect ENDPOINT` and without a credentials file looks there.
+endpoint: a command with `--connect ENDPOINT` and without a credentials file looks there.
 
 Another machine has a folder from `evopolicy-coordinator certs issue`: a credentials file beside its certificates, which
-it
-names by relative paths. Wherever credentials are named, the file or its folder may be given.
+it names by relative paths. Wherever credentials are named, the file or its folder may be given.
 
 Rule: tokens and results cross a network inside TLS only, unless the file states that its coordinator was started with
 `--insecure-tcp`.
@@ -157,8 +155,7 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
     """The credentials of a command, with its `--connect` endpoints in place of the file's.
 
     Reads `file` if given (or, when that is a folder, the role's file in it), else the registry's entry for the
-    endpoints,
-    else the default state folder. Raises ConfigError that names the searched place and the remedy.
+    endpoints, else the default state folder. Raises ConfigError that names the searched place and the remedy.
     """
     if file is not None and file.is_dir():
         held = ", ".join(sorted(path.stem for path in file.glob("*.json"))) or "none"

@@ -1,8 +1,7 @@
 """Typed requests of workers, gateways and operators to the coordinator, with timeouts.
 
 All requests may be repeated. A request without a reply is sent again, with back-off, until the reply comes or the
-caller's
-timeout passes. A refusal counts as a reply.
+caller's timeout passes. A refusal counts as a reply.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@ Rules that this module owns:
 - Every declaration is held by an object, since dropping it undeclares it.
 - Scouting is off and the admin space is closed; `access_control` below grants the rights.
 - Machines connect over mutual TLS: each has a certificate, a user name and a password of its own. It has rights only if
-  the
-  certificate's common name and the user name both equal its identity.
+  the certificate's common name and the user name both equal its identity.
 - No process forks while it has a session open.
 """
 
@@ -221,8 +220,7 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
     """A client session, open inside the `async with`.
 
     Waits until a router accepts it. Raises TransportError after `timeout_s` seconds (None: waits forever); a wrong
-    password
-    has the same effect, as the router does not report it.
+    password has the same effect, as the router does not report it.
     """
     with notify_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
         session = await _open_client(credentials, timeout_s)
