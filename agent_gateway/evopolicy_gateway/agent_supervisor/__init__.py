@@ -1,1 +1,1 @@
-"""The process that starts one agent, watches its clock, logs its output, and ends what it leaves."""
+"""The process that starts one agent, watches its wall clock, logs its output, and ends its process tree."""

@@ -1,4 +1,4 @@
-"""`logs/agent.jsonl`: the agent's raw stream, a JSON document a line, kept within bounds."""
+"""`logs/agent.jsonl`: the agent's raw stream, one JSON document per line, bounded in size."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from evopolicy_gateway.agent_supervisor.redaction import Redaction
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LOG_BYTES = 1 << 30
-"""An agent that floods its output fills no disk: beyond it only a last line says so."""
+"""Limit of the log, bytes, so that an agent cannot fill the disk. A last line notes that the rest is missing."""
 
 
 class AgentLog:
-    """Appends, without keys and tokens; every line reaches the file at once. What the disk refuses is lost, the agent goes on."""
+    """Appends lines without keys and tokens; each reaches the file at once. Lines that the disk refuses are lost;
+    the agent continues."""
 
     def __init__(self, path: Path, redact: Redaction | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -24,10 +25,10 @@ class AgentLog:
         self._left = MAX_LOG_BYTES - path.stat().st_size
         self.redact = redact or Redaction()
         self.last_errors: deque[str] = deque(maxlen=20)
-        """What came on stderr last, for a message about why a program ended."""
+        """The last lines of stderr, for a message about why a program ended."""
 
     def raw(self, line: bytes, stream: str) -> None:
-        """A line of the agent as it came when it is JSON on stdout, else wrapped with the name of its stream."""
+        """Logs a line of the agent: unchanged if it is JSON on stdout, else wrapped with the name of its stream."""
         line = line.rstrip(b"\r\n")
         if stream == "stderr":
             self.last_errors.append(line[:500].decode("utf-8", "replace").strip())
@@ -46,7 +47,7 @@ class AgentLog:
         self.note(document)
 
     def note(self, document: dict[str, Any]) -> None:
-        """A line of ours, such as a prompt."""
+        """Logs a line of our own, such as a prompt."""
         self._write(orjson.dumps(document))
 
     def close(self) -> None:

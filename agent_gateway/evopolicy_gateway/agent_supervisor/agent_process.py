@@ -1,4 +1,4 @@
-"""One program of an agent: its pipes, read line by line without ever holding more than one line."""
+"""One program of an agent, and its pipes, of which memory holds at most one line at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LAST_WORDS_S = 1.0
 
 
 class AgentProcess:
-    """Running program in a session of its own. Everything it says goes to the agent's log."""
+    """A running program in a session of its own. All its output goes to the agent's log."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: AgentLog) -> None:
         self._process = process
@@ -34,7 +34,7 @@ class AgentProcess:
         talks: bool,
         pass_fds: Sequence[int] = (),
     ) -> AgentProcess:
-        """Starts it; OSError when that fails. `talks`: it has a stdin to be written to."""
+        """Starts the program; raises OSError when that fails. `talks`: its stdin is a pipe."""
         process = await asyncio.create_subprocess_exec(
             *ending_with_parent(program, signal.SIGKILL),
             cwd=cwd,
@@ -52,14 +52,14 @@ class AgentProcess:
         return self._process.pid
 
     async def lines(self) -> AsyncIterator[bytes]:
-        """Lines of stdout until it ends; what is longer than `MAX_LINE_BYTES` comes cut."""
+        """Yields lines of stdout until it ends; lines longer than `MAX_LINE_BYTES` are split."""
         assert self._process.stdout is not None
         async for line in _lines(self._process.stdout):
             self._log.raw(line, "stdout")
             yield line
 
     async def say(self, line: bytes) -> bool:
-        """Writes a line to its stdin; False when it no longer listens. Waits for a reader only as long as it lives."""
+        """Writes a line to its stdin and waits until the program reads it. Returns False when stdin is closed."""
         stdin = self._process.stdin
         if stdin is None or stdin.is_closing():
             return False
@@ -71,20 +71,20 @@ class AgentProcess:
         return True
 
     def hang_up(self) -> None:
-        """Ends its stdin: nothing more is said to it."""
+        """Closes its stdin."""
         if self._process.stdin is not None:
             self._process.stdin.close()
 
     async def ended(self) -> int:
-        """Its exit status (negative: the signal that ended it)."""
-        # `Process.wait` would wait for the pipes too, which a daemonised child can hold open for ever.
+        """Waits for its end and returns the exit status (negative: the signal that ended it)."""
+        # `Process.wait` would also wait for the pipes, which a daemonised child can hold open forever.
         while self._process.returncode is None:  # noqa: ASYNC110
             await asyncio.sleep(0.02)
         return self._process.returncode
 
     async def close(self) -> None:
-        """Stops reading; to be called when the program is gone."""
-        # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+        """Stops reading. Call it after the program has ended."""
+        # The pipe may still hold the last lines; do not wait for a child that keeps it open.
         await asyncio.wait([self._stderr], timeout=_LAST_WORDS_S)
         self._stderr.cancel()
         await asyncio.gather(self._stderr, return_exceptions=True)
@@ -114,6 +114,6 @@ async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[bytes]:
 
 
 def environment_of(urls: Mapping[str, str]) -> dict[str, str]:
-    """The operator's variables without this project's own, with the URLs."""
+    """The operator's variables except this project's own, plus the URLs."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("EVOPOLICY")}
     return kept | dict(urls)

@@ -1,7 +1,7 @@
-"""An agent's two clocks: its time as a whole, and how long it has done nothing.
+"""An agent's two clocks: its total time, and the time since its last activity.
 
-The first stands still while its provider is away, and waits for hidden episodes are given back to it. The second is of
-programs alone, as a coding agent's stream has a limit of its own.
+The first pauses during outages of its provider, and waits for hidden episodes do not count. The second applies to plain
+programs only, as a coding agent's stream has a timeout of its own.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from pathlib import Path
 from evopolicy_gateway.run import processes
 
 SILENCE_S = 3600.0
-"""Usual limit of an agent's silence: longer than any pause for thought, and much shorter than its wall limit."""
+"""Default limit of an agent's inactivity, seconds: longer than any pause for thought, and much shorter than its wall
+limit."""
 _LOOK_S = 1.0
 _LOOKS = 20
-"""So often is looked for processor time within the limit of silence."""
+"""Number of measurements of processor time within the limit of inactivity."""
 _BUSY_SHARE = 0.05
-"""Of one core, from one look to the next: a program that only waits and polls takes less."""
+"""Share of one core between two measurements above which the agent is active; a program that only waits and polls
+uses less."""
 
 
 class AgentClock:
-    """Counts down from `limit_s` seconds."""
+    """Counts down from `limit_s` seconds; pauses and waits for hidden episodes do not count."""
 
     def __init__(self, limit_s: float, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
@@ -36,21 +38,22 @@ class AgentClock:
         self._held_s = 0.0
 
     def held(self, seconds: float) -> None:
-        """Gives back so many seconds in all, for which its submits have waited because hidden episodes had the machines."""
+        """Sets the total time, seconds, in which its submits waited because hidden episodes occupied the machines;
+        it does not count."""
         self._held_s = max(self._held_s, seconds)
 
     def left_s(self) -> float:
-        """Seconds that are left; below zero when it has run out."""
+        """Seconds left; negative when the time is up."""
         now = self._now() if self._paused_at is None else self._paused_at
         return self._limit_s - (now - self._started - self._paused_s - self._held_s)
 
     def used_s(self) -> float:
-        """Seconds that have passed on it."""
+        """Seconds used."""
         return self._limit_s - self.left_s()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """It stands still inside the `with`."""
+        """Pauses the clock inside the `with`."""
         self._paused_at = self._now()
         try:
             yield
@@ -59,39 +62,40 @@ class AgentClock:
             self._paused_at = None
 
     async def run_out(self) -> None:
-        """Returns when it has."""
-        # Looks again and again: it may be stopped meanwhile.
+        """Returns when the time is up."""
+        # Checks repeatedly, as the clock may be paused meanwhile.
         while (left := self.left_s()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(min(left, _LOOK_S))
 
 
 class Activity:
-    """What an agent has done lately, and whether it has fallen silent.
+    """Tracks an agent's recent activity, and detects inactivity.
 
-    It is active while a submit of it runs, whenever it asks for one, when a file of its workspace has changed, and while its
-    processes take processor time. What it prints and answers does not count: a program may do so for ever.
+    An agent is active while one of its submits runs, when it requests one, when a file of its workspace changes, and
+    while its processes use processor time. Its output and its answers do not count: a program may produce them forever.
     """
 
     def __init__(
         self, limit_s: float, workspace: Path, cpu_s: Callable[[], float] = processes.cpu_below
     ) -> None:
-        """Silent after `limit_s` seconds; `cpu_s` tells the processor seconds of the agent's processes so far."""
+        """Inactive after `limit_s` seconds; `cpu_s` returns the processor seconds that the agent's processes have
+        used."""
         self.limit_s = limit_s
         self.submits = 0
-        """It has asked for so many."""
+        """Number of submits that it has requested."""
         self._workspace = workspace
         self._cpu_s = cpu_s
         self._running = False
         self._active_at = time.monotonic()
 
     def told(self, submits: int, running: bool) -> None:
-        """How many submits it has asked for, and whether one has no answer yet."""
+        """Reports how many submits it has requested, and whether one of them is unanswered."""
         if submits != self.submits or running or self._running:
             self._active_at = time.monotonic()
         self.submits, self._running = submits, running
 
     async def silence(self) -> str:
-        """Returns when it has lasted for `limit_s`, with what to say of it."""
+        """Returns after `limit_s` seconds of inactivity, with a text that describes it."""
         pause_s = min(self.limit_s / _LOOKS, 3600.0)
         while True:
             cpu_s, looked_at = self._cpu_s(), time.monotonic()
@@ -101,7 +105,7 @@ class Activity:
                 self._active_at = now
             if now - self._active_at < self.limit_s:
                 continue
-            # A workspace may hold very many files, so it is looked at only when nothing else was seen.
+            # A workspace may hold very many files, so it is scanned only when no other activity was seen.
             unchanged_s = max(0.0, time.time() - await asyncio.to_thread(_last_change, self._workspace))
             if unchanged_s >= self.limit_s:
                 return (
@@ -112,7 +116,8 @@ class Activity:
 
 
 def _last_change(folder: Path) -> float:
-    """Latest change of a file below a folder, Unix time; feedback aside, which is not the agent's to write."""
+    """Time of the latest change of a file below a folder, Unix time, seconds; ignores feedback, which the agent does
+    not write."""
     last = 0.0
     for root, folders, files in os.walk(folder):
         if Path(root) == folder and "feedback" in folders:

@@ -1,7 +1,7 @@
-"""The agent supervisor: a process that starts one agent, watches its clock, and leaves nothing of it behind.
+"""The agent supervisor: a process that starts one agent, watches its wall clock, and ends all its processes.
 
-It speaks the lines of `control.py` with `evopolicy run`. It is apart from the gateway, so that an agent's parent holds no
-credentials, and so that a gateway that dies and comes back finds the agent still at work.
+It exchanges the messages of `operator/child_messages.py` with `evopolicy run`, one per line. It is separate from the
+gateway, so that an agent's parent holds no credentials, and so that a restarted gateway finds the agent still running.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from evopolicy_gateway.operator.child_messages import (
 from evopolicy_gateway.run import processes
 
 END_GRACE_S = 3.0
-"""From SIGTERM to SIGKILL."""
+"""Time from SIGTERM to SIGKILL."""
 LAST_WORDS_S = 2.0
 _TEXT_SHOWN = 2000
 _LINES_SHOWN = 8
@@ -51,7 +51,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
-    """Plays the agent to its end, or until told; everything that it started is gone afterwards."""
+    """Runs the agent until it ends, is stopped, or its time is up; afterwards none of its processes is left."""
     environment = environment_of({**order.urls, **order.variables})
     config = None if order.config is None else msgspec.convert(order.config, AgentConfig)
     agent_log = AgentLog(Path(order.agent_log), Redaction.of(secrets_in(environment, config), order.urls))
@@ -78,7 +78,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         reason = None if play.done() else "told" if told.done() else "wall_limit"
         stage.over.set()
         await _until_gone(stage.started)
-        # With its programs gone a harness ends by itself, and can still say how far it came.
+        # Once its programs have ended, a harness returns by itself with its facts (turns, tokens).
         await asyncio.wait([play], timeout=LAST_WORDS_S)
         play.cancel()
         ending = (await asyncio.gather(play, return_exceptions=True))[0]
@@ -120,7 +120,8 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
-    """Variables whose values may be secrets: what an agent's settings name for passing on is one whatever its name."""
+    """Variables whose values may be secrets; those in the settings' `pass_environment` always count, whatever their
+    names."""
     named = (
         {}
         if config is None
@@ -135,14 +136,14 @@ def _tell(doing: AgentDoing) -> None:
 
 
 async def _tell_time(clock: AgentClock) -> None:
-    """Again and again, so that an agent that is killed and goes on has no more time than another."""
+    """Reports the used time periodically, so that an agent that is killed and resumed gets no extra time."""
     while True:
         await asyncio.sleep(_TELL_TIME_S)
         child_messages.emit(AgentTime(used_s=clock.used_s()))
 
 
 async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None) -> None:
-    """Returns when the parent says stop, or is gone; passes on to the clocks what it is told meanwhile."""
+    """Returns when the parent requests the stop or is gone; until then forwards its reports to the clocks."""
     while (order := await orders.next()) is not None:
         if isinstance(order, child_messages.HeldTime):
             clock.held(order.seconds)
@@ -153,9 +154,10 @@ async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None)
 
 
 async def _until_gone(started: Collection[int]) -> None:
-    """Ends all that the agent has started, and returns when nothing of it lives.
+    """Ends all processes of the agent, and returns when none is alive.
 
-    What survives being killed (the kernel holds it) is told to the parent: as long as it lives the agent is not gone.
+    Processes that survive SIGKILL (stuck in the kernel) are reported to the parent: while they live, the agent is not
+    gone.
     """
     told: list[int] = []
     while left := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
@@ -176,7 +178,7 @@ async def _main() -> int:
     if not isinstance(first, StartAgent):
         return 2
     if first.lock is not None:
-        # Of this process alone, and let go of by its death: no program of the agent inherits it.
+        # Held by this process alone until its death: no program of the agent inherits it.
         file = os.open(first.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         await asyncio.to_thread(fcntl.flock, file, fcntl.LOCK_EX)
     main = asyncio.create_task(keep(first, orders))
@@ -189,7 +191,7 @@ async def _main() -> int:
 
 
 if __name__ == "__main__":
-    # A thread that still reads stdin must not hold up the exit.
+    # os._exit: a thread still reading stdin must not delay the exit.
     try:
         code = asyncio.run(_main())
     except Exception:

@@ -1,4 +1,4 @@
-"""Agents by the name that `--agent` gives them."""
+"""Creates harnesses from the value of `--agent`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode
 
 
 def entry_name(agent: str) -> str:
-    """The leaderboard entry that an agent gets when the operator names none: `evolve`, `replay-gaits`, `command-run.sh`."""
+    """An agent's default leaderboard entry: `evolve`, `replay-gaits`, `command-run.sh`."""
     kind, _, rest = agent.partition(":")
     if kind == "replay":
         return f"replay-{Path(rest).resolve().name}"
@@ -43,9 +43,10 @@ def entry_name(agent: str) -> str:
 
 
 def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Harness:
-    """The harness of `--agent`, with a coding agent's settings where the operator has them. ConfigError for what is none.
+    """The harness of `--agent`, with a coding agent's settings if the operator has them. Raises ConfigError for invalid
+    values.
 
-    Files in a command or after `replay:` are meant from `started_in`: the agent itself runs elsewhere.
+    Files in a command or after `replay:` are relative to `started_in`, as the agent itself runs elsewhere.
     """
     kind, colon, rest = agent.partition(":")
     if config is None and kind == "file" and rest:
@@ -83,7 +84,7 @@ def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
 
 
 def _ours(module: str) -> list[str]:
-    # -P: modules in the workspace, which the agent writes, must not take the place of installed ones.
+    # -P: modules in the workspace, which the agent writes, must not shadow installed ones.
     return [sys.executable, "-P", "-m", f"evopolicy_gateway.agents.{module}"]
 
 
@@ -95,7 +96,7 @@ def _split(command: str) -> list[str]:
 
 
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
-    """The command with files that lie where it was given named absolutely."""
+    """The command with absolute paths for files that exist in `started_in`."""
     resolved = _absolute(words, started_in)
     if shutil.which(resolved[0]) is None:
         raise ConfigError(f"--agent {agent}: no program {words[0]!r}, neither a file here nor on the PATH")
@@ -103,13 +104,13 @@ def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
 
 
 def _no_files(words: Sequence[str], started_in: Path) -> str:
-    """Which words of a command look like files next to the operator, and are none; empty for none of them."""
+    """A hint that names words of a command that look like files but do not exist; empty if there are none."""
     looks = re.compile(r"(\./|\.\./)?[\w./-]+\.(py|sh|js|ts|rb|pl|toml|yaml|json)")
     lost = [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
     return f"{started_in} has no {', '.join(lost)}: relative paths are looked for there first" if lost else ""
 
 
 def _absolute(words: Sequence[str], started_in: Path) -> list[str]:
-    """The words with files that lie where they were given named absolutely."""
-    # Links stay links: a virtual environment's python is one, and another program without it.
+    """The words, with absolute paths for files that exist in `started_in`."""
+    # Links are not resolved: a virtual environment's python is one, and its target is outside the environment.
     return [os.path.abspath(started_in / word) if (started_in / word).is_file() else word for word in words]

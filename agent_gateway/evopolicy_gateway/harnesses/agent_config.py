@@ -1,7 +1,7 @@
 """An agent's settings, from a TOML file or a suite's `[[agents]]` table.
 
-`docs/how-to/coding-agents.md` lists them with examples. Unknown keys are refused. A file holds no secrets: `environment` is written to
-`run.json`, `pass_environment` only names variables that must be set.
+`docs/how-to/coding-agents.md` lists them with examples. Unknown keys are refused. A file holds no secrets:
+`environment` is written to `run.json`, and `pass_environment` only names variables that must be set.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from evopolicy_gateway.harnesses.usage import Prices
 
 
 class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where an event tells the tokens; dotted paths such as `usage.input_tokens`, empty for what it does not tell."""
+    """Where an event reports token counts: dotted paths such as `usage.input_tokens`; empty for counts that it does
+    not report."""
 
     input: str = ""
     cache_read: str = ""
@@ -26,43 +27,44 @@ class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     output: str = ""
     reasoning: str = ""
     total: str = ""
-    """Of a stream whose `output` lacks the reasoning: what `total` is above `input` is output."""
+    """For a stream whose `output` excludes reasoning: output is then `total` minus `input`, if that is larger."""
     input_includes_cached: bool = False
-    """The stream counts `cache_read` into `input`, as Codex does."""
+    """Whether the stream includes `cache_read` in `input`, as Codex does."""
     counts: Literal["turn", "session"] = "turn"
-    """What the numbers add up: one turn, or the session so far."""
+    """Whether the numbers cover one turn, or the session so far."""
 
 
 class Events(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a CLI's JSON lines mean: dotted paths, where `*` stands for every element of a list.
+    """The meaning of a CLI's JSON lines: dotted paths, where `*` stands for every element of a list.
 
-    `[name=value]` goes on only where the object has that value, such as `[type=result].error.message`. The first path with a value counts, and an event without any is passed over.
+    `[name=value]` matches only objects with that value, such as `[type=result].error.message`. The first path with a
+    value counts; an event without any is ignored.
     """
 
     session: tuple[str, ...] = ()
     text: tuple[str, ...] = ()
-    """What the agent says."""
+    """The agent's text."""
     action: tuple[str, ...] = ()
-    """What it does, for people who watch."""
+    """The agent's action, for people who watch."""
     error: tuple[str, ...] = ()
-    """The turn failed, and this is why."""
+    """The error with which the turn failed."""
     tokens: TokenPaths = TokenPaths()
 
 
 class Cli(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How to speak with a CLI that there is no harness for. `{model}`, `{effort}`, `{session}`, `{prompt}` are filled in.
+    """How to use a CLI without a harness of its own. `{model}`, `{effort}`, `{session}`, `{prompt}` are filled in.
 
-    An argument that needs a model or an effort is dropped with the one before it where none is set.
+    If no model or effort is set, an argument that needs it is dropped together with the option before it.
     """
 
     first: tuple[str, ...]
     """Arguments of a session's first turn."""
     resume: tuple[str, ...] = ()
-    """Arguments of later turns; empty: the CLI knows no sessions, each turn starts anew."""
+    """Arguments of later turns; empty: the CLI has no sessions, and each turn starts from scratch."""
     prompt: Literal["stdin", "argument"] = "stdin"
-    """`argument`: it stands where `{prompt}` is."""
+    """`argument`: the prompt replaces `{prompt}` in the arguments."""
     own_session_id: bool = False
-    """The session's id is made here (a UUID), and given by `{session}` in `first` too."""
+    """We generate the session's id (a UUID), and `{session}` passes it in `first` too."""
     version: tuple[str, ...] = ("--version",)
     events: Events = Events()
 
@@ -71,40 +73,41 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """All of an agent's settings."""
 
     harness: str
-    """`codex`, `claude-code`; any other name with a `[cli]` table."""
+    """`codex`, `claude-code`, or any other name with a `[cli]` table."""
     model: str | None = None
-    """Model string, as the CLI takes it; None for its own default."""
+    """Model string in the CLI's form; None for its default."""
     effort: str | None = None
     program: tuple[str, ...] = ()
-    """In place of the CLI on the PATH."""
+    """Replaces the CLI on the PATH."""
     extra_args: tuple[str, ...] = ()
     environment: dict[str, str] = {}
     pass_environment: tuple[str, ...] = ()
     provider: str | None = None
-    """Whose outage or quota pauses this agent; default: the harness's usual one."""
+    """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
     user_config: bool = False
-    """Let the CLI read the user's own settings, rules and memory: off, so that a run depends on this file alone."""
+    """Lets the CLI read the user's own settings, rules and memory; off by default, so that a run depends on this
+    file alone."""
     retries: int = 5
-    """In a row, for one turn."""
+    """Most retries in a row, for one turn."""
     backoff_s: float = 4.0
-    """Before the first retry; doubled for each further one."""
+    """Seconds before the first retry; doubled for each further one."""
     reprompts: int = 8
-    """Times that an agent which stops with budget left is told to go on."""
+    """How often an agent that stops with budget left is prompted to continue."""
     silence_s: float = 3600.0
-    """A CLI that says nothing for so long is ended, and its session resumed."""
+    """A CLI without output for this many seconds is ended, and its session resumed."""
     pause_s: float = 900.0
-    """First pause of an outage or a quota without a told end; doubled up to an hour."""
+    """First pause for an outage or a quota without a stated end, seconds; doubled up to an hour."""
     max_pause_s: float = 86_400.0
-    """All pauses of a run together; after them the run ends."""
+    """Limit of all pauses of a run together, seconds; after them the run ends."""
     max_tokens: int | None = None
-    """Per run, all kinds together."""
+    """Limit per run, all kinds of tokens together."""
     max_cost: float | None = None
-    """Per run, US dollars; needs `prices`."""
+    """Limit per run, US dollars; needs `prices`."""
     prices: Prices | None = None
     cli: Cli | None = None
 
     def check(self, environment: Mapping[str, str] | None = None) -> None:
-        """ConfigError naming the setting that is wrong."""
+        """Raises ConfigError that names the wrong setting."""
         variables = os.environ if environment is None else environment
         missing = [name for name in self.pass_environment if not variables.get(name)]
         if missing:
@@ -130,7 +133,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         )
 
     def settings(self) -> dict[str, object]:
-        """What `run.json` keeps of it."""
+        """The part recorded in `run.json`."""
         kept = msgspec.to_builtins(self)
         return {
             name: value for name, value in kept.items() if value not in (None, [], {}) and name != "harness"
@@ -138,7 +141,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def read_agent(path: Path) -> AgentConfig:
-    """The settings in a TOML file. ConfigError says what is wrong and where."""
+    """The settings in a TOML file. Raises ConfigError with the file and the fault."""
     try:
         config = msgspec.toml.decode(path.read_bytes(), type=AgentConfig)
     except OSError as error:

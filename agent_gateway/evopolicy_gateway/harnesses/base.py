@@ -1,7 +1,8 @@
-"""What a harness is: how one kind of agent is started, talked to and read, from its first word to its last.
+"""The interface of a harness, which starts one kind of agent, sends it prompts and reads its output.
 
-A harness runs in the agent supervisor (`supervisor.py`), which holds no credentials: it knows the workspace and the three URLs.
-It does not end processes and does not watch the clock; the agent supervisor does both.
+A harness runs in the agent supervisor (`supervisor.py`), which holds no credentials: it knows the workspace and the
+three URLs. It neither ends the agent's processes at the run's end nor watches the wall clock; the agent supervisor does
+both.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _INFO_TIMEOUT_S = 30.0
 
 
 class AgentError(EvopolicyError):
-    """The agent cannot be started, or its harness cannot make sense of it; for the operator."""
+    """The agent cannot be started, or its harness cannot interpret its output; for the operator."""
 
 
 def _nobody_watches(_: AgentDoing) -> None:
@@ -37,41 +38,42 @@ def _nobody_watches(_: AgentDoing) -> None:
 
 
 class Stage(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an agent plays."""
+    """The surroundings in which an agent runs."""
 
     workspace: Path
-    """Its working directory."""
+    """The agent's working directory."""
     urls: Mapping[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs."""
     environment: Mapping[str, str]
-    """All its variables, the `EVOPOLICYGYM_*` ones too."""
+    """All variables of the agent, including the `EVOPOLICYGYM_*` ones."""
     log: AgentLog
     on_turn: Callable[[int, str], None]
-    """Told what the agent says, for people who watch."""
+    """Called with a turn's number and the agent's text, for people who watch."""
     started: list[int] = []
-    """Ids of the processes that `start` has started, whose exit status it takes."""
+    """Ids of the processes started by `start`, which also collects their exit status."""
     session_file: Path | None = None
-    """Where a session is kept, so that it goes on after its agent supervisor was killed."""
+    """File of the session's state, with which the session resumes after its agent supervisor was killed."""
     on_doing: Callable[[AgentDoing], None] = _nobody_watches
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
     activity: Activity | None = None
-    """None: nobody asks whether it is silent."""
+    """None: inactivity is not watched."""
     over: asyncio.Event = msgspec.field(default_factory=asyncio.Event)
-    """Set when the agent's time is over: a program that ends from now on has been ended, and is not started again."""
+    """Set when the agent's time is up: programs that end after that were ended, and are not restarted."""
     jail: Jail | None = None
-    """Around every program that `start` starts."""
+    """The jail of every program that `start` starts."""
 
     def with_environment(self, more: Mapping[str, str]) -> Stage:
-        """The same stage with more variables."""
+        """A copy with more variables."""
         return msgspec.structs.replace(self, environment={**self.environment, **more})
 
     async def sleep(self, seconds: float) -> None:
-        """Waits, but not beyond the agent's time."""
+        """Sleeps, but not beyond the agent's time."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.over.wait(), seconds)
 
     async def start(self, program: list[str], *, talks: bool) -> AgentProcess:
-        """Starts a program of the agent in the workspace; `talks`: it is written to. AgentError when it cannot be."""
+        """Starts a program of the agent in the workspace. `talks`: its stdin is a pipe. Raises AgentError when it
+        cannot be started."""
         way = None if self.jail is None else self.jail.way(program)
         try:
             process = await AgentProcess.start(
@@ -92,7 +94,7 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
         return process
 
     async def info(self) -> dict[str, Any]:
-        """What `/info` says now. OSError when the gateway does not answer."""
+        """The present content of `/info`. Raises OSError when the gateway does not answer."""
         return await asyncio.to_thread(_get_json, self.urls["EVOPOLICYGYM_INFO_URL"])
 
 
@@ -100,27 +102,28 @@ class Harness(ABC):
     """One kind of agent."""
 
     name: str
-    """As `run.json` names it: `command`, `replay`, `evolve`, …"""
+    """Name in `run.json`: `command`, `replay`, `evolve`, …"""
     command: Sequence[str] = ()
-    """Words of the operator's command, whose files a jail shows; nothing that an agent has said."""
+    """Words of the operator's command, whose files a jail shows; never words of an agent."""
     variables: Sequence[str] = ()
-    """Variables of the operator that the agent's settings pass on, into a jail too."""
+    """Names of the operator's variables that the agent's settings pass on, into a jail too."""
     resumable = False
-    """It goes on from `Stage.session_file` after everything of it was killed."""
+    """Whether it resumes from `Stage.session_file` after all its processes were killed."""
 
     def known(self) -> dict[str, Any]:
-        """Facts for `run.json` that do not depend on how it ends: where nobody is left who could tell the others."""
+        """Facts for `run.json` that do not depend on the agent's end, for runs whose supervisor cannot report the
+        others."""
         return {}
 
     def check(self) -> None:  # noqa: B027
-        """ConfigError where the agent cannot be started on this machine; to be asked before a run is opened."""
+        """Raises ConfigError when the agent cannot be started on this machine; call it before a run is opened."""
 
     @abstractmethod
     async def play(self, stage: Stage) -> AgentEnded:
-        """Plays until the agent stops by itself. Cancelled when the run is over for another reason."""
+        """Runs the agent until it stops by itself. Cancelled when the run ends for another reason."""
 
 
-# The gateway is on this machine; a proxy from the surroundings must not be asked for it.
+# The gateway is on this machine; proxies of the environment must not be used for it.
 _opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
@@ -128,6 +131,6 @@ def _get_json(url: str) -> dict[str, Any]:
     try:
         with _opener.open(url, timeout=_INFO_TIMEOUT_S) as answer:
             document = json.load(answer)
-    except HTTPException as error:  # a gateway that was killed while it answered
+    except HTTPException as error:  # the gateway was killed while it answered
         raise OSError(f"{url} did not answer to the end: {error!r}") from error
     return dict(document)

@@ -1,12 +1,13 @@
-"""Claude Code: `claude --print --output-format stream-json`, its session begun under an id of ours and resumed by it.
+"""Claude Code: `claude --print --output-format stream-json`, its session started under our own id and resumed by it.
 
-Its stream, a JSON object a line: `system` (subtype `init` with the session and the version, `api_retry` for retries of its
-own), `assistant` and `user` messages with content blocks, and one `result` at the end: `is_error`, `api_error_status`,
-`errors`, and `usage` of this invocation, with cache reads and creations apart from `input_tokens`. A message's own usage is
-repeated with every block of it and tells too little output, so it counts only where no result came.
+Its stream, one JSON object per line: `system` (subtype `init` with the session and the version, `api_retry` for its own
+retries), `assistant` and `user` messages with content blocks, and one `result` at the end: `is_error`,
+`api_error_status`, `errors`, and `usage` of this invocation, with cache reads and creations separate from
+`input_tokens`. A message's own usage is repeated with each of its blocks and reports too little output, so it counts
+only if no result came.
 
-Tools are the paper's six; permissions are bypassed, since what holds an agent is the jail around it. As root the CLI
-refuses that unless `IS_SANDBOX=1`.
+Tools are the paper's six; permissions are bypassed, since the jail confines the agent. As root the CLI refuses that
+unless `IS_SANDBOX=1`.
 
 https://code.claude.com/docs/en/headless, https://code.claude.com/docs/en/cli-reference
 """
@@ -27,7 +28,7 @@ _ISOLATION = ("--safe-mode", "--strict-mcp-config")
 
 
 class ClaudeCode(Dialect):
-    """`claude`."""
+    """The dialect of `claude`."""
 
     name = "claude-code"
     program = ("claude",)
@@ -39,7 +40,7 @@ class ClaudeCode(Dialect):
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
         words = ["--print", "--output-format", "stream-json", "--verbose"]
         words += ["--permission-mode", "bypassPermissions"]
-        # Before `--tools` came, the profile could only be had by allowing its members.
+        # Versions without `--tools` can restrict the tools only by allowing them.
         words += ["--tools" if "--tools" in options else "--allowedTools", TOOLS]
         if not self.config.user_config:
             words += [option for option in _ISOLATION if option in options]
@@ -65,7 +66,7 @@ class ClaudeCode(Dialect):
 
 
 class ClaudeReader(TurnReader):
-    """One `claude --print`."""
+    """Reads the stream of one `claude --print`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -89,7 +90,7 @@ class ClaudeReader(TurnReader):
             self.usage = self.usage - self._messages.pop(identity, Usage()) + told
             self._messages[identity] = told
             if len(self._messages) > _MAX_OPEN_MESSAGES:
-                # What is dropped stays counted: a message is not told anew after so many others.
+                # Dropped messages stay counted: after so many others, a message is not reported again.
                 del self._messages[next(iter(self._messages))]
         content = message.get("content")
         for block in content if isinstance(content, list) else ():
@@ -122,7 +123,7 @@ class ClaudeReader(TurnReader):
 
 
 def usage_of(told: Mapping[str, Any]) -> Usage:
-    """The paper's counts from a `usage` object."""
+    """The paper's token counts from a `usage` object."""
     return Usage(
         input_noncached=count(told.get("input_tokens")),
         cache_read=count(told.get("cache_read_input_tokens")),

@@ -1,11 +1,11 @@
-"""A coding agent's CLI as an agent: one logical session, turn after turn, through failures, outages and restarts.
+"""A coding agent's CLI as an agent: one logical session over many turns, through failures, outages and restarts.
 
 Rules:
-- After a failure the same session is resumed, at most `retries` times in a row, each after a longer pause. Nothing of that
-  touches the environment or the budget.
-- A provider that stays away, or a quota that is spent, pauses the run instead; the agent's clock stands still meanwhile.
-- An agent that stops with budget left is told what remains, at most `reprompts` times.
-- A cap on tokens or money ends the agent, also within a turn where its stream tells.
+- After a failure the same session is resumed, at most `retries` times in a row, each time after a longer back-off. This
+  affects neither the environment nor the budget.
+- A longer outage of the provider, or an exhausted quota, pauses the run instead; the agent's clock pauses meanwhile.
+- An agent that stops with budget left is reminded of it, at most `reprompts` times.
+- A cap on tokens or money ends the agent, also within a turn if its stream reports usage.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class CliAgent(Harness):
-    """Any CLI that there is a `Dialect` for."""
+    """Runs any CLI that has a `Dialect`."""
 
     def __init__(self, dialect: Dialect) -> None:
         self.name = dialect.name
@@ -53,7 +53,7 @@ class CliAgent(Harness):
         self._version: str | None = None
         self._state = SessionState()
         self._failures = 0
-        """Failed turns since the last one that was done."""
+        """Failed turns since the last completed one."""
         self._pause_s = self._config.pause_s
 
     def check(self) -> None:
@@ -79,14 +79,14 @@ class CliAgent(Harness):
             prompt = ending
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
-        """One turn, booked."""
+        """Runs one turn and records its usage."""
         dialect, state = self._dialect, self._state
         resume = state.session is not None and dialect.resumes
         begun = state.session if resume else str(uuid.uuid4()) if dialect.makes_session_id else None
         arguments = dialect.arguments(begun, resume=resume, prompt=prompt, options=self._options)
         stage.log.note({"type": "prompt", "turn": state.turns, "session": begun, "message": prompt})
         reader = dialect.reader()
-        # A stream that counts its session tells what this session used before once more.
+        # A cumulative stream repeats the usage of this session's earlier turns, so these are not added again.
         spent = state.usage_without(begun) if dialect.cumulative else state.usage
         told = Usage()
 
@@ -108,7 +108,7 @@ class CliAgent(Harness):
         return reader
 
     async def _done(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
-        """The next prompt after a turn that was done, or the end."""
+        """The next prompt after a completed turn, or the end."""
         state = self._state
         state.turns += 1
         self._failures, self._pause_s = 0, self._config.pause_s
@@ -131,7 +131,7 @@ class CliAgent(Harness):
         return prompts.interrupted(None) if left is None else prompts.go_on(left)
 
     async def _failed(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
-        """The prompt of the retry after a failed turn, once it is time for it, or the end."""
+        """Waits as the failure requires and returns the prompt of the retry, or the end."""
         state, config = self._state, self._config
         failure = reader.failure or TurnFailure(kind="passing", message="the program ended without a word")
         message = stage.log.redact.text(failure.message)
@@ -162,12 +162,12 @@ class CliAgent(Harness):
         return await self._prompt_after_failure(stage)
 
     async def _pause(self, stage: Stage, failure: TurnFailure, message: str) -> None:
-        """Waits for the provider, with the agent's clock standing still."""
+        """Waits for the provider, with the agent's clock paused."""
         state, config = self._state, self._config
         wait_s = self._pause_s if failure.wait_s is None else failure.wait_s
         wait_s = min(wait_s * random.uniform(1.0, 1.1), max(0.0, config.max_pause_s - state.paused_s))
         self._pause_s = min(2.0 * self._pause_s, max(_MAX_PAUSE_S, config.pause_s))
-        # Only a turn that is done wins the retries back: until then, one try a pause.
+        # Only a completed turn resets the retries: until then, one attempt per pause.
         self._failures = max(self._failures, config.retries)
         stage.log.note({"type": "paused", "seconds": round(wait_s, 1), "message": message})
         paused = AgentDoing(action=f"paused: {message}", paused_s=wait_s, provider=config.provider_name)
@@ -178,7 +178,7 @@ class CliAgent(Harness):
         stage.on_doing(AgentDoing(action="tries again", provider=config.provider_name))
 
     async def _prompt_after_failure(self, stage: Stage) -> str:
-        """The first prompt of a session, or what one that was interrupted is told."""
+        """The first prompt of a session, or the prompt that resumes an interrupted one."""
         if self._state.session is None or not self._dialect.resumes:
             return prompts.FIRST
         return prompts.interrupted(await left_of(stage))
@@ -198,7 +198,7 @@ class CliAgent(Harness):
         return None
 
     def _missing(self, environment: Mapping[str, str]) -> str | None:
-        """What is missing where the program is not there."""
+        """An error text if the program is missing, else None."""
         name, install = self._program[0], self._dialect.install
         if shutil.which(name, path=environment.get("PATH")) is not None:
             return None
@@ -207,7 +207,7 @@ class CliAgent(Harness):
         )
 
     async def _probe(self, stage: Stage) -> None:
-        """Finds the program, its version and its options. AgentError says what is missing."""
+        """Finds the program, its version and its options. Raises AgentError that names what is missing."""
         name, dialect = self._program[0], self._dialect
         if (missing := self._missing(stage.environment)) is not None:
             raise AgentError(missing)
@@ -275,9 +275,9 @@ class CliAgent(Harness):
 
 
 async def left_of(stage: Stage) -> int | None:
-    """Episodes that are left, once no submit is in flight any more; None when the gateway does not answer.
+    """Episodes left, once no submit is in flight; None when the gateway does not answer.
 
-    An agent that is prompted while its submit runs could only say that it waits, and would use its reminders up.
+    An agent prompted while its submit runs could only answer that it waits, and would use up its reminders.
     """
     try:
         while (info := await stage.info()).get("submit_in_flight") and not stage.over.is_set():

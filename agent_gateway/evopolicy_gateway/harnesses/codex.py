@@ -1,9 +1,9 @@
 """OpenAI's Codex CLI: `codex exec --json`, continued by `codex exec resume ID`.
 
-Its stream, a JSON object a line: `thread.started {thread_id}`, `turn.started`, `item.started|updated|completed {item}`,
-`turn.completed {usage}`, `turn.failed {error}`, `error {message}`. An `error` that starts with "Reconnecting" is only a
-notice; any error counts only if the turn does not complete. `usage` counts the thread from its beginning, across resumes;
-`input_tokens` holds the cached ones and `output_tokens` the reasoning ones.
+Its stream, one JSON object per line: `thread.started {thread_id}`, `turn.started`, `item.started|updated|completed
+{item}`, `turn.completed {usage}`, `turn.failed {error}`, `error {message}`. An `error` that starts with "Reconnecting"
+is only a notice; any error counts only if the turn does not complete. `usage` counts the thread from its start, across
+resumes; `input_tokens` includes the cached ones and `output_tokens` the reasoning ones.
 
 https://developers.openai.com/codex/noninteractive, https://github.com/openai/codex (codex-rs/exec)
 """
@@ -23,7 +23,7 @@ _NOTICE = "Reconnecting"
 
 
 class Codex(Dialect):
-    """`codex`."""
+    """The dialect of `codex`."""
 
     name = "codex"
     program = ("codex",)
@@ -36,7 +36,7 @@ class Codex(Dialect):
         words = ["exec", "resume"] if resume else ["exec"]
         words += ["--json", "--skip-git-repo-check", _BYPASS]
         if not self.config.user_config:
-            # Versions before these options read the user's settings whatever we say.
+            # Versions without these options always read the user's settings.
             words += [option for option in _ISOLATION if option in options]
         if self.config.model is not None:
             words += ["--model", self.config.model]
@@ -55,7 +55,7 @@ class Codex(Dialect):
 
 
 class CodexReader(TurnReader):
-    """One `codex exec`."""
+    """Reads the stream of one `codex exec`."""
 
     def read(self, event: Mapping[str, Any]) -> None:
         kind = event.get("type")
@@ -95,7 +95,7 @@ class CodexReader(TurnReader):
 
 
 def usage_of(told: Mapping[str, Any]) -> Usage:
-    """The paper's counts from a `usage` object."""
+    """The paper's token counts from a `usage` object."""
     cached = count(told.get("cached_input_tokens"))
     reasoning = told.get("reasoning_output_tokens")
     return Usage(

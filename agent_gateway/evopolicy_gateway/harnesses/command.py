@@ -1,9 +1,9 @@
 """Any program as an agent: started in the workspace with the published variables.
 
-It may also speak the published turn protocol, JSON lines: it is sent `{"type": "prompt", "turn": N, "message": …}` on stdin
-and answers each with one object on stdout, until it says stop or exits. `turn`, `text` and `stop` are optional in an answer; an
-answer that names an earlier turn is passed over. A program that never reads its stdin plays until it exits, whatever it prints.
-A program that does nothing for long is ended (`clock.Activity`).
+It may also use the published turn protocol, JSON lines: it receives `{"type": "prompt", "turn": N, "message": …}` on
+stdin and answers each with one object on stdout, until it sends stop or exits. `turn`, `text` and `stop` are optional
+in an answer; an answer that names an earlier turn is ignored. A program that never reads its stdin runs until it exits,
+whatever it prints. An inactive program is ended (`clock.Activity`).
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from evopolicy_gateway.operator.child_messages import AgentEnded
 
 _PIPE_TIMEOUT_S = 1.0
 _STOP_TIMEOUT_S = 10.0
-"""How long a program that has said stop may take to exit by itself."""
+"""Time that a program has to exit after it sent stop, seconds."""
 IDLE_TURNS = 10
-"""After so many answers in a row without a submit in between, prompts come slowly."""
+"""After this many answers in a row without a submit in between, prompts are delayed."""
 _IDLE_PAUSE_S = 10.0
-"""Between them: one that answers and does nothing else takes no processor time then, and is found to be silent."""
+"""The delay, seconds: a program that only answers then uses no processor time, and is detected as inactive."""
 
 
 class CommandHarness(Harness):
-    """`command:PROGRAM…`, and the agents that come with this package."""
+    """`command:PROGRAM…`, and the agents of this package."""
 
     def __init__(
         self, name: str, program: list[str], settings: dict[str, Any] | None = None, hint: str = ""
     ) -> None:
-        """`hint`: what may be wrong with the program, should it fail."""
+        """`hint`: a possible mistake in the command, shown if the program fails."""
         self.name = name
         self._program = program
         self.command = program
@@ -55,7 +55,7 @@ class CommandHarness(Harness):
                 return AgentEnded(
                     reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known()
                 )
-            # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+            # The pipe may still hold the last lines; do not wait for a child that keeps it open.
             await asyncio.wait([talking], timeout=_PIPE_TIMEOUT_S)
             await asyncio.wait([ended], timeout=_STOP_TIMEOUT_S if talk.stopped else None)
             return self._ending(ended.result() if ended.done() else 0, talk.turn)
@@ -78,7 +78,7 @@ class CommandHarness(Harness):
 
 
 async def _silence(stage: Stage) -> str:
-    """As `Activity.silence`; never returns where nobody asks."""
+    """As `Activity.silence`; never returns if inactivity is not watched."""
     if stage.activity is None:
         never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         return await never
@@ -90,9 +90,9 @@ class _Talk:
 
     def __init__(self, process: AgentProcess, stage: Stage) -> None:
         self.turn = 0
-        """Turns answered."""
+        """Number of turns answered."""
         self.stopped = False
-        """It has said stop."""
+        """Whether it has sent stop."""
         self._process = process
         self._stage = stage
         self._answered = asyncio.Event()
@@ -100,8 +100,9 @@ class _Talk:
         """Answers in a row without a submit in between."""
 
     async def go_on(self) -> None:
-        """Until the program says stop, or its stdout ends."""
-        # Apart from reading: a program that prints objects and never reads fills its stdin, and must still be read.
+        """Exchanges turns until the program sends stop, or its stdout ends."""
+        # A task apart from reading: the stdin of a program that never reads it fills up, and its output must still be
+        # read.
         prompting = asyncio.create_task(self._prompt())
         activity = self._stage.activity
         submits = 0
@@ -155,13 +156,13 @@ async def _message(stage: Stage, turn: int) -> str:
 
 
 def _names_earlier(answer: dict[str, Any], turn: int) -> bool:
-    """Whether it says of itself that it is not the answer to this turn. A program that counts from one is taken at this turn."""
+    """Whether the answer names an earlier turn than this one. Programs that count from one are accepted."""
     named = answer.get("turn")
     return isinstance(named, int) and named < turn
 
 
 def _answer(line: bytes) -> dict[str, Any] | None:
-    """The line as a turn's answer; None for what is no JSON object."""
+    """The line as a turn's answer; None if it is no JSON object."""
     if not line.lstrip().startswith(b"{"):
         return None
     try:

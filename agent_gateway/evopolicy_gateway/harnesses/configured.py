@@ -1,7 +1,7 @@
-"""A CLI that a TOML file describes: its arguments, and dotted paths into its JSON events.
+"""A CLI described by a TOML file: its arguments, and dotted paths into its JSON events.
 
-Lines that are no JSON are what the agent says. A turn is done when the program ends with status 0 and no event told an
-error.
+Lines that are not JSON are text of the agent. A turn is complete when the program exits with status 0 and no event
+reported an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from evopolicy_gateway.harnesses.usage import Usage, count
 
 
 class ConfiguredCli(Dialect):
-    """`[cli]` of an agent's settings."""
+    """The `[cli]` table of an agent's settings."""
 
     tells_end = False
 
@@ -47,11 +47,11 @@ class ConfiguredCli(Dialect):
         for word in template:
             lacking = [name for name, value in known.items() if name in word and value is None]
             if lacking:
-                # `--model {model}` goes as a pair; `--model={model}` alone.
+                # `--model {model}` is dropped as a pair, `--model={model}` alone.
                 if words and words[-1].startswith("-") and word == lacking[0]:
                     words.pop()
                 continue
-            # In one pass, so that a prompt which holds `{model}` stays as it is.
+            # In one pass, so that `{model}` inside a prompt is not replaced.
             words.append(_filled(word, {name: value or "" for name, value in known.items()}))
         return words + list(self.config.extra_args)
 
@@ -63,7 +63,7 @@ class ConfiguredCli(Dialect):
 
 
 class ConfiguredReader(TurnReader):
-    """One turn of a configured CLI."""
+    """Reads the stream of one turn of a configured CLI."""
 
     def __init__(self, events: Events) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class ConfiguredReader(TurnReader):
 
 
 def values(document: Any, path: str) -> Iterator[Any]:
-    """Every value at a dotted path; nothing for an empty path."""
+    """Yields every value at a dotted path; nothing for an empty path."""
     if not path:
         return
     if path.startswith("["):

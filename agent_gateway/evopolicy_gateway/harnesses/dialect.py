@@ -1,7 +1,7 @@
-"""How one CLI is spoken to: its arguments, and what the events of its stream mean. No I/O here.
+"""The interface of a CLI's dialect: its arguments, and the meaning of its stream's events. No I/O.
 
-`cli_agent.py` runs any dialect: it starts the program, feeds each line of its stream to a `TurnReader`, and decides from
-what the reader has gathered whether the turn is done, failed, or to be resumed.
+`cli_agent.py` runs any dialect: it starts the program, feeds each line of its stream to a `TurnReader`, and then
+decides by the reader's state whether the turn is complete, failed, or to be resumed.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _VERSION = re.compile(r"\d+\.\d+(?:\.\d+)?[\w.+-]*")
 
 
 class TurnReader(ABC):
-    """Gathers what one turn's stream tells."""
+    """Collects the state of one turn from its stream."""
 
     def __init__(self) -> None:
         self.session: str | None = None
-        """The session's id, once the stream has told it."""
+        """The session's id, once the stream has reported it."""
         self.done = False
-        """The agent has ended its turn as it should."""
+        """Whether the agent completed its turn."""
         self.failure: TurnFailure | None = None
-        """Why the turn failed; a turn that is done has none."""
+        """Why the turn failed; None for a completed turn."""
         self.usage = Usage()
-        """Of this turn so far, or of the whole session where the dialect is `cumulative`."""
+        """Token use of this turn so far, or of the whole session if the dialect is `cumulative`."""
         self.text = ""
-        """What the agent said last."""
+        """The agent's latest text."""
         self.action = ""
-        """What it does now, for people who watch."""
+        """The agent's present action, for people who watch."""
         self.requests_failed = 0
-        """Retries that the CLI made by itself."""
+        """Number of retries by the CLI itself."""
 
     @abstractmethod
     def read(self, event: Mapping[str, Any]) -> None:
-        """Takes the next event; raises nothing for events it does not know."""
+        """Processes the next event; ignores unknown events."""
 
 
 class Dialect(ABC):
@@ -48,33 +48,34 @@ class Dialect(ABC):
 
     name: str
     program: tuple[str, ...]
-    """Unless the operator names another."""
+    """The default program."""
     cumulative = False
-    """Its token counts are of the session, not of the turn."""
+    """Whether its token counts are of the session, not of the turn."""
     tested_version = ""
-    """Of the CLI that the dialect was last held against."""
+    """Version of the CLI with which the dialect was last tested."""
     install = ""
-    """How to get it."""
+    """The install command."""
     makes_session_id = False
-    """The first turn is given an id that we make."""
+    """Whether the first turn starts under an id that we generate."""
     resumes = True
-    """Sessions can be continued."""
+    """Whether sessions can be resumed."""
     help_args: tuple[str, ...] = ()
-    """What makes it print its options; empty: they are not looked at."""
+    """Arguments that make the CLI print its options; empty: its options are not checked."""
     prompt_on_stdin = True
     tells_end = True
-    """Its stream says how a turn ended; otherwise the exit status does."""
+    """Whether its stream reports how a turn ended; otherwise the exit status does."""
 
     def __init__(self, config: AgentConfig) -> None:
         self.config = config
 
     @abstractmethod
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
-        """After the program's name. `session`: to continue, or to begin under; `options`: the text of its help."""
+        """Arguments after the program's name. `session`: the session to resume or start; `options`: the CLI's help
+        text."""
 
     @abstractmethod
     def reader(self) -> TurnReader:
-        """For the next turn."""
+        """A reader for the next turn."""
 
     def environment(self) -> dict[str, str]:
         """Variables that it needs besides the operator's."""
@@ -88,13 +89,13 @@ class Dialect(ABC):
         return ("--version",)
 
     def version_in(self, text: str) -> str | None:
-        """The version in what it says to `--version`."""
+        """The version in its `--version` output; None if there is none."""
         found = _VERSION.search(text[:_MAX_VERSION_CHARS])
         return None if found is None else found.group(0)
 
 
 def mapping(value: Any) -> Mapping[str, Any]:
-    """The value if it is an object, else an empty one: streams are not to be trusted with their shape."""
+    """The value if it is an object, else an empty one: a stream's structure is not trusted."""
     return value if isinstance(value, dict) else {}
 
 
@@ -103,7 +104,7 @@ def string(value: Any) -> str:
 
 
 def first_line(text: str, limit: int = 160) -> str:
-    """For a live view: the first line that says something."""
+    """The first line that is not blank, cut to `limit` characters, for a live view."""
     for line in text.splitlines():
         if stripped := line.strip():
             return stripped if len(stripped) <= limit else stripped[: limit - 1] + "…"

@@ -1,4 +1,4 @@
-"""What agents are told, turn by turn. The rules themselves are in the workspace's `AGENTS.md`."""
+"""Prompts for agents, by turn. The rules themselves are in the workspace's `AGENTS.md`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FIRST = (
 
 
 def go_on(left: int) -> str:
-    """To an agent that stopped with budget left."""
+    """Prompt for an agent that stopped with budget left."""
     return (
         f"You stopped, and {left} episodes of the budget are left. Unspent episodes are lost, and every submit is one more"
         " candidate for selection. Go on improving the policy and submit again; the rules in AGENTS.md still hold."
@@ -19,12 +19,12 @@ def go_on(left: int) -> str:
 
 
 def warned(warning: str | None) -> str:
-    """What is added to a prompt where the policy failed in the last submit."""
+    """Addition to a prompt if the policy failed in the last submit."""
     return f" In your last submit {warning}" if warning else ""
 
 
 def interrupted(left: int | None) -> str:
-    """To an agent whose session goes on after a failure that was not its own."""
+    """Prompt for an agent whose session resumes after a failure that was not its own."""
     remaining = (
         "Ask /info for the budget that is left."
         if left is None

@@ -1,6 +1,6 @@
-"""An agent that somebody else starts, in a container or on another host: there is nothing to start here, only to wait.
+"""An agent that is started by someone else, in a container or on another host; this harness only waits.
 
-It ends when the budget is spent, when its time is over, or when the operator says `evopolicy finish RUN_DIRECTORY`.
+It ends when the budget is spent, when its time is up, or when the operator runs `evopolicy finish RUN_DIRECTORY`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _LOOK_S = 0.5
 
 
 class RemoteHarness(Harness):
-    """`remote`: it is not in our hands, so neither is what it may see and reach."""
+    """`remote`: we do not control the agent, nor what it may see and reach."""
 
     name = "remote"
     resumable = True

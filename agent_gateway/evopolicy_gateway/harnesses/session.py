@@ -1,6 +1,6 @@
-"""What of an agent's session outlives its processes: enough to go on after anything was killed.
+"""The persistent part of an agent's session, sufficient to resume after any process was killed.
 
-Written after every change, in a private file outside the workspace.
+It is written after every change, to a private file outside the workspace.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ from evopolicy_gateway.harnesses.usage import Usage
 
 
 class SessionState(msgspec.Struct, kw_only=True):
-    """One run's side of an agent."""
+    """State of one run's agent session."""
 
     session: str | None = None
-    """The CLI's id of the session; None before it told one."""
+    """The CLI's id of the session; None until the CLI has reported it."""
     turns: int = 0
-    """Turns that the agent ended as it should."""
+    """Turns that the agent completed."""
     retries: int = 0
-    """Turns that were begun again after a failure."""
+    """Turns started again after a failure."""
     reprompts: int = 0
     paused_s: float = 0.0
     requests_failed: int = 0
-    """Retries that the CLI made by itself."""
+    """Number of retries by the CLI itself."""
     used: dict[str, Usage] = {}
-    """Tokens by session id: replaced where the stream counts the session, added to where it counts the turn."""
+    """Tokens by session id: replaced if the stream counts the session, added up if it counts the turn."""
 
     @property
     def usage(self) -> Usage:
-        """Of the whole run."""
+        """Token use of the whole run."""
         return sum(self.used.values(), Usage())
 
     def usage_without(self, session: str | None) -> Usage:
-        """Of all sessions but this one."""
+        """Token use of all sessions except this one."""
         return sum((usage for known, usage in self.used.items() if known != session), Usage())
 
     def take(self, session: str, usage: Usage, *, cumulative: bool) -> None:
-        """Books what a turn used, once it is over."""
+        """Records the usage of a finished turn."""
         if cumulative:
-            # A turn that failed tells nothing; its session's count must not be lost by it.
+            # A failed turn may report no usage, which must not reset its session's count.
             if usage.total >= self.used.get(session, Usage()).total:
                 self.used[session] = usage
         else:
@@ -50,7 +50,7 @@ class SessionState(msgspec.Struct, kw_only=True):
 
 
 def load(path: Path | None) -> SessionState:
-    """The state in a file; a new one where there is none, or none that can be read."""
+    """The state in a file; a new one if the file is missing or unreadable."""
     if path is None:
         return SessionState()
     try:
@@ -60,7 +60,7 @@ def load(path: Path | None) -> SessionState:
 
 
 def save(path: Path | None, state: SessionState) -> None:
-    """Keeps it; what the disk refuses is lost, the agent goes on."""
+    """Saves the state. If the disk refuses it is lost, and the agent continues."""
     if path is None:
         return
     try:

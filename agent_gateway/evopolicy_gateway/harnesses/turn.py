@@ -1,7 +1,7 @@
-"""One turn of a CLI: one start of its program, fed with a prompt and read to its end.
+"""One turn of a CLI: one start of its program, with a prompt on its input, read to its end.
 
-How the turn ended is in the reader afterwards: `done`, or `failure` with why not. A program that says nothing for too long,
-does not exit once it is done, or passes a cap is ended here with everything below it.
+The reader then holds how the turn ended: `done`, or `failure` with the reason. This module ends a program, with all its
+descendants, that is silent for too long, does not exit after its turn, or exceeds a cap.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.run import processes
 
 DONE_TIMEOUT_S = 30.0
-"""What a program gets to exit after it has said that its turn is done."""
+"""Time that a program has to exit after it reported the end of its turn, seconds."""
 _PIPE_TIMEOUT_S = 1.0
 _KILL_GRACE_S = 3.0
 
 Capped = Callable[[TurnReader], str | None]
-"""Why the turn must end now for what it used; None when it may go on."""
+"""Returns why the turn must end now because of its usage; None if it may continue."""
 
 
 async def play_turn(
@@ -36,7 +36,7 @@ async def play_turn(
     silence_s: float,
     capped: Capped,
 ) -> None:
-    """Plays it to its end; AgentError when the program cannot be started."""
+    """Runs one turn to its end. Raises AgentError when the program cannot be started."""
     stage.log.last_errors.clear()
     process = await stage.start(program, talks=dialect.prompt_on_stdin)
     reading = asyncio.create_task(_read(stage, process, reader, silence_s, capped))
@@ -45,12 +45,12 @@ async def play_turn(
     try:
         await asyncio.wait([reading, ended], return_when=asyncio.FIRST_COMPLETED)
         if reading.done():
-            # Its output is at its end: it exits by itself, unless the reading was broken off.
+            # Its output has ended: it exits by itself, unless the reading was aborted.
             await asyncio.wait([ended], timeout=0.0 if reading.result() else DONE_TIMEOUT_S)
         if not ended.done():
             await asyncio.to_thread(processes.end_descendants, _KILL_GRACE_S, waited=stage.started)
         code = await ended
-        # What it said last may still be in the pipe; a child that holds the pipe open is not waited for.
+        # The pipe may still hold the last lines; do not wait for a child that keeps it open.
         await asyncio.wait([reading], timeout=_PIPE_TIMEOUT_S)
     finally:
         for task in (reading, feeding, ended):
@@ -67,7 +67,7 @@ async def play_turn(
 async def _read(
     stage: Stage, process: AgentProcess, reader: TurnReader, silence_s: float, capped: Capped
 ) -> bool:
-    """Reads the stream to its end; True when the program has to be ended for it."""
+    """Reads the stream to its end; returns True when the program has to be ended."""
     lines = process.lines()
     while True:
         timeout_s = DONE_TIMEOUT_S if reader.done else silence_s
@@ -103,7 +103,7 @@ async def _feed(process: AgentProcess, prompt: str) -> None:
 
 
 def _crash(program: str, code: int, errors: list[str]) -> TurnFailure:
-    """A program that ended without having said how its turn did."""
+    """The failure of a program that ended without reporting how its turn ended."""
     how = f"exit status {code}" if code >= 0 else f"signal {-code}"
     last = " | ".join(line for line in errors[-3:] if line)
     told = turn_failure_of(last) if last else None

@@ -1,10 +1,10 @@
-"""Why a turn failed, and what follows from it: rules without I/O.
+"""Kinds of failed turns, and their consequences: rules without I/O.
 
-- `passing`: a crash, a timeout, an error of the provider that a retry may cure.
+- `passing`: a crash, a timeout, or an error of the provider that a retry may resolve.
 - `quota`: the account's limit is reached; only time helps, so the run pauses.
-- `lost`: the CLI no longer knows the session; a new one is begun.
+- `lost`: the CLI no longer knows the session; a new one is started.
 - `final`: a retry would fail in the same way (a wrong key, an unknown model), so the run ends.
-- `cap`: the run has used the tokens or the money that it may.
+- `cap`: the run has used up its limit of tokens or money.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Kind = Literal["passing", "quota", "lost", "final", "cap"]
 MAX_BACKOFF_S = 300.0
 _MAX_MESSAGE = 500
 _MAX_SEARCHED = 20_000
-"""Characters of a message in which a time to wait is looked for."""
+"""Characters of a message that are searched for a waiting time."""
 
 _LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
 _QUOTA = re.compile(
@@ -56,13 +56,13 @@ class TurnFailure(msgspec.Struct, frozen=True, kw_only=True):
     kind: Kind
     message: str
     provider: bool = False
-    """The provider's doing; False for a crash of the CLI."""
+    """Whether the provider caused it; False for a crash of the CLI."""
     wait_s: float | None = None
-    """When to try again, if the provider told."""
+    """Seconds until the next attempt, if the provider stated them."""
 
 
 def turn_failure_of(message: str, status: int | None = None, now: float | None = None) -> TurnFailure:
-    """What an error's text, and the HTTP status where it is told apart, mean. `now`: Unix time."""
+    """Classifies an error by its text, and by its HTTP status if known separately. `now`: Unix time, seconds."""
     text = " ".join(message.split())[:_MAX_MESSAGE] or "no message"
     found = _STATUS.search(text)
     code = status if status is not None else int(found.group(1) or found.group(2)) if found else None
@@ -80,13 +80,14 @@ def turn_failure_of(message: str, status: int | None = None, now: float | None =
 
 
 def backoff_s(attempt: int, base_s: float, chance: float) -> float:
-    """Seconds before retry `attempt` (from 1): base · 2^(attempt − 1), times 0.75 to 1.25 by `chance` in [0, 1)."""
+    """Seconds before retry `attempt` (from 1): base · 2^(attempt − 1), times 0.75 to 1.25 by `chance` in [0, 1); at
+    most `MAX_BACKOFF_S`."""
     whole = base_s * 2.0 ** min(attempt - 1, 16)
     return min(MAX_BACKOFF_S, float(whole) * (0.75 + 0.5 * chance))
 
 
 def _wait_in(text: str, now: float) -> float | None:
-    """Seconds to wait, finite, where the text tells."""
+    """The waiting time stated in the text, seconds, finite; None if there is none."""
     told = _told_wait(text, now)
     return told if told is not None and math.isfinite(told) else None
 

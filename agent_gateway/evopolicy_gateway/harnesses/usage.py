@@ -1,7 +1,8 @@
-"""Token accounting as the paper's appendix defines it: input that no cache served, cache traffic, output with reasoning.
+"""Token accounting as the paper's appendix defines it: uncached input, cache traffic, output including reasoning.
 
-A stream that counts cached tokens into its input (Codex) has them taken off; one that reports them apart (Claude Code) is
-taken as it is. Reasoning is part of `output` in both, and shown beside it where it is told.
+If a stream includes cached tokens in its input (Codex), they are subtracted; if it reports them separately (Claude
+Code), the input is used as it is. `output` includes reasoning in both; reasoning is also shown by itself if it is
+reported.
 """
 
 from __future__ import annotations
@@ -14,27 +15,27 @@ MILLION = 1_000_000
 
 
 KINDS = ("input_noncached", "cache_read", "cache_creation", "output")
-"""Of tokens, each counted once."""
+"""Kinds of tokens; each token counts in exactly one."""
 
 
 class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """US dollars per million tokens."""
 
     input: float
-    """Of `input_noncached`."""
+    """Price of `input_noncached`."""
     output: float
     cache_read: float = 0.0
     cache_creation: float = 0.0
 
 
 class Usage(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of tokens."""
+    """Token counts."""
 
     input_noncached: int = 0
     cache_read: int = 0
     cache_creation: int = 0
     output: int = 0
-    """Reasoning included."""
+    """Output tokens, including reasoning."""
     reasoning: int | None = None
 
     def __add__(self, other: Usage) -> Usage:
@@ -46,18 +47,18 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def __sub__(self, other: Usage) -> Usage:
-        """Without `other`, which is part of it; `reasoning` stays."""
+        """Subtracts `other`, a part of this usage; `reasoning` stays unchanged."""
         return msgspec.structs.replace(
             self, **{kind: getattr(self, kind) - getattr(other, kind) for kind in KINDS}
         )
 
     @property
     def total(self) -> int:
-        """All tokens, cached ones too."""
+        """All tokens, including cached ones."""
         return tokens_in(msgspec.structs.asdict(self))
 
     def cost(self, prices: Prices) -> float:
-        """US dollars."""
+        """Cost in US dollars."""
         return (
             self.input_noncached * prices.input
             + self.cache_read * prices.cache_read
@@ -66,7 +67,7 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
         ) / MILLION
 
     def recorded(self, prices: Prices | None) -> dict[str, Any]:
-        """As `run.json`'s `tokens`; reasoning and cost only where they are known."""
+        """The form of `run.json`'s `tokens`; reasoning and cost only if they are known."""
         document: dict[str, Any] = msgspec.to_builtins(self)
         if self.reasoning is None:
             del document["reasoning"]
@@ -76,16 +77,17 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 MAX_COUNT = 10**12
-"""No turn takes more tokens: sums of what a stream claims stay numbers that every reader takes."""
+"""Limit of one reported count, above any real turn, so that sums of a stream's claims stay numbers that every reader
+accepts."""
 
 
 def count(value: Any) -> int:
-    """A count of a stream, at most `MAX_COUNT`; 0 for what is none."""
+    """A count from a stream, at most `MAX_COUNT`; 0 for an invalid one."""
     return (
         min(value, MAX_COUNT) if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
     )
 
 
 def tokens_in(told: dict[str, Any] | None) -> int:
-    """All tokens of a usage as `run.json` has it, or a sweep's index; 0 for none."""
+    """Total tokens of a usage from `run.json` or a sweep's index; 0 for None."""
     return 0 if told is None else sum(int(told.get(kind) or 0) for kind in KINDS)

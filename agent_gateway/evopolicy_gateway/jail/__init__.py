@@ -1,8 +1,8 @@
-"""The agent's jail: what an agent's programs see of this machine, and whom they can talk to.
+"""The agent's jail: which files of this machine an agent's programs see, and which hosts they reach.
 
 Rules:
-- A program sees its workspace, the system, its own installation and what the operator named; nothing of the cluster.
-- Its network namespace has no route. What it reaches, it reaches through listening sockets that it hands out to its
-  agent supervisor as it starts: the gateway's port, and a proxy that knows the harness's hosts.
-- There is no silent way out of it: where it cannot be built the run is refused, and `run.json` says what was used.
+- A program sees its workspace, the system, its own installation and the operator's additions; nothing of the cluster.
+- Its network namespace has no route. It reaches other hosts only through listening sockets that it sends to its agent
+  supervisor at its start: the gateway's port, and a proxy that permits the harness's hosts.
+- The jail is never dropped silently: if it cannot be built the run is refused, and `run.json` records the mode used.
 """

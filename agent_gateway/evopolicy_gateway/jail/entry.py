@@ -1,8 +1,9 @@
-"""Inside the jail, before the agent's program: listens on loopback ports, hands the sockets out, becomes the program.
+"""Runs inside the jail before the agent's program: listens on loopback ports, sends the sockets out, executes the
+program.
 
 `python -I -S entry.py FD PORT,PORT,… PROGRAM…`. FD is a unix socket to the agent supervisor, `-` where the network is
-open. A socket belongs to the network namespace that it was made in, so the agent supervisor answers there without the agent having
-any way out itself.
+open. A socket stays in the network namespace in which it was created, so the agent supervisor serves these ports, while
+the agent has no route out itself.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ def main(arguments: list[str]) -> None:
     control, ports, program = arguments[0], arguments[1], arguments[2:]
     if control != "-":
         hand_out(int(control), ports)
-    # Ignored around bubblewrap, so that a program is asked to end before its jail is torn down.
+    # Ignored around bubblewrap, so that the program receives the signals before its jail is torn down.
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGPIPE):
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -31,7 +32,7 @@ def main(arguments: list[str]) -> None:
 
 
 def hand_out(control: int, ports: str) -> None:
-    """Listens on the ports and gives the sockets away."""
+    """Listens on the ports and sends the sockets to the agent supervisor."""
     listening = []
     for port in ports.split(","):
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)

@@ -1,6 +1,6 @@
-"""Which files of this machine an agent's program needs: its installation, the interpreter of its first line, our Python.
+"""Files of this machine that an agent's program needs: its installation, the interpreter of its first line, our Python.
 
-A folder is shown as a whole only where it looks like an installation of its own; otherwise the file alone is.
+A whole folder is shown only if it looks like an installation of its own; otherwise only the file.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pathlib import Path
 from evopolicy_common.simulators import SIMULATORS
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
-"""Shown in every jail."""
+"""Folders visible in every jail."""
 
 _HIDDEN = frozenset((*SIMULATORS, "evopolicy_worker", "evopolicy_coordinator"))
-"""Packages that no agent gets to see, in whatever installation they are."""
+"""Packages that no agent may see, in any Python installation."""
 
 _INSTALLATION_MARKS = ("pyvenv.cfg", "lib", "libexec", "node_modules")
 _SITE_FOLDERS = ("site-packages", "dist-packages")
@@ -29,15 +29,15 @@ _SHEBANG_BYTES = 512
 
 
 class Needs:
-    """What is to be shown, read-only: paths as they are, and links as links."""
+    """Paths to show read-only: files and folders as they are, and links as links."""
 
     def __init__(self) -> None:
         self.paths: dict[str, None] = {}
         self.links: dict[str, str] = {}
-        """Path, and what the link there says."""
+        """Path of each link to its target."""
 
     def path(self, path: str) -> None:
-        """Shows a file or folder."""
+        """Adds a file or folder."""
         if not _in_system(path) and os.path.exists(path):
             self.paths[path] = None
 
@@ -47,7 +47,7 @@ class Needs:
 
 
 def needs_of(command: Sequence[str], search: str | None) -> Needs:
-    """What the command that the operator gave needs: its program, the files it names, and our own Python.
+    """What the operator's command needs: its program, the files it names, and our own Python.
 
     `search`: the PATH.
     """
@@ -64,7 +64,8 @@ def needs_of(command: Sequence[str], search: str | None) -> Needs:
 
 
 def hidden_below(folder: str) -> Iterator[str]:
-    """Files and folders of packages that no agent gets to see in the Python installations at and right below `folder`."""
+    """Yields files and folders of packages that no agent may see, in the Python installations at and directly below
+    `folder`."""
     root = Path(folder)
     sites: list[Path] = []
     for base in ("", "lib/", "lib64/", "local/lib/", "versions/*/lib/", "envs/*/lib/", "*/lib/"):
@@ -83,7 +84,8 @@ def hidden_below(folder: str) -> Iterator[str]:
 
 
 def _our_python(needs: Needs) -> None:
-    """The interpreter with its standard library, numpy, cloudpickle, and the agents that come with this package; nothing else."""
+    """Adds the interpreter with its standard library, numpy, cloudpickle, and the agents of this package; nothing
+    else."""
     prefix, base = os.path.abspath(sys.prefix), os.path.abspath(sys.base_prefix)
     needs.path(base)
     if os.path.realpath(base) != base:
@@ -99,7 +101,7 @@ def _our_python(needs: Needs) -> None:
 
 
 def our_packages() -> Iterator[tuple[str, str]]:
-    """Where the packages of the agents that come with us are, and where a virtual environment shows them."""
+    """Yields the packages that shipped agents need, each with its path in the jail's virtual environment."""
     if os.path.abspath(sys.prefix) == os.path.abspath(sys.base_prefix):
         return
     site = sysconfig.get_path("platlib")
@@ -116,7 +118,7 @@ def our_packages() -> Iterator[tuple[str, str]]:
 
 
 def _program(needs: Needs, path: str, search: str | None, depth: int = 0) -> None:
-    """A program: the links that lead to it, its installation, and what its first line names."""
+    """Adds a program: the links that lead to it, its installation, and the interpreter of its first line."""
     for _ in range(_MAX_LINKS):
         if not os.path.islink(path):
             break
@@ -133,14 +135,14 @@ def _program(needs: Needs, path: str, search: str | None, depth: int = 0) -> Non
 
 
 def _installation(needs: Needs, path: str) -> None:
-    """The folder of the installation that `path` belongs to, where it is one of its own."""
+    """Adds the folder of the installation to which `path` belongs, if it is one of its own."""
     parts = Path(path).parts
     if "node_modules" in parts:
         needs.path(str(Path(*parts[: parts.index("node_modules") + 1])))
     elif Path(path).parent.name in ("bin", "shims"):
         root = Path(path).parents[1]
         home = Path(os.path.expanduser("~"))
-        # `~/.local` holds far more than programs, state folders of others too.
+        # `~/.local` holds far more than programs, including other software's state.
         too_wide = root == Path("/") or root == home or root in home.parents or root.name == ".local"
         marked = any((root / mark).exists() for mark in _INSTALLATION_MARKS)
         if not too_wide and marked and not _is_ours(path):
@@ -170,6 +172,6 @@ def _in_system(path: str) -> bool:
 
 
 def _is_ours(path: str) -> bool:
-    """In the virtual environment that this package runs from, of which only `our_packages` are shown."""
+    """Whether `path` is in the virtual environment of this package, of which only `our_packages` are shown."""
     prefix = os.path.abspath(sys.prefix)
     return prefix != os.path.abspath(sys.base_prefix) and (path + "/").startswith(prefix + "/")

@@ -1,4 +1,4 @@
-"""One run's jail, as the agent supervisor uses it: for each program a command, an environment, and doors while it runs."""
+"""One run's jail, for the agent supervisor: a command, an environment, and network access for each program."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HARNESS_HOSTS: Mapping[str, tuple[str, ...]] = {
     "codex": ("api.openai.com", "auth.openai.com", "chatgpt.com"),
     "claude-code": ("api.anthropic.com", "console.anthropic.com", "platform.claude.com"),
 }
-"""Where the model of a harness that we know is, and where its CLI logs in."""
+"""Hosts of the model, and of the login, of known harnesses."""
 HARNESS_VARIABLES: Mapping[str, tuple[str, ...]] = {
     "codex": ("OPENAI_API_KEY", "CODEX_API_KEY", "OPENAI_BASE_URL"),
     "claude-code": (
@@ -41,21 +41,21 @@ HARNESS_VARIABLES: Mapping[str, tuple[str, ...]] = {
         "CLAUDE_CODE_OAUTH_TOKEN",
     ),
 }
-"""Which variables hold its key."""
+"""Variables that hold the harness's key."""
 
 
 class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """What an agent supervisor is told of the jail that its agent plays in."""
+    """The jail's settings, as an agent supervisor receives them."""
 
     settings: JailSettings
     private: str
-    """Folder for the agent's home and /tmp, kept until the run is over."""
+    """Folder for the agent's home and /tmp, kept until the run ends."""
     hidden: tuple[str, ...] = ()
-    """Folders that are never shown."""
+    """Folders that are never visible."""
 
 
 class Way:
-    """How one program is started: the whole command, and the socket that it hands its listening sockets out by."""
+    """One start of a program: the complete command, and the socket through which it sends its listening sockets."""
 
     def __init__(self, jail: Sequence[str], program: Sequence[str], proxy: JailProxy | None) -> None:
         """`proxy` None: the network is open."""
@@ -63,7 +63,8 @@ class Way:
         self._supervisor: socket.socket | None = None
         self._child: socket.socket | None = None
         self._serving: asyncio.Task[None] | None = None
-        # Not on bubblewrap's command line, which the jail's first process shows to the agent: what is hidden is named there.
+        # Passed by --args, not on the command line: the jail's first process shows that to the agent, and it names the
+        # hidden folders.
         self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
         self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
         if (filter_ := filter_program()) is not None:
@@ -82,14 +83,14 @@ class Way:
         return (*self._files, *(() if self._child is None else (self._child.fileno(),)))
 
     def started(self, ended: Callable[[], Awaitable[object]]) -> None:
-        """Serves the doors until `ended` comes back: the program is gone."""
+        """Serves the program's network access until `ended` returns, which is when the program has ended."""
         self._close_files()
         if self._child is not None:
             self._child.close()
             self._serving = asyncio.create_task(self._serve(ended))
 
     def failed(self) -> None:
-        """It could not be started."""
+        """Releases the descriptors of a program that could not be started."""
         self._close_files()
         for sock in (self._supervisor, self._child):
             if sock is not None:
@@ -114,7 +115,7 @@ class Way:
 
 
 def _readable(data: bytes) -> int:
-    """A descriptor to read this from."""
+    """A descriptor from which `data` can be read."""
     fd = os.memfd_create("evopolicy-jail")
     with open(fd, "wb", closefd=False) as file:
         file.write(data)
@@ -122,12 +123,13 @@ def _readable(data: bytes) -> int:
     return fd
 
 
-# Asked to end, bubblewrap would end at once and take the program with it; so only the program is asked.
+# bubblewrap ends at once on SIGTERM, and takes the program with it; the shell makes it ignore the signal, so that only
+# the program receives it.
 _PATIENT = ("/bin/sh", "-c", 'trap "" TERM INT; exec "$@"', "jail")
 
 
 class Jail:
-    """Around all programs of one agent; each has namespaces of its own."""
+    """The jail of all programs of one agent; each start has namespaces of its own."""
 
     def __init__(
         self,
@@ -140,9 +142,10 @@ class Jail:
         started_in: Path,
         variables: Sequence[str] = (),
     ) -> None:
-        """`command`: words that the operator gave, never the agent's. `variables`: what its settings pass on.
+        """`command`: words that the operator gave, never the agent's. `variables`: names that the agent's settings pass
+        on.
 
-        `started_in`: where the operator's relative paths are meant from.
+        `started_in`: folder to which the operator's paths are relative.
         """
         settings = order.settings
         self._open_network = settings.mode == "open-network"
@@ -168,7 +171,7 @@ class Jail:
         self._proxy_port = self._proxy().proxy_port
 
     def environment(self, surroundings: Mapping[str, str], ours: Mapping[str, str]) -> dict[str, str]:
-        """Of the agent supervisor's variables those that the agent gets, with `ours` and the way to the allowed hosts."""
+        """The agent's variables: the permitted ones of `surroundings`, `ours`, and the proxy for the allowed hosts."""
         kept = {
             name: value
             for name, value in surroundings.items()
@@ -186,11 +189,11 @@ class Jail:
         }
 
     def way(self, program: Sequence[str]) -> Way:
-        """For one start of a program."""
+        """Prepares one start of a program."""
         return Way(self._view.arguments(), program, None if self._open_network else self._proxy())
 
     def sealed(self, program: Sequence[str]) -> list[str]:
-        """The command of a program that needs nobody: a CLI that is asked for its version."""
+        """The command of a program without network access, such as a CLI that prints its version."""
         return [*self._view.arguments(), "--", *program]
 
     def _proxy(self) -> JailProxy:

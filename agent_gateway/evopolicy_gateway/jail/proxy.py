@@ -1,7 +1,7 @@
-"""What leads out of a jail: the ports of one program's network namespace, answered by the agent supervisor.
+"""Network access of a jailed program: the agent supervisor serves the ports of its network namespace.
 
-A forwarded port leads to the same port of this machine. The proxy port takes `CONNECT HOST:PORT` for the named hosts
-only; names are resolved out here, since a jail has no name service.
+A forwarded port leads to the same port of this machine. The proxy port accepts `CONNECT HOST:PORT` for the allowed
+hosts only; it resolves names outside the jail, since a jail has no name service.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from evopolicy_gateway.jail.settings import Host
 
 PROXY_PORT = 3128
 MAX_CONNECTIONS = 256
-"""At once, of one program."""
+"""Most simultaneous connections of one program."""
 _MAX_HEAD_BYTES = 16 << 10
 _HEAD_TIMEOUT_S = 30.0
 _CONNECT_TIMEOUT_S = 60.0
@@ -27,7 +27,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class JailProxy:
-    """The open doors of one program in its jail. `close` when the program is gone."""
+    """The network access of one jailed program. Call `close` once the program has ended."""
 
     def __init__(self, forwards: Mapping[int, Host], hosts: frozenset[Host]) -> None:
         self._forwards = dict(forwards)
@@ -41,11 +41,12 @@ class JailProxy:
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """To be listened on in the jail, in the order in which `serve` expects the sockets."""
+        """Ports on which to listen in the jail, in the order in which `serve` expects the sockets."""
         return (*self._forwards, self.proxy_port)
 
     async def serve(self, control: socket.socket) -> None:
-        """Takes the listening sockets from the jail and serves them; nothing when it ended without handing them out."""
+        """Receives the listening sockets from the jail and serves them; does nothing if the program ended without
+        sending them."""
         loop = asyncio.get_running_loop()
         control.setblocking(False)
         ready = asyncio.Event()
@@ -125,7 +126,7 @@ async def _refuse(writer: asyncio.StreamWriter, status: str, why: str) -> None:
 async def _join(
     reader: asyncio.StreamReader, writer: asyncio.StreamWriter, to: Host, greeting: bytes = b""
 ) -> None:
-    """Passes bytes both ways until both sides have ended."""
+    """Copies bytes in both directions until both sides have ended."""
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT_S):
             there, away = await asyncio.open_connection(*to)

@@ -1,4 +1,4 @@
-"""What the operator chose of an agent's jail, checked before anything is started."""
+"""The operator's settings of an agent's jail, checked before anything is started."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evopolicy_common.processes import distribution
 
 Mode = Literal["bwrap", "open-network", "none"]
 Host = tuple[str, int]
-"""Name and port."""
+"""Name and port of a host."""
 
 HTTPS = 443
 _HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<port>[0-9]{1,5}))?")
@@ -32,26 +32,26 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
     mode: Mode = "bwrap"
     """`open-network`: jailed, with this machine's network. `none`: not jailed."""
     read: tuple[str, ...] = ()
-    """Files and folders that it sees besides, at their own paths."""
+    """Files and folders that it also sees, at their own paths."""
     write: tuple[str, ...] = ()
-    """Such that it may also change."""
+    """Files and folders that it may also change."""
     environment: tuple[str, ...] = ()
-    """Variables that are passed on."""
+    """Names of variables that are passed on."""
     hosts: tuple[str, ...] = ()
-    """`HOST` (port 443) or `HOST:PORT` that it reaches besides its harness's own."""
+    """`HOST` (port 443) or `HOST:PORT` that it may reach besides its harness's own hosts."""
 
     @property
     def recorded(self) -> str:
-        """As `run.json` tells it."""
+        """The text for `run.json`."""
         return {"bwrap": "bwrap", "open-network": "bwrap, open network", "none": "none"}[self.mode]
 
     def chosen(self) -> dict[str, Any]:
-        """What was widened by the operator, for `run.json`."""
+        """The operator's additions to the jail, for `run.json`."""
         kept = {"read": self.read, "write": self.write, "environment": self.environment, "hosts": self.hosts}
         return {name: list(value) for name, value in kept.items() if value}
 
     def check(self) -> None:
-        """ConfigError naming the option that is wrong, or what this machine lacks."""
+        """Raises ConfigError that names the wrong option, or what this machine lacks."""
         if self.mode not in get_args(Mode):
             raise ConfigError(f"--jail {self.mode!r}: there are {', '.join(get_args(Mode))}")
         for option, paths in (("--jail-bind", self.read), ("--jail-bind-rw", self.write)):
@@ -69,7 +69,8 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def host(text: str) -> Host:
-    """Name in lower case and port of `HOST` or `HOST:PORT`. ConfigError for anything else, patterns too."""
+    """Parses `HOST` or `HOST:PORT` into lower-case name and port. Raises ConfigError for anything else, including
+    patterns."""
     found = _HOST.fullmatch(text)
     port = HTTPS if found is None or found["port"] is None else int(found["port"])
     if found is None or not 0 < port < 1 << 16:
@@ -78,7 +79,7 @@ def host(text: str) -> Host:
 
 
 def check_bubblewrap() -> None:
-    """ConfigError, with what to do, when this machine cannot build a jail."""
+    """Raises ConfigError, with the remedy, when this machine cannot build a jail."""
     program = shutil.which("bwrap")
     if program is None:
         raise ConfigError(
@@ -98,7 +99,7 @@ def check_bubblewrap() -> None:
 
 
 def absolute(path: str, started_in: Path) -> str:
-    """A path of an option, meant from where the command was given."""
+    """An option's path, resolved relative to the folder in which the command was started."""
     return os.path.abspath(started_in / os.path.expanduser(path))
 
 

@@ -1,10 +1,12 @@
-"""System calls that lead around a jail's namespaces, as a seccomp filter for bubblewrap: for the jail's first process too.
+"""A seccomp filter for bubblewrap against system calls that bypass a jail's namespaces; it covers the jail's first
+process too.
 
 Rules that this module owns:
-- Sockets are of families that network namespaces divide. A virtual machine's AF_VSOCK leads out of all of them, and so
-  does AF_ALG; of netlink there is what routes and lists sockets. A ring (io_uring) would make sockets without `socket`.
+- Sockets are of families that network namespaces isolate. A virtual machine's AF_VSOCK bypasses all namespaces, and so
+  does AF_ALG; of netlink, only routes and socket listings are permitted. A ring (io_uring) would create sockets without
+  `socket`.
 - Keyrings belong to a login, not to a namespace: none can be read or written.
-- Nobody asks the kernel for its log, for other processes' performance, or to run programs in it.
+- No program may read the kernel's log, measure other processes' performance, or run programs in the kernel.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from evopolicy_common.seccomp import ALLOWED, AUDIT_ARCH, JUMP_EQUAL, Instructio
 from evopolicy_common.seccomp.numbers import REFUSED, SOCKET
 
 _REFUSED = {
-    # As by a kernel without them, which programs know how to live with.
+    # ENOSYS as from a kernel without these calls, which programs can handle.
     errno.ENOSYS: ("io_uring_setup", "add_key", "request_key", "keyctl"),
     errno.EPERM: ("bpf", "perf_event_open", "userfaultfd", "fanotify_init", "syslog"),
 }
@@ -26,7 +28,7 @@ _NETLINK = (0, 4)  # NETLINK_ROUTE, NETLINK_SOCK_DIAG
 
 
 def filter_program() -> bytes | None:
-    """The filter, 8 bytes an instruction; None on a processor that there is no table for."""
+    """The filter, 8 bytes an instruction; None on an architecture without a table of calls."""
     machine = os.uname().machine
     if machine not in AUDIT_ARCH:
         return None

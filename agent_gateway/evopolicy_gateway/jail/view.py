@@ -1,8 +1,8 @@
-"""What a jailed program sees of this machine, as bubblewrap's arguments. Later ones lie over earlier ones.
+"""The files that a jailed program sees, as bubblewrap's arguments. Later arguments cover earlier ones.
 
-As root the jail's processes are still root to the files that they see, though without any capability: so what root may
-write by its name alone (`/proc/sys`) is read-only too. Of `/proc` there is what programs need. What the kernel counts there
-for the whole machine, some of it for root only, is covered: hidden episodes move those numbers.
+Run by root, the jail's processes are still root for the files that they see, though without any capability. So files
+that root may write by user id alone (`/proc/sys`) are read-only too. `/proc` shows only what programs need: its
+machine-wide counters, some readable by root only, are covered, because hidden episodes change them.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _ETC = (
     *("protocols", "services", "ssl", "terminfo", "timezone"),
 )
 _PRIVATE = ("/etc/ssl/private", "/etc/pki/tls/private")
-"""The machine's own keys, which root may read."""
+"""The machine's own private keys, which root may read."""
 _PROC_SHOWN = frozenset(("cpuinfo", "filesystems", "meminfo", "sys", "version"))
 _PROC_COPIES = ("loadavg", "stat", "uptime")
-"""Files with counters of the whole machine that programs cannot do without: they see them as they were, and empty."""
+"""Files with machine-wide counters that programs cannot do without: a copy with zeroed counters replaces them."""
 _COUNTERS = (
     *(f"/proc/sys/fs/{name}" for name in ("aio-nr", "dentry-state", "file-nr", "inode-nr", "inode-state")),
     *("/proc/sys/fs/quota", "/proc/sys/kernel/pty/nr"),
@@ -38,7 +38,7 @@ _COUNTERS = (
 
 
 class View(msgspec.Struct, frozen=True, kw_only=True):
-    """What one run's agent sees. Paths are absolute; those of this machine are seen at their own places."""
+    """The files that one run's agent sees. Paths are absolute; files of this machine appear at their own paths."""
 
     workspace: Path
     private: Path
@@ -46,14 +46,15 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     home: str
     needs: Needs
     read: tuple[str, ...]
-    """Chosen by the operator."""
+    """Paths that the operator added, read-only."""
     write: tuple[str, ...]
     hidden: tuple[Path, ...]
-    """Never seen, also where it lies in something that is: the runs, the coordinator's state."""
+    """Never visible, even inside visible folders: the runs, the coordinator's state."""
     open_network: bool
 
     def prepare(self) -> None:
-        """Makes the agent's home and /tmp; what is there stays, for an agent that goes on after its agent supervisor died."""
+        """Creates the agent's home and /tmp; existing ones stay, for an agent that resumes after its agent
+        supervisor died."""
         for name in ("home", "tmp", "proc"):
             (self.private / name).mkdir(mode=0o700, parents=True, exist_ok=True)
         for name in _PROC_COPIES:
@@ -61,7 +62,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
             (self.private / "proc" / name).write_text(_without_counts(name, content))
 
     def arguments(self) -> list[str]:
-        """The command up to the program."""
+        """The bubblewrap command, up to the program."""
         command = [*_bubblewrap(), *([] if self.open_network else ["--unshare-net"])]
         command += [*_system(self.open_network), *self._proc()]
         command += [
@@ -86,7 +87,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         for source, target in our_packages():
             command += ["--ro-bind", source, target]
         command += self._masks(outside)
-        # Chosen by name among what is hidden, such as a policy of an earlier run.
+        # Paths that the operator named inside hidden folders, such as a policy of an earlier run.
         command += self._binds(inside)
         workspace = str(self.workspace)
         command += ["--bind", workspace, workspace]
@@ -104,7 +105,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
             path = f"/proc/{name}"
             if name in _PROC_COPIES:
                 words += ["--ro-bind", str(self.private / "proc" / name), path]
-            # Links lead to a process's own.
+            # Links are not covered: they lead to a process's own files.
             elif not name.isdecimal() and name not in _PROC_SHOWN and not os.path.islink(path):
                 words += _covered(path)
         return words
@@ -118,7 +119,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         return False
 
     def _binds(self, paths: Sequence[str]) -> list[str]:
-        """Parents before what lies in them; writable ones over read-only ones."""
+        """Binds parents before their content, and writable paths over read-only ones."""
         words: list[str] = []
         for path in sorted(
             dict.fromkeys(paths), key=lambda path: (path.count("/"), path in self.write, path)
@@ -127,7 +128,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         return words
 
     def _masks(self, shown: Iterable[str]) -> list[str]:
-        """Covers simulators, and what is hidden, in the folders that are shown."""
+        """Covers simulators and hidden folders inside the visible folders."""
         covered: dict[str, None] = {}
         for folder in (*SYSTEM, *shown):
             if os.path.isdir(folder) and not (folder in SYSTEM and os.path.islink(folder)):
@@ -153,7 +154,7 @@ def _bubblewrap() -> list[str]:
 
 @functools.cache
 def _can_disable_userns(program: str) -> bool:
-    """Since 0.8; older ones leave the kernel's own limits as they are."""
+    """Whether bubblewrap has the option (since 0.8); older versions leave the kernel's limits unchanged."""
     return b"--disable-userns" in subprocess.run([program, "--help"], capture_output=True, check=False).stdout
 
 
@@ -173,14 +174,14 @@ def _system(open_network: bool) -> list[str]:
 
 
 def _covered(path: str) -> list[str]:
-    """Nothing in place of what is there, if anything is."""
+    """Covers `path` with an empty folder or file, if it exists."""
     if os.path.isdir(path):
         return ["--tmpfs", path]
     return ["--ro-bind", "/dev/null", path] if os.path.exists(path) else []
 
 
 def _without_counts(name: str, content: str) -> str:
-    """A file of `/proc` with zeros for what is counted."""
+    """A file of `/proc` with zeros in place of counters."""
     if name == "loadavg":
         return "0.00 0.00 0.00 1/1 1\n"
     if name == "uptime":
