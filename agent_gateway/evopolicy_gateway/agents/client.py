@@ -1,7 +1,8 @@
-"""The agent's half of the HTTP protocol: `/info`, `/task` and `/submit`, patient with a gateway that is busy or away.
+"""A client of the HTTP protocol for agents: `/info`, `/task` and `/submit`, with retries while the gateway is busy or
+away.
 
-Knows the three URLs and nothing else. A submit is sent with an idempotency key and `?wait=false`, then asked for until
-it is done, so that no single request lasts long and a lost answer loses nothing.
+It knows the three URLs and nothing else. It sends a submit with an idempotency key and `?wait=false`, then polls until
+the submit is done. So no single request lasts long, and a lost reply loses nothing.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from typing import Any, NoReturn
 from urllib.parse import urlsplit, urlunsplit
 
 _OVER = ("run_closed", "cancelled")
-"""With 409: nothing more is taken. Any other 409 passes by itself."""
+"""Statuses of a final 409: no more submits are accepted. Any other 409 is temporary."""
 
 
 class ProtocolError(Exception):
-    """The gateway answered with something that the protocol does not allow, or stayed away too long."""
+    """The gateway's reply violates the protocol, or the gateway was unreachable for too long."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refusal:
-    """A submit that was refused and cost nothing."""
+    """A submit that was refused and not charged."""
 
     status: str
     """`budget_invalid`, `invalid_env_instance`, `run_closed`, `cancelled`."""
@@ -38,34 +39,34 @@ class Refusal:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """A submit that was charged."""
+    """The result of a submit that was charged."""
 
     name: str
-    """Of its folder under `feedback/`."""
+    """Name of its folder under `feedback/`."""
     status: str
     summary: dict[str, Any]
-    """What `summary.json` says; its arrays are null unless the status is `ok`."""
+    """The content of `summary.json`; its arrays are null unless the status is `ok`."""
 
 
 @dataclass(kw_only=True)
 class Client:
-    """Speaks to one run's gateway."""
+    """A client of one run's gateway."""
 
     info_url: str
     task_url: str
     submit_url: str
     answer_s: float = 60.0
-    """A gateway that says nothing for so long is asked again."""
+    """Timeout of one request, seconds; after it the request is sent again."""
     timeout_s: float = 300.0
-    """How long a gateway may be unreachable before giving up, seconds."""
+    """How long the gateway may be unreachable before the client gives up, seconds."""
     poll_s: float = 0.25
-    """Time between questions after a submit that runs, seconds; it grows while the submit does."""
+    """First pause between polls of a running submit, seconds; it grows up to eight times that."""
     sleep: Callable[[float], None] = field(default=time.sleep)
     clock: Callable[[], float] = field(default=time.monotonic)
 
     @classmethod
     def from_environment(cls) -> Client:
-        """A client for the URLs in the `EVOPOLICYGYM_*` variables. KeyError when one is missing."""
+        """A client for the URLs in the `EVOPOLICYGYM_*` variables. Raises KeyError when one is missing."""
         return cls(
             info_url=os.environ["EVOPOLICYGYM_INFO_URL"],
             task_url=os.environ["EVOPOLICYGYM_TASK_URL"],
@@ -73,18 +74,18 @@ class Client:
         )
 
     def info(self) -> dict[str, Any]:
-        """What `/info` says now."""
+        """The present content of `/info`."""
         return self._expect_json(*self._request(self.info_url))
 
     def task(self) -> str:
-        """The task's markdown."""
+        """The task's text, Markdown."""
         status, body = self._request(self.task_url)
         if status != 200:
             raise ProtocolError(f"GET {self.task_url} answered {status}: {body[:200]!r}")
         return body.decode("utf-8", "replace")
 
     def submit(self, env_instances: list[int]) -> Verdict | Refusal:
-        """Submit `system/` as it is now on these train cases and wait for the verdict."""
+        """Submits the present `system/` on these train cases and waits for the verdict."""
         key = uuid.uuid4().hex
         body = json.dumps({"env_instances": env_instances}).encode()
         headers = {"Content-Type": "application/json", "Idempotency-Key": key}
@@ -131,7 +132,7 @@ class Client:
     def _request(
         self, url: str, body: bytes | None = None, headers: dict[str, str] | None = None
     ) -> tuple[int, bytes]:
-        """Status and body of one exchange, tried again while the gateway is away or restarting."""
+        """Status and body of one request, retried while the gateway is away or restarting."""
         give_up_at = self.clock() + self.timeout_s
         while True:
             try:
@@ -161,7 +162,7 @@ def _extended(url: str, *, path: str = "", query: str = "") -> str:
 
 
 def exit_after(agent: str, play: Callable[[Client], int]) -> NoReturn:
-    """Ends the program by what `play` gives: 0 for any submit that was taken, 1 for none, or no gateway."""
+    """Exits with 0 when `play` returns that any submit was accepted, and with 1 otherwise, or without a gateway."""
     try:
         taken = play(Client.from_environment())
     except ProtocolError as error:

@@ -1,7 +1,7 @@
 """A Python function as agent: `python -m evopolicy_gateway.agents.function FILE`, in the workspace, inside the jail.
 
-FILE holds the function as cloudpickle wrote it on the host. It is called with a `Workspace`. What it returns is written as
-JSON to `result.json`: nothing that an agent wrote is ever unpickled on the host.
+FILE holds the function, pickled by cloudpickle on the host. It is called with a `Workspace`. Its return value is
+written as JSON to `result.json`: the host never unpickles anything written by an agent.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ RESULT = "result.json"
 
 
 class SubmitRefusedError(Exception):
-    """A submit was refused and cost nothing; `status` and the message say why."""
+    """A submit was refused and not charged; `status` and the message give the reason."""
 
     def __init__(self, status: str, message: str) -> None:
         super().__init__(f"{status}: {message}")
@@ -26,18 +26,18 @@ class SubmitRefusedError(Exception):
 
 
 class Workspace:
-    """What an agent function works with: the workspace's files, the task, and submits."""
+    """The interface for an agent function: the workspace's files, the task, and submits."""
 
     def __init__(self, client: Client, folder: Path) -> None:
         self._client = client
         self.folder = folder
-        """The workspace. `system/` is the policy, `feedback/` what came of submits."""
+        """The workspace. `system/` is the policy, `feedback/` holds the results of submits."""
         self.n_submits = 0
-        """Submits that were charged so far."""
+        """Number of submits charged so far."""
 
     @property
     def info(self) -> dict[str, Any]:
-        """What the run's `/info` says now: spaces, environment, bounds, state."""
+        """The present content of the run's `/info`: spaces, environment, bounds, state."""
         return self._client.info()
 
     @property
@@ -51,7 +51,7 @@ class Workspace:
         return int(self.info["state"]["remaining_budget"])
 
     def write(self, policy: str | Mapping[str, str]) -> None:
-        """Writes `system/policy.py`, or several files below `system/` by their paths."""
+        """Writes `system/policy.py`, or several files given by their paths below `system/`."""
         files = {"policy.py": policy} if isinstance(policy, str) else policy
         for name, text in files.items():
             path = self.folder / "system" / name
@@ -59,9 +59,11 @@ class Workspace:
             path.write_text(text, encoding="utf-8")
 
     def submit(self, cases: Iterable[int]) -> dict[str, Any]:
-        """Plays `system/` as it is now on these train ids, and waits: the content of the submit's `summary.json`.
+        """Submits the present `system/` on these train ids, waits, and returns the content of the submit's
+        `summary.json`.
 
-        Raises SubmitRefusedError when it is refused (the budget is too small, an id is unknown, the run is closed).
+        Raises SubmitRefusedError when the submit is refused (the budget is too small, an id is unknown, the run is
+        closed).
         """
         verdict = self._client.submit([int(case) for case in cases])
         if isinstance(verdict, Refusal):
@@ -76,7 +78,8 @@ def _fail(message: str) -> NoReturn:
 
 
 def main() -> None:
-    """Plays in the current directory. Exit code 0 when a submit was taken and the function returned what JSON can say."""
+    """Runs the function in the current directory. Exit code 0 when a submit was charged and the return value is
+    valid JSON."""
     import cloudpickle
 
     try:

@@ -1,9 +1,10 @@
 """`replay`: submits given policies one after another, dividing the budget evenly.
 
-Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is a
-folder with a `policy.py` (as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (as a workspace). DIR is one itself, or
-its subfolders are, and are played in sorted order. Where DIR has a folder named like the environment, with `/` as `_`, it
-is played instead: one DIR for many environments, such as `examples/policies`.
+Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is
+a folder with a `policy.py` (such as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (such as a
+workspace). DIR is either a policy, or its subfolders are policies, which are submitted in sorted order. If DIR has a
+folder named like the environment, with `/` as `_`, that folder is used instead: so one DIR serves many environments,
+such as `examples/policies`.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from pathlib import Path
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
 
 METADATA = frozenset({"_meta.json", "metrics.json"})
-"""As `records.checkpoints.METADATA`: an agent's jail shows the agents alone, not the package of that module."""
+"""Equals `records.checkpoints.METADATA`, which is not importable here: an agent's jail shows only the agents'
+modules."""
 
 
 def policies_in(folder: Path) -> list[Path]:
-    """Folders of the policies in `folder`, in the order in which they are played."""
+    """Folders of the policies in `folder`, in the order of their submits."""
     itself = _policy(folder)
     if itself is not None:
         return [itself]
@@ -29,13 +31,14 @@ def policies_in(folder: Path) -> list[Path]:
 
 
 def folder_for(folder: Path, env: str) -> Path:
-    """`folder`, or what it has for this environment."""
+    """The subfolder of `folder` for this environment, or else `folder` itself."""
     own = folder / env.replace("/", "_")
     return own if own.is_dir() else folder
 
 
 def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
-    """Episodes for each policy, in order: as even as can be, the first ones one more; [] when not one is possible.
+    """Episodes for each policy, in order: as even as possible, the first ones one more; [] when the budget suffices for
+    none.
 
     With too small a budget the last policies get none; `least` and `most` bound a submit.
     """
@@ -48,8 +51,8 @@ def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
 
 
 def stage(policy: Path, system: Path) -> None:
-    """Makes `system` a copy of `policy`, without what a run has put beside a checkpoint's files; links are copied as links,
-    for the service to judge."""
+    """Replaces `system` by a copy of `policy` without a run's metadata files; links are copied as links, for the
+    service to judge."""
     system.mkdir(exist_ok=True)
     for old in system.iterdir():
         if old.is_dir() and not old.is_symlink():
@@ -65,7 +68,8 @@ def stage(policy: Path, system: Path) -> None:
 
 
 def play(client: Client, folder: Path, workspace: Path) -> int:
-    """Submits all; how many were taken. ProtocolError when the gateway stays away."""
+    """Submits all policies and returns how many submits were accepted. Raises ProtocolError when the gateway stays
+    unreachable."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])
     folder = folder_for(folder, str(info["env_meta"]["env"]))
@@ -101,7 +105,7 @@ def _policy(folder: Path) -> Path | None:
 
 
 def main() -> None:
-    """Plays in the current directory."""
+    """Runs the agent in the current directory."""
     exit_after("replay", lambda client: play(client, Path(sys.argv[1]), Path.cwd()))
 
 

@@ -1,4 +1,5 @@
-"""`random`: the agent of the random row. Submits a policy of uniform random actions once, with the whole budget it may.
+"""`random`: the agent of the tables' random row. Submits a policy of uniform random actions once, with the largest
+permitted number of episodes.
 
 Run as `python -m evopolicy_gateway.agents.uniform` in the workspace, with the `EVOPOLICYGYM_*` URLs set.
 """
@@ -89,7 +90,7 @@ class Policy:
 
 
 def play(client: Client, workspace: Path) -> bool:
-    """Submits once; whether it was taken. ProtocolError when the gateway stays away."""
+    """Submits once and returns whether it was accepted. Raises ProtocolError when the gateway stays unreachable."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])
     n_episodes = min(int(info["state"]["remaining_budget"]), int(info["max_episodes_per_submit"]))
@@ -103,7 +104,7 @@ def play(client: Client, workspace: Path) -> bool:
 
 
 def main() -> None:
-    """Plays in the current directory."""
+    """Runs the agent in the current directory."""
     exit_after("random", lambda client: play(client, Path.cwd()))
 
 

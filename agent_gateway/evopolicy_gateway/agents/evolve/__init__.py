@@ -1,9 +1,9 @@
-"""`evolve`: the reference agent. Improves a parametrised policy under the run's budget, with no language model.
+"""`evolve`: the reference agent. Improves a parametrised policy within the run's budget, without a language model.
 
-It knows what every agent may know: `/info`, `/task`, `/submit` and the feedback files. Run as
+It uses only what every agent may use: `/info`, `/task`, `/submit` and the feedback files. Run as
 `python -m evopolicy_gateway.agents.evolve` in the workspace, with the `EVOPOLICYGYM_*` URLs set.
 
-One submit plays a whole population, a candidate an episode, since the policy is told the episode's index. The last
-submits hold one candidate each: those are the checkpoints meant for the hidden validation, which plays every episode
-of a checkpoint, whatever its index.
+One submit evaluates a whole population, one candidate per episode, since the policy receives the episode's index. The
+last submits have one candidate each: they are the checkpoints for the hidden validation, which plays every episode of a
+checkpoint, whatever its index.
 """

@@ -1,4 +1,4 @@
-"""The agent: plays populations, then finals, and learns from what the feedback tells."""
+"""The agent: evaluates populations, then finals, and learns from the feedback."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evopolicy_gateway.agents.evolve.search import Candidate, Episode, Search, m
 from evopolicy_gateway.agents.evolve.staging import stage_candidates, stage_code
 
 MAX_ROWS_READ = 3000
-"""Rows of one trajectory that the agent reads at most."""
+"""Most rows that the agent reads of one trajectory."""
 MAX_REFUSALS = 3
 
 
@@ -40,7 +40,7 @@ class Agent:
         self._n_refusals = 0
 
     def run(self) -> None:
-        """Spend the budget. ProtocolError when the gateway stays away or keeps refusing."""
+        """Spends the budget. Raises ProtocolError when the gateway stays unreachable or keeps refusing."""
         self._system.mkdir(exist_ok=True)
         stage_code(self._system)
         plan = make_plan(max(self._budget, 1), *self._bounds)
@@ -55,7 +55,7 @@ class Agent:
         self._play_finals(plan.finals, plan.episodes_per_final)
 
     def _play_finals(self, n: int, n_episodes: int) -> None:
-        """Single candidates on the same fresh cases, until nothing is left that a submit may spend."""
+        """Submits single candidates on the same fresh cases, until no budget is left for a submit."""
         first_case = self._next_case
         least = max(n_episodes, self._bounds[0])
         number = 0
@@ -70,7 +70,7 @@ class Agent:
     def _play_population(
         self, title: str, candidates: list[Candidate], n_episodes: int | None = None
     ) -> None:
-        """One submit in which the candidates take turns: each of them on the same case, then on the next one."""
+        """Submits the candidates in turns: all of them on one case, then all on the next."""
         total = max(n_episodes or len(candidates), self._bounds[0])
         total = min(total, self._bounds[1], self._budget)
         if total < self._bounds[0] or not candidates:
@@ -112,7 +112,7 @@ class Agent:
                 self._search.add_family(family)
 
     def _trajectories(self, verdict: Verdict, n_episodes: int) -> list[list[Step]]:
-        """Trajectories of a population's episodes, where something is to be had from them; else none."""
+        """Trajectories of a population's episodes, if they can teach anything; else none."""
         returns = verdict.summary["returns"]
         tells_apart = len(set(returns)) > len(returns) // 2
         if tells_apart and not self._lessons.wanted:
@@ -122,7 +122,7 @@ class Agent:
         return [read_steps(folder, MAX_ROWS_READ) for folder in folders]
 
     def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
-        """One line: what was played, how it went, what leads, what is left."""
+        """Prints one line: the submit, its result, the leader, the remaining budget."""
         line = f"{verdict.name} {title}: {verdict.status}, {len(candidates)} candidates"
         returns = verdict.summary.get("returns")
         if verdict.status == "ok" and returns:
@@ -138,7 +138,8 @@ class Agent:
 
 
 def main() -> int:
-    """Run the agent in the current folder; 0 when the budget is spent, 1 when the gateway could not be used."""
+    """Runs the agent in the current folder. Returns 0 when the budget is spent, 1 when the gateway could not be
+    used."""
     try:
         Agent(Client.from_environment(), Path.cwd()).run()
     except KeyError as missing:

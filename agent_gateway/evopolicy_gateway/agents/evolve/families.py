@@ -1,6 +1,7 @@
-"""Where the search begins: families of controllers that suit a pair of spaces, each an endless source of candidates.
+"""Starting points of the search: families of controllers that suit a pair of spaces, each an endless source of
+candidates.
 
-A family is chosen by the form of the spaces alone; no environment is named or recognised.
+Families are chosen by the structure of the spaces alone; no environment is named or recognised.
 """
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ MAX_CONSTANTS = 8
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Family:
-    """Controllers of one kind and how far to mutate each of their numbers."""
+    """Controllers of one kind, with the mutation scale of each of their numbers."""
 
     name: str
     kind: str
-    """As in `evolved.controllers.build`."""
+    """A kind of `evolved.controllers.build`."""
     scale: Vector
     """Standard deviation of a mutation of strength 1, for every number of the vector."""
     first: tuple[Vector, ...] = ()
-    """Candidates to try before any random one."""
+    """Candidates to try before random ones."""
     centre: Vector
-    """Mean of the random ones."""
+    """Mean of the random candidates."""
     spread: Vector
-    """Standard deviation of the random ones."""
+    """Standard deviation of the random candidates."""
     settings: dict[str, Any] = field(default_factory=dict)
     weight: int = 1
     """How many candidates it contributes each time its turn comes in the opening."""
 
     def sample(self, rng: np.random.Generator) -> Iterator[Vector]:
-        """Candidates' vectors, the fixed ones first, then random ones without end (none when nothing can vary)."""
+        """Yields candidates' vectors: the fixed ones first, then random ones without end (none if nothing can vary)."""
         yield from self.first
         while self.spread.any():
             yield self.centre + self.spread * rng.standard_normal(self.centre.size)
@@ -73,7 +74,7 @@ def families_for(obs_space: Schema, action_space: Schema) -> list[Family]:
 
 
 def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> list[Family]:
-    """The families that use a plant found from trajectories; the defaults first, then variations."""
+    """The families that use an identified plant; defaults first, then variations."""
     n_outputs = ActionHead(action_space).size
     families = []
     for kind in ("pusher", "carrier"):
@@ -98,7 +99,7 @@ def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: S
 
 
 def seeking_family(settings: dict[str, Any]) -> Family:
-    """The family that plans in a view whose motion was found from trajectories."""
+    """The family that plans in a view whose motion was identified from trajectories."""
     first = tuple(np.array(v, dtype=float) for v in ((0, 0, 0), (2, 0, -1), (0, 1, -1), (-2, 1, 0)))
     return Family(
         name="seeker",
@@ -147,7 +148,7 @@ def _linear(n_outputs: int, n_features: int) -> Family:
 
 
 def _switchable(obs_space: Schema, n_features: int) -> list[int]:
-    """Features worth switching on alone: signed ones, bounded ones last components first (often velocities)."""
+    """Features that may be switched on alone: for a Box the signed ones, last components (often velocities) first."""
     signed = np.ones(n_features, dtype=bool)
     if obs_space["type"] == "Box":
         low, high = bounds(obs_space)
@@ -156,7 +157,7 @@ def _switchable(obs_space: Schema, n_features: int) -> list[int]:
 
 
 def _bang_bang(n_outputs: int, switchable: list[int], n_features: int, *, chooses: bool) -> Family:
-    """Linear controllers that start from one feature deciding everything."""
+    """Linear controllers, first those that decide by a single feature."""
     first = []
     for feature in switchable[: 2 * MAX_CONSTANTS]:
         for sign in (1.0, -1.0):

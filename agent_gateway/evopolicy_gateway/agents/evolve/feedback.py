@@ -1,6 +1,6 @@
-"""Reads what a submit left in `feedback/`: nothing else tells the agent how its candidates did.
+"""Reads a submit's files in `feedback/`, the agent's only source of its candidates' results.
 
-A summary is small and always read; of trajectories only as much as the caller needs, since one can be large.
+A summary is small and always read; of a trajectory, which may be large, only as much as the caller needs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Step:
     """One row of a trajectory."""
 
     obs: Any
-    """What the policy received, as JSON has it; None where observations are stored outside the rows."""
+    """The observation that the policy received, as JSON; None if observations are stored outside the rows."""
     action: Any
     reward: float
     terminated: bool
@@ -30,7 +30,7 @@ class Step:
 def episode_folders(
     workspace: Path, submit_id: str, n_episodes: int, first_global_episode: int
 ) -> list[Path]:
-    """Folders of the submit's episodes in request order; they need not exist (not-ok submits leave none)."""
+    """Folders of the submit's episodes in request order; they need not exist (submits that are not ok have none)."""
     folder = workspace / "feedback" / submit_id / "episodes"
     if not folder.is_dir():
         return []
@@ -40,7 +40,7 @@ def episode_folders(
 
 
 def read_steps(episode: Path, max_rows: int) -> list[Step]:
-    """The first `max_rows` rows of an episode's trajectory; none when it has no trajectory."""
+    """The first `max_rows` rows of an episode's trajectory; none if it has no trajectory."""
     path = episode / "trajectory.jsonl"
     if not path.is_file():
         return []
@@ -58,7 +58,7 @@ def _step(row: dict[str, Any]) -> Step:
 
 
 def _numbers(value: Any) -> Any:
-    """`value` with `"NaN"`, `"Inf"` and `"-Inf"` as floats; other strings stay."""
+    """Returns `value` with `"NaN"`, `"Inf"` and `"-Inf"` as floats; other strings are unchanged."""
     if isinstance(value, dict):
         return {key: _numbers(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -67,5 +67,5 @@ def _numbers(value: Any) -> Any:
 
 
 def novelty(steps: list[Step]) -> int:
-    """How many different observations an episode saw, a measure of how far it got when no reward tells."""
+    """Number of different observations in an episode: a measure of progress without rewards."""
     return len({fingerprint(step.obs) for step in steps if step.obs is not None})

@@ -1,4 +1,5 @@
-"""What trajectories teach beyond their returns: families of controllers that need to know how the world reacts."""
+"""Learns from trajectories more than returns: families of controllers that need a model of the environment's
+reactions."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ MAX_VIEW_LOGS = 96
 
 
 class Lessons:
-    """Collects trajectories for as long as there is something to be learnt from them."""
+    """Collects trajectories while they can still teach anything."""
 
     def __init__(self, obs_space: Schema, action_space: Schema) -> None:
         self._spaces = obs_space, action_space
@@ -23,11 +24,12 @@ class Lessons:
 
     @property
     def wanted(self) -> bool:
-        """Whether more trajectories could teach anything."""
+        """Whether more trajectories can teach anything."""
         return self._wants_plant or self._wants_views
 
     def learn(self, episodes: list[list[Step]]) -> list[Family]:
-        """Families that these trajectories, with the earlier ones, make possible; a known one's settings may be newer."""
+        """Families that these trajectories, with the earlier ones, make possible; a known family may have newer
+        settings."""
         families: list[Family] = []
         if self._wants_plant:
             plant = find_plant(*self._spaces, episodes)

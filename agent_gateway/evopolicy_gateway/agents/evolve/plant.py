@@ -1,7 +1,7 @@
-"""Finds out from trajectories how actions move what is observed: the plant that a controller which moves things needs to know.
+"""Identifies the plant from trajectories: how actions move what is observed, as controllers that move things need it.
 
 An effector's coordinate is a component of `observation` whose step-to-step change follows one output, and whose values
-lie where the achieved goal's do on that axis.
+are near those of the achieved goal on that axis.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
 from evopolicy_gateway.agents.evolve.feedback import Step
 
 N_AXES = 3
-"""Goals are taken for positions when they have this many elements: things in a plane leave no way over them."""
+"""Goals with this many elements count as positions: in a plane the effector could not pass over things."""
 MIN_STEPS = 40
 MIN_CORRELATION = 0.5
 REACTION_STEPS = 2
-"""An action's effect is looked for in the displacement over this many steps."""
+"""An action's effect is measured as the displacement over this many steps."""
 
 
 def find_plant(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> dict[str, Any] | None:
-    """Settings for the `pusher` and `carrier` controllers, or None where the spaces or the trajectories do not give any."""
+    """Settings for the `pusher` and `carrier` controllers; None if the spaces or the trajectories do not determine
+    them."""
     if not goal_keys(obs_space) or action_space["type"] != "Box":
         return None
     n_axes = math.prod(obs_space["spaces"]["desired_goal"]["shape"])
@@ -68,7 +69,7 @@ _KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
 def _correlations(displacement: Rows, actions: Rows) -> Rows:
-    """Absolute correlation of every component's displacement with every output, (components, outputs)."""
+    """Absolute correlation of every component's displacement with every output, shape (components, outputs)."""
     d = displacement - displacement.mean(axis=0)
     a = actions - actions.mean(axis=0)
     scale = np.outer(np.linalg.norm(d, axis=0), np.linalg.norm(a, axis=0))
@@ -77,7 +78,8 @@ def _correlations(displacement: Rows, actions: Rows) -> Rows:
 
 
 def _lift_axis(achieved: Rows, step: float) -> int:
-    """The axis along which the thing, disturbed, moved least: it rests on something. The last one when none moved."""
+    """The axis along which the disturbed thing moved least, as it rests on something. The last axis if it did not
+    move."""
     moved = np.ptp(achieved, axis=0)
     return int(np.argmin(moved)) if moved.max() > max(step / 2, 3 * moved.min()) else N_AXES - 1
 
@@ -85,7 +87,7 @@ def _lift_axis(achieved: Rows, step: float) -> int:
 def _match_axes(
     correlation: Rows, observed: Rows, achieved: Rows, desired: Rows
 ) -> list[tuple[int, int]] | None:
-    """Per goal axis the observation component and output that move along it; None when an axis has none."""
+    """Per goal axis, the observation component and the output that moves along it; None when an axis has none."""
     reach = np.maximum(np.ptp(observed, axis=0), np.abs(desired - achieved).max())
     axes: list[tuple[int, int]] = []
     for axis in range(achieved.shape[1]):

@@ -1,12 +1,12 @@
-"""The strategy, pure: which candidates to try next, given how the earlier ones did. No clock, disk or network.
+"""The strategy, pure: which candidates to try next, given the results of the earlier ones. No clock, disk or network.
 
-- An *opening* tries candidates of every family once; each later *round* re-tries the survivors beside their mutants, all
-  on the same case, so that they differ by nothing but themselves; *finals* try single candidates, each a checkpoint.
-- A return is explained as candidate effect + case effect (fitted by alternating means), so that candidates that met
-  different cases can be compared; a candidate's worth is its effect, drawn towards its family's mean while it was seen
-  seldom, since the best of many single returns is mostly luck.
-- Where most returns are one and the same (a reward that hardly anybody has met yet), novelty is added to them, and a
-  round is spread over cases, since a case on which nobody meets the reward teaches nothing.
+- An *opening* tries candidates of every family once. Each later *round* tries the survivors again together with their
+  mutants, all on the same case, so that only the candidates differ. *Finals* try single candidates, each a checkpoint.
+- A return is modelled as candidate effect + case effect (fitted by alternating means), so that candidates that played
+  different cases are comparable. A candidate's worth is its effect, shrunk towards its family's mean while it has few
+  episodes, since the best of many single returns is mostly luck.
+- If most returns are equal (a sparse reward that hardly any candidate has reached), novelty is added to them, and a
+  round is spread over cases, since a case on which no candidate gets the reward teaches nothing.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ SURVIVING_SHARE = 0.35
 FIRST_STRENGTH, STRENGTH_DECAY = 0.8, 0.7
 """Mutation strength of the first round after the opening, and its factor from round to round."""
 SPARSE_SHARE = 0.6
-"""Returns are sparse when more than this share of them is the same."""
+"""Returns are sparse when more than this share of them is equal."""
 NOISY_RATIO, VERY_NOISY_RATIO = 0.5, 1.2
-"""Variance of noise over that of candidate effects from which on a candidate meets two and four cases a round."""
+"""Ratios of the noise variance to that of candidate effects above which a candidate plays two and four cases per
+round."""
 TIED_SHARE = 0.15
-"""Share of a round that may share its best return before one case is taken to be too easy."""
+"""Share of a round with the best return above which one case counts as too easy."""
 NOVELTY_BONUS = 0.3
-"""What the most novel episode is worth while returns are sparse, in units of the returns' range."""
+"""Bonus of the most novel episode while returns are sparse, in units of the returns' range."""
 MAX_PER_FAMILY = 0.6
-"""Share of the survivors that one family may hold, so that an early lucky one does not end the race."""
+"""Largest share of the survivors in one family, so that an early lucky family does not displace all others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,21 +47,21 @@ class Episode:
     """Train case id."""
     episode_return: float
     novelty: float = 0.0
-    """How many different observations it saw; 0 when nobody looked."""
+    """Number of different observations in it; 0 if it was not determined."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Candidate:
-    """One parametrised controller, and every episode seen of it."""
+    """One parametrised controller, and all its episodes so far."""
 
     family: Family
     vector: Vector
     episodes: list[Episode] = field(default_factory=list)
     is_final: bool = False
-    """True once it was given a checkpoint of its own."""
+    """Whether it had a checkpoint of its own."""
 
     def as_json(self) -> dict[str, Any]:
-        """As `candidates.json` lists it."""
+        """Its entry in `candidates.json`."""
         return {
             "kind": self.family.kind,
             "vector": [float(f"{value:.7g}") for value in self.vector],
@@ -70,19 +71,20 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """How a budget is spent, in episodes."""
+    """The division of a budget, in episodes."""
 
     opening: int
     rounds: tuple[int, ...]
     finals: int
-    """How many finals at least; what is left over is added to them."""
+    """Least number of finals; unused budget adds more."""
     episodes_per_final: int
 
 
 def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
-    """A plan for `budget` ≥ 1 episodes that keeps to the bounds of a submit.
+    """A plan for `budget` ≥ 1 episodes within the bounds of a submit.
 
-    A small budget goes into finals, since each is judged again on the hidden validation cases; a large one into search.
+    A small budget goes into finals, since each is evaluated again on the hidden validation cases; a large one into
+    search.
     """
     per_final = max(min_per_submit, min(3, budget // 32, max_per_submit), 1)
     share = 0.5 if budget <= 16 else 0.35 if budget <= 64 else 0.28
@@ -106,7 +108,7 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
 
 
 class Search:
-    """Keeps all candidates and proposes the next ones."""
+    """Holds all candidates and proposes the next ones."""
 
     def __init__(self, families: Iterable[Family], rng: np.random.Generator) -> None:
         self._rng = rng
@@ -117,10 +119,10 @@ class Search:
         self.candidates: list[Candidate] = []
 
     def add_family(self, family: Family) -> None:
-        """A family that feedback made possible: its first candidates join the next round.
+        """Adds a family that feedback made possible: its first candidates join the next round.
 
-        Of one known by that name only the settings are taken over, for all of its candidates: what is known of the
-        world has grown, and is not what the search is about.
+        For a family with a known name only the settings are updated, for all of its candidates: they describe the
+        environment and are not part of the search.
         """
         for known in self._families:
             if known.name == family.name:
@@ -131,7 +133,7 @@ class Search:
         self._newcomers.append(family)
 
     def opening(self, n: int) -> list[Candidate]:
-        """`n` new candidates, drawn from the families in turn."""
+        """Draws `n` new candidates, from the families in turn."""
         drawn: list[Candidate] = []
         sources = list(self._families)
         while len(drawn) < n and sources:
@@ -161,10 +163,10 @@ class Search:
         return survivors + self._joined(fresh)
 
     def finalist(self) -> Candidate:
-        """The next candidate worth a checkpoint of its own.
+        """The next candidate for a checkpoint of its own.
 
-        In turn the best that is left, and the best of a family seldom chosen so far: the hidden validation sees more
-        cases than the search did, so a hedge against a leader that was lucky costs little.
+        Alternates between the best one left and the best of a family seldom chosen so far: the hidden validation plays
+        more cases than the search did, so a hedge against a lucky leader costs little.
         """
         taken = [c for c in self.candidates if c.is_final]
         left = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
@@ -183,13 +185,14 @@ class Search:
         return chosen
 
     def ranking(self) -> list[Candidate]:
-        """All candidates that were tried, best first."""
+        """All evaluated candidates, best first."""
         worth = self.worth()
         tried = [c for c in self.candidates if c.episodes]
         return sorted(tried, key=lambda c: worth[id(c)], reverse=True)
 
     def worth(self) -> dict[int, float]:
-        """By `id` of each tried candidate: its effect, drawn towards its family's mean while it was seen seldom."""
+        """By `id` of each evaluated candidate: its effect, shrunk towards its family's mean while it has few
+        episodes."""
         tried = [c for c in self.candidates if c.episodes]
         if not tried:
             return {}
@@ -204,7 +207,8 @@ class Search:
 
     @property
     def repeats(self) -> int:
-        """How many cases each candidate of the next round should meet: more where one does not tell them apart."""
+        """Number of cases that each candidate of the next round should play: more if one case does not distinguish
+        them."""
         tried = [c for c in self.candidates if c.episodes]
         if not tried or self.is_flat:
             return 1
@@ -220,27 +224,28 @@ class Search:
         return 4 if ratio > VERY_NOISY_RATIO else 2 if tied or ratio > NOISY_RATIO else 1
 
     def _effects(self, tried: list[Candidate]) -> tuple[Vector, float]:
-        """Effects of `tried`, and the variance of one episode's noise over that of the better half's effects, ≤ 2."""
+        """Effects of `tried`, and the ratio of one episode's noise variance to the variance of the better half's
+        effects, ≤ 2."""
         effects, noise = _fit(self._scores(tried))
         better = np.sort(effects)[len(effects) // 2 :]
         return effects, min(noise**2 / max(float(np.var(better)), 1e-12), 2.0)
 
     @property
     def is_flat(self) -> bool:
-        """True while no return differs from another."""
+        """True while all returns are equal."""
         returns = [e.episode_return for c in self.candidates for e in c.episodes]
         return not returns or max(returns) - min(returns) < 1e-9
 
     @property
     def is_sparse(self) -> bool:
-        """True while most returns are one and the same."""
+        """True while most returns are equal."""
         returns = np.array([e.episode_return for c in self.candidates for e in c.episodes])
         if not returns.size:
             return False
         return bool(np.isclose(returns, np.median(returns), rtol=0.0, atol=1e-9).mean() > SPARSE_SHARE)
 
     def _scores(self, tried: list[Candidate]) -> list[list[tuple[int, float]]]:
-        """Per candidate (case, score) of its episodes: the returns, with a bonus for novelty while they are sparse."""
+        """Per candidate, (case, score) of its episodes: the returns, with a bonus for novelty while they are sparse."""
         bonus = 0.0
         if self.is_sparse:
             returns = [e.episode_return for c in tried for e in c.episodes]
@@ -249,7 +254,7 @@ class Search:
         return [[(e.case, e.episode_return + bonus * e.novelty) for e in c.episodes] for c in tried]
 
     def _hedge_bar(self, worth: dict[int, float]) -> float:
-        """What a hedge must be worth: near the leader where returns are sure, as little as the middle where they are not."""
+        """The least worth of a hedge: near the leader's if returns are reliable, down to the median if they are not."""
         values = np.array(list(worth.values()) or [0.0])
         tried = [c for c in self.candidates if c.episodes]
         doubt = min(1.0, self._effects(tried)[1]) if tried else 1.0
@@ -269,7 +274,8 @@ class Search:
         return kept + [c for c in ranked if c not in kept][: n - len(kept)]
 
     def _mutant(self, parents: list[Candidate], strength: float) -> Candidate:
-        """A parent, better ones more often, moved: a random step, half the time on top of a step towards a relative."""
+        """Mutates a parent, drawn with preference for better ones: a random step, half the time after a step towards
+        a relative."""
         able = [p for p in parents if p.family.scale.any()]
         if not able:
             return self._draw(parents)
@@ -286,7 +292,7 @@ class Search:
         return Candidate(family=parent.family, vector=vector + strength * parent.family.scale * step)
 
     def _draw(self, parents: list[Candidate]) -> Candidate:
-        """A new candidate of any family that still has some; the best parent again where none has."""
+        """A new candidate of any family that has candidates left; else the best parent again."""
         for index in self._rng.permutation(len(self._families)):
             family = self._families[int(index)]
             for vector in islice(self._sources[family.name], 1):
@@ -294,7 +300,7 @@ class Search:
         return Candidate(family=parents[0].family, vector=parents[0].vector)
 
     def _mean_of_best(self) -> Candidate | None:
-        """The mean of the leading family's best candidates, as the cross-entropy method would have it."""
+        """The mean of the leading family's best candidates, as in the cross-entropy method."""
         ranked = self.ranking()
         elite = [c for c in ranked if c.family is ranked[0].family and len(c.episodes) > 1][:3]
         if len(elite) < 2 or not elite[0].family.scale.any():
@@ -308,7 +314,8 @@ class Search:
 
 
 def _distinct(kept: list[Candidate], ranked: list[Candidate]) -> list[Candidate]:
-    """`ranked` without those that did exactly as a kept or better one did wherever both were seen: the same behaviour."""
+    """`ranked` without candidates whose returns equal those of a kept or better one on all shared cases: the same
+    behaviour."""
     seen = list(kept)
     distinct: list[Candidate] = []
     for candidate in ranked:
@@ -327,7 +334,7 @@ def _same_behaviour(one: Candidate, other: Candidate) -> bool:
 def _fit(scores: list[list[tuple[int, float]]]) -> tuple[Vector, float]:
     """Candidate effects of an additive model candidate + case, and the standard deviation of its residuals.
 
-    Where nobody played twice there are no residuals to speak of: the noise is then 0, as it is the same for all.
+    If no candidate played twice there are no meaningful residuals; the noise is then 0.
     """
     owner = np.array([i for i, played in enumerate(scores) for _ in played])
     cases = np.unique([case for played in scores for case, _ in played], return_inverse=True)[1]

@@ -17,7 +17,7 @@ ENTRY_POINT = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""\n\nfro
 
 
 def stage_code(system: Path) -> None:
-    """Put the policy's code into `system`, replacing the `policy.py` that was there."""
+    """Copies the policy's code into `system`, and replaces its `policy.py`."""
     target = system / PACKAGE
     target.mkdir(parents=True, exist_ok=True)
     source = resources.files("evopolicy_gateway.agents.evolve") / PACKAGE
@@ -29,13 +29,13 @@ def stage_code(system: Path) -> None:
 
 
 def stage_candidates(system: Path, candidates: Sequence[Candidate], schedule: Sequence[int]) -> None:
-    """List `candidates`, and which of them plays each episode of the next submit."""
+    """Writes `candidates`, and which of them plays each episode of the next submit."""
     plan = {"candidates": [c.as_json() for c in candidates], "schedule": list(schedule)}
     _replace(system / CANDIDATES_FILE, json.dumps(plan))
 
 
 def _replace(path: Path, text: str) -> None:
-    """Written whole or not at all: a snapshot may be taken at any moment."""
+    """Replaces the file atomically: a snapshot may be taken at any moment."""
     temporary = path.with_name(path.name + ".new")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)

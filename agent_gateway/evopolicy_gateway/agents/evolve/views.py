@@ -1,9 +1,11 @@
-"""Finds out from trajectories how a grid of symbols moves with the actions: what the seeker needs to plan in its view.
+"""Identifies from trajectories how a grid of symbols moves with the actions, as the seeker needs it to plan in its
+view.
 
-- A cell's symbol comes from the cell where, before the action, symbols agreed with it most, rare symbols counting more.
-- Advancing is the action of which a cell's symbol tells best whether it moves the view or is stopped.
-- Turns leave one cell in its place: where the agent stands. The cell from which advancing would bring a symbol there is
-  the one that advancing enters; where turns leave none, the cell that told best.
+- A cell's symbol comes from the cell whose symbols before the action agreed with it most, with rare symbols weighted
+  more.
+- Advancing is the action for which one cell's symbol predicts best whether the action moves the view or is stopped.
+- Turns leave one cell in its place: the agent's own. The cell that advancing would bring there is the cell that
+  advancing enters. If turns leave no such cell, the best predicting cell is used.
 """
 
 from __future__ import annotations
@@ -18,14 +20,14 @@ from evopolicy_gateway.agents.evolve.evolved.spaces import Schema
 from evopolicy_gateway.agents.evolve.feedback import Step
 
 MIN_MOVES = 25
-"""Transitions of an action that changed the view, to learn its map from."""
+"""Least number of transitions in which an action changed the view, to learn its map."""
 MAX_MOVES = 1500
 MIN_AGREEMENT = 0.7
 MIN_MAPPED_SHARE = 0.3
 MIN_SEEN = 8
-"""How often a symbol must have been met under the touch to be judged blocking by experience."""
+"""How often a symbol must have been met at the touched cell before it can count as blocking."""
 RARE_FRAMES = 0.3
-"""A symbol is rare when fewer than this share of the frames show it."""
+"""A symbol is rare when fewer than this share of the frames contain it."""
 
 Symbols = NDArray[np.int32]
 
@@ -40,7 +42,7 @@ class ViewLog:
 
 
 def view_logs(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> list[ViewLog]:
-    """The episodes as logs of the grid in their observations; none where there is no grid or nothing to choose."""
+    """The episodes as logs of the grid in their observations; none without a grid or a Discrete action space."""
     exists, key = find_grid(obs_space)
     if not exists or action_space["type"] != "Discrete":
         return []
@@ -49,7 +51,7 @@ def view_logs(obs_space: Schema, action_space: Schema, episodes: list[list[Step]
 
 
 def find_views(obs_space: Schema, action_space: Schema, runs: list[ViewLog]) -> dict[str, Any] | None:
-    """Settings for the `seeker` controller, or None where the logs do not give any."""
+    """Settings for the `seeker` controller; None if the logs do not determine them."""
     if not runs:
         return None
     frames = np.concatenate([run.frames for run in runs])
@@ -87,7 +89,7 @@ def _rarity(frames: Symbols) -> dict[int, float]:
 
 
 def _source_cells(before: Symbols, after: Symbols, rarity: dict[int, float]) -> Symbols:
-    """For each cell, the cell whose symbol it takes over; -1 where none agrees well enough."""
+    """For each cell, the cell from which its symbol comes; -1 if none agrees well enough."""
     n_cells = before.shape[1]
     weigh = np.vectorize(lambda symbol: rarity[int(symbol)], otypes=[float])
     weight_before, weight_after = weigh(before), weigh(after)
@@ -109,7 +111,7 @@ def _is_still(cells: Symbols) -> bool:
 def _advance_and_touch(
     before: Symbols, actions: Symbols, moved: NDArray[np.bool_], maps: dict[int, Symbols]
 ) -> tuple[int, int] | None:
-    """The action that may be stopped, and the cell it would enter; None where no action is ever stopped."""
+    """The action that may be stopped, and the cell it would enter; None if no action is ever stopped."""
     best = (0.05, -1, -1)  # bits; less tells nothing
     for action in maps:
         rows = actions == action
@@ -133,7 +135,7 @@ def _advance_and_touch(
 
 
 def _information(symbols: Symbols, outcome: NDArray[np.bool_]) -> float:
-    """Mutual information between a symbol and a yes-or-no outcome, bits."""
+    """Mutual information between a symbol and a binary outcome, bits."""
     kinds = np.unique(symbols, return_inverse=True)[1]
     n = np.bincount(kinds)
     yes = np.bincount(kinds, outcome)
@@ -162,7 +164,7 @@ def _barriers(
 
 
 def _rare(frames: Symbols) -> set[int]:
-    """Symbols that few frames show."""
+    """Symbols that few frames contain."""
     shown: dict[int, int] = {}
     for frame in frames:
         for symbol in set(frame.tolist()):
@@ -171,7 +173,7 @@ def _rare(frames: Symbols) -> set[int]:
 
 
 def _prizes(runs: list[ViewLog], touch: int) -> list[list[int]]:
-    """[symbol under the touch, action] of steps that were rewarded where most steps are not."""
+    """Pairs [symbol at the touched cell, action] of rewarded steps; none unless rewards are rare."""
     rewards = np.concatenate([run.rewards for run in runs])
     if np.mean(rewards > 0) > 0.05:
         return []

@@ -1,5 +1,5 @@
-"""The policy that `evolve` writes into a workspace: this folder, copied, plus a `candidates.json`.
+"""The policy that `evolve` writes into a workspace: a copy of this folder, plus a `candidates.json`.
 
-Nothing here imports anything but the standard library and numpy, and nothing names an environment: what a policy does
-follows from the two spaces and from its candidate's numbers.
+It imports only the standard library and numpy, and names no environment: a policy's behaviour follows from the two
+spaces and its candidate's numbers.
 """

@@ -1,7 +1,7 @@
-"""Parametrised controllers: each turns a flat vector of numbers into behaviour.
+"""Parametrised controllers: each maps a flat vector of numbers to behaviour.
 
-A controller is built from a candidate: its `kind`, its `vector`, and `settings` found out from feedback. How many
-numbers a kind takes is `parameter_count`, the one place that both the search and the policy ask.
+A controller is built from a candidate: its `kind`, its `vector`, and `settings` identified from feedback. Both the
+search and the policy get the length of a kind's vector from `parameter_count`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from .spaces import ActionHead, Features, Schema, Vector, as_image
 OSCILLATOR_PERIOD_STEPS = 25.0
 """Period of an oscillator whose tempo is 0; each unit of tempo halves it."""
 SALIENCY_FEATURES = 4
-"""Left-right and up-down balance and mean of what is salient, and one."""
+"""Left-right and up-down balance and mean of the salient colour, and a constant 1."""
 
 
 def parameter_count(kind: str, obs_space: Schema, action_space: Schema) -> int:
-    """Length of the vector that `kind` takes between these spaces. KeyError for an unknown kind."""
+    """Length of the vector of `kind` for these spaces. Raises KeyError for an unknown kind."""
     outputs = ActionHead(action_space).size
     features = Features(obs_space).size
     return {
@@ -59,7 +59,7 @@ class Linear:
 
 
 class Oscillator:
-    """Open loop: every output is a sine of one common period, with an amplitude, phase and offset of its own."""
+    """Open loop: every output is a sine of one common period, with its own amplitude, phase and offset."""
 
     def __init__(self, head: ActionHead, vector: Vector) -> None:
         self._head = head
@@ -74,7 +74,7 @@ class Oscillator:
 
 
 class Explorer:
-    """Random choices that prefer what this episode has not tried yet where it stands.
+    """Random choices that prefer what this episode has not yet tried after the same observation.
 
     An output's score is its logit, less `curiosity` × log(1 + how often it was chosen after the same observation), plus
     `persistence` when it was the last choice, plus Gumbel noise × `temperature`.
@@ -99,9 +99,9 @@ class Explorer:
 
 
 class Saliency:
-    """Steers by where in a picture a colour lies: outputs are linear in that colour's balance and mean.
+    """Steers by the position of a colour in a picture: outputs are linear in that colour's balance and mean.
 
-    The first three numbers weigh the colour channels (one channel counts as three equal ones).
+    The first three numbers weight the colour channels (one channel counts as three equal ones).
     """
 
     def __init__(self, head: ActionHead, schema: Schema, vector: Vector) -> None:
@@ -123,7 +123,7 @@ class Saliency:
 
 
 def fingerprint(obs: Any) -> bytes:
-    """Bytes that are equal for equal observations, numbers compared to two significant decimals."""
+    """Bytes that are equal for equal observations; numbers are rounded to two decimals."""
     if isinstance(obs, dict):
         return b"".join(fingerprint(obs[key]) for key in sorted(obs))
     if isinstance(obs, tuple):
@@ -148,7 +148,7 @@ def build(
     action_space: Schema,
     rng: np.random.Generator,
 ) -> Controller:
-    """A fresh controller for one episode. ValueError for an unknown kind."""
+    """A new controller for one episode. Raises ValueError for an unknown kind."""
     head = ActionHead(action_space)
     if kind == "constant":
         return Constant(head, vector)

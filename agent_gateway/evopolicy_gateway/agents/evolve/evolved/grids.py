@@ -1,12 +1,13 @@
-"""Finds its way by a small grid of symbols seen from where it stands, such as a partial view of rooms.
+"""Navigates by a small grid of symbols around the agent, such as a partial view of rooms.
 
-How the view moves with each action, which cell is touched by advancing and what blocks the way are found from
-trajectories (`views.py` on the agent's side). With them the seeker plans in its view: it walks to what has paid before,
-else to what is rare and tries every action on it, else to a random place it can see.
+How the view moves with each action, which cell advancing touches and which symbols block the way is identified from
+trajectories (`views.py` on the agent's side). With this model the seeker plans in its view: it walks to symbols that
+were rewarded before, else to rare symbols and tries every action on them, else to a random visible place.
 
-Settings: `key`, the part of a Dict observation that holds the grid, or None; `maps`, by action that moves the view, the
-cell each cell's symbol comes from, -1 where unknown; `advance`, the action that blocked cells stop; `touch`, the cell
-it enters; `blocked`, symbols that stop it; `rare`, symbols worth touching; `prizes`, [symbol, action] that paid.
+Settings: `key`, the part of a Dict observation that holds the grid, or None; `maps`, for each action that moves the
+view, the cell from which each cell's symbol comes, -1 if unknown; `advance`, the action that blocked cells stop;
+`touch`, the cell it enters; `blocked`, symbols that stop it; `rare`, symbols worth touching; `prizes`, rewarded pairs
+[symbol, action].
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from .spaces import ActionHead, Schema, Vector
 
 MAX_GRID_SIDE = 15
 MAX_VIEWS_PLANNED = 400
-"""How many different views a plan looks through at most."""
+"""Most different views that one plan examines."""
 
 Symbols = NDArray[np.int32]
 
 
 def find_grid(schema: Schema) -> tuple[bool, str | None]:
-    """Whether there is a grid of symbols in this space, and under which key of the Dict (None at the top)."""
+    """Whether the space contains a grid of symbols, and its key in a Dict (None at the top level)."""
     if _is_grid(schema):
         return True, None
     if schema["type"] == "Dict":
@@ -45,7 +46,7 @@ def _is_grid(schema: Schema) -> bool:
 
 
 def read_symbols(obs: Any, key: str | None) -> Symbols:
-    """The grid as one number a cell, flat int32; cells with the same values in all channels get the same number."""
+    """The grid as one number per cell, flat int32; cells with equal values in all channels get equal numbers."""
     grid = np.asarray(obs if key is None else obs[key], dtype=np.int32)
     if grid.ndim == 2:
         return grid.reshape(-1)
@@ -55,7 +56,7 @@ def read_symbols(obs: Any, key: str | None) -> Symbols:
 
 
 class GridSeeker:
-    """Parameters: how willingly it turns to rare symbols, to distant places, and to a random action."""
+    """Parameters: the appeal of rare symbols, the appeal of distant places, the share of random actions."""
 
     PARAMETERS = 3
 
@@ -90,7 +91,7 @@ class GridSeeker:
         return self._head.action(np.eye(self._head.size)[action])
 
     def _notice(self, seen: Symbols) -> None:
-        """Drop a plan that did not go as planned; walk on where handling something has cleared the way."""
+        """Drops a plan that was stopped; advances if an action on something has cleared the way."""
         if self._last is None:
             return
         before, action = self._last
@@ -108,7 +109,7 @@ class GridSeeker:
         return int(turns[int(self._rng.integers(len(turns)))])
 
     def _decide(self, seen: Symbols) -> list[int]:
-        """Actions to take next, at least one."""
+        """The next actions, at least one."""
         ways = self._ways(seen)
         prizes = [cell for cell in ways if int(seen[cell]) in self._prizes]
         if prizes:
@@ -131,7 +132,7 @@ class GridSeeker:
         return [*ways[cell], self._advance]
 
     def _ways(self, seen: Symbols) -> dict[int, list[int]]:
-        """By cell that can be brought under the touch: the shortest actions to do so."""
+        """For each cell that can become the touched cell, the shortest list of actions to get there."""
         here = np.arange(seen.size)
         ways: dict[int, list[int]] = {}
         known = {here.tobytes()}

@@ -1,7 +1,7 @@
-"""The Policy: plays in episode k the candidate that `candidates.json` schedules for episode k.
+"""The Policy: in episode k it plays the candidate that `candidates.json` schedules for episode k.
 
-One submit tries a whole population that way: the file lists candidates, and `schedule[k]` is the one to play when
-`reset(k)` is called. A checkpoint meant to be scored lists a single candidate, which then plays every episode.
+So one submit evaluates a whole population: the file lists candidates, and `reset(k)` selects the one at
+`schedule[k]`. A checkpoint that is meant to be scored lists a single candidate, which then plays every episode.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ CANDIDATES_FILE = "candidates.json"
 
 
 class Policy:
-    """The contract of a run: `__init__(obs_space, action_space, env_meta)`, `reset(episode_index)`, `act(obs)`."""
+    """The interface of a run's policies: `__init__(obs_space, action_space, env_meta)`, `reset(episode_index)`,
+    `act(obs)`."""
 
     def __init__(
         self, obs_space: dict[str, Any], action_space: dict[str, Any], env_meta: dict[str, Any]
@@ -33,14 +34,14 @@ class Policy:
         self._controller: Controller | None = None
 
     def reset(self, episode_index: int) -> None:
-        """Begin an episode; `episode_index` is its position in the submit."""
+        """Starts an episode; `episode_index` is its position in the submit."""
         candidate = self._candidates[self._schedule[episode_index % len(self._schedule)]]
         rng = np.random.default_rng([self._seed, episode_index])
         vector = np.asarray(candidate["vector"], dtype=float)
         self._controller = build(candidate["kind"], vector, candidate.get("settings", {}), *self._spaces, rng)
 
     def act(self, obs: Any) -> Any:
-        """The action for `obs`, in the form that the action space states."""
+        """The action for `obs`, in the form of the action space."""
         if self._controller is None:
             self.reset(0)
         assert self._controller is not None

@@ -1,13 +1,14 @@
-"""Brings a thing to its goal with an effector that the actions move: by pushing it, or by grasping and carrying it.
+"""Moves a thing to its goal with an effector: by pushing it, or by grasping and carrying it.
 
-Which observation components are the effector's position, and which action moves each, is found from trajectories
-(`plant.py` on the agent's side) and comes as settings; nothing is known of the task but the goal convention: Dict
+Which observation components are the effector's position, and which output moves each, is identified from trajectories
+(`plant.py` on the agent's side) and passed as settings. The only knowledge of the task is the goal convention: Dict
 observations with `observation`, and `achieved_goal` and `desired_goal`, here positions in space.
 
 Settings: `effector`, per axis the index into `observation`; `outputs`, per axis the output that moves it; `slopes`,
 displacement per unit of that output and step; `lift_axis`, the axis along which things are approached from above.
-Parameters are factors around 0 = the default; then comes an offset for every output: what those that move no axis do
-meanwhile, such as a gripper. Lengths are in units of the effector's travel in one step.
+Parameters are exponents of factors (the depth of touch is a length), 0 = the default. Then comes an offset for every
+output, which sets outputs that move no axis, such as a gripper's. Lengths are in units of the effector's travel in one
+step.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ FACTOR_RANGE = 3.0
 
 
 class _Mover:
-    """What pushing and carrying share: reading the observation, and moving the effector to a point."""
+    """Shared by pushing and carrying: reads the observation, and moves the effector to a point."""
 
     PARAMETERS = 6
 
@@ -40,27 +41,27 @@ class _Mover:
         self._offset = vector[self.PARAMETERS :]
 
     def _positions(self, obs: Any) -> tuple[Vector, Vector, Vector]:
-        """Thing, its goal, and the effector; each a fresh float64 vector with an element per axis."""
+        """Positions of the thing, its goal, and the effector; each a new float64 vector with one element per axis."""
         thing = np.array(obs["achieved_goal"], dtype=float).reshape(-1)
         goal = np.array(obs["desired_goal"], dtype=float).reshape(-1)
         effector = np.asarray(obs["observation"], dtype=float).reshape(-1)[self._effector]
         return thing, goal, effector
 
     def _level(self, difference: Vector) -> Vector:
-        """The part of `difference` across the lift axis."""
+        """The part of `difference` perpendicular to the lift axis."""
         level = difference.copy()
         level[self._lift] = 0.0
         return level
 
     def _action(self, move: Vector, others: float = 1.0) -> Any:
-        """The action for a wanted displacement; `others` multiplies what the remaining outputs do."""
+        """The action for a desired displacement; `others` scales the remaining outputs."""
         outputs = others * self._offset
         outputs[self._outputs] = self._speed * move / self._slopes
         return self._head.action(outputs)
 
 
 class Pusher(_Mover):
-    """Gets behind the thing, touches it, pushes along the line to the goal.
+    """Moves behind the thing, touches it, and pushes it along the line to the goal.
 
     Parameters: distance kept behind, clearance, depth of touch, sideways tolerance, speed, goal tolerance.
     """
@@ -81,7 +82,7 @@ class Pusher(_Mover):
         return self._action(self._target(thing, effector, missing / distance, distance) - effector)
 
     def _target(self, thing: Vector, effector: Vector, way: Vector, distance: float) -> Vector:
-        """Where the effector should go next."""
+        """The effector's next target position."""
         touch = thing.copy()
         touch[self._lift] += self._depth
         offset = self._level(effector - thing)
@@ -101,7 +102,7 @@ class Pusher(_Mover):
 
 
 class Carrier(_Mover):
-    """Comes down on the thing from above, reverses the other outputs to grasp it, carries it to the goal.
+    """Approaches the thing from above, reverses the other outputs to grasp it, and carries it to the goal.
 
     Parameters: sideways tolerance, clearance, depth of touch, reach within which to grasp, speed, steps to grasp for.
     """

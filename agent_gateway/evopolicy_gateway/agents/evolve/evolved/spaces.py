@@ -1,4 +1,4 @@
-"""From an observation to a feature vector, and from a vector of outputs to an action, for any pair of spaces.
+"""Converts observations to feature vectors, and output vectors to actions, for any pair of spaces.
 
 Features are a fixed function of the space alone, so that a weight means the same in every submit of a run. Outputs are
 in units where 0 is the action nearest to zero and ±1 are the bounds.
@@ -17,15 +17,15 @@ Schema = dict[str, Any]
 Vector = NDArray[np.float64]
 
 FEATURE_LIMIT = 10.0
-"""Features are clipped here, so that one wild component cannot drown the others."""
+"""Features are clipped to ± this value, so that one extreme component cannot dominate the others."""
 IMAGE_CELLS = 4
 """A picture becomes this many by this many mean colours."""
 MAX_ONE_HOT = 64
-"""A Discrete with more values than this is one number in [-1, 1]."""
+"""A Discrete space with more values than this becomes one number in [-1, 1]."""
 
 
 def bounds(schema: Schema) -> tuple[Vector, Vector]:
-    """Lowest and highest value of every element of a Box, flat; infinite where there is none."""
+    """Lowest and highest value of every element of a Box, flat; infinite if unbounded."""
     size = math.prod(schema["shape"])
     low, high = _floats(schema["low"]), _floats(schema["high"])
     return np.broadcast_to(low, size).astype(float), np.broadcast_to(high, size).astype(float)
@@ -38,14 +38,14 @@ def _floats(value: Any) -> list[float]:
 
 
 def goal_keys(schema: Schema) -> bool:
-    """True for the goal convention: a Dict with `observation`, `achieved_goal` and `desired_goal`."""
+    """Whether the space follows the goal convention: a Dict with `observation`, `achieved_goal` and `desired_goal`."""
     return schema["type"] == "Dict" and {"observation", "achieved_goal", "desired_goal"} <= set(
         schema["spaces"]
     )
 
 
 class Features:
-    """An observation as a float64 vector of `size` values, each of the order of one where the space is bounded."""
+    """Converts an observation to a float64 vector of `size` values, each of order one if the space is bounded."""
 
     def __init__(self, schema: Schema) -> None:
         self.size, self._convert = _features(schema)
@@ -92,7 +92,7 @@ def _features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
 
 
 def goal_error(obs: Any) -> Vector:
-    """What is still missing: desired minus achieved goal, flat."""
+    """Difference to the goal: desired minus achieved goal, flat."""
     desired = np.asarray(obs["desired_goal"], dtype=float).reshape(-1)
     missing: Vector = desired - np.asarray(obs["achieved_goal"], dtype=float).reshape(-1)
     return missing
@@ -129,7 +129,7 @@ def as_image(obs: Any, schema: Schema) -> NDArray[np.float64]:
 
 
 class ActionHead:
-    """Turns `size` outputs into an action of the space."""
+    """Converts `size` outputs to an action of the space."""
 
     def __init__(self, schema: Schema) -> None:
         self.size, self._convert = _head(schema)
