@@ -63,8 +63,7 @@ def bytes_text(n: float) -> str:
 
 
 def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    """Removes unprintable characters: any value may contain text of a policy or an agent. JSON lines escape it
-    themselves."""
+    """Removes unprintable characters: any value may contain text of a policy or an agent. JSON lines escape it."""
     for name, value in event.items():
         if isinstance(value, str):
             event[name] = harmless(value)
@@ -92,8 +91,7 @@ def setup_logging(level: str = "info") -> None:
 
 
 def setup_notices() -> None:
-    """For interactive commands and scripts: prints warnings as plain lines on stderr, so that stdout holds results
-    only."""
+    """For interactive commands and scripts: prints warnings as plain lines on stderr; stdout holds results only."""
     import structlog
 
     def plain(_: Any, __: str, event: Any) -> str:
@@ -121,8 +119,7 @@ def code_of(error: ConfigError | DamagedStoreError) -> int:
 
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line and an exit code: 2 for wrong options and files, 1 for what the machine refuses
-    and for later failures."""
+    """Turns our errors into one line and an exit code: 2 for wrong options and files, 1 for all others."""
     try:
         yield
     except (ConfigError, DamagedStoreError) as error:

@@ -11,8 +11,7 @@ import msgspec
 from evopolicy_common.wire.refusals import Refusal
 
 DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-"""Errors that msgspec raises for malformed or mismatching input: another shape, text that is not UTF-8, nesting
-without end."""
+"""Errors of msgspec for input that is malformed, of another shape, not UTF-8, or nested without end."""
 
 
 class EvopolicyError(Exception):

@@ -16,8 +16,7 @@ MAX_LOG_BYTES = 1 << 30
 
 
 class AgentLog:
-    """Appends lines without keys and tokens; each reaches the file at once. Lines that the disk refuses are lost;
-    the agent continues."""
+    """Appends lines without keys and tokens, unbuffered. Lines that the disk refuses are lost; the agent continues."""
 
     def __init__(self, path: Path, redact: Redaction | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

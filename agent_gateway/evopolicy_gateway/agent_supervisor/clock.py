@@ -16,14 +16,13 @@ from pathlib import Path
 from evopolicy_gateway.run import processes
 
 SILENCE_S = 3600.0
-"""Default limit of an agent's inactivity, seconds: longer than any pause for thought, and much shorter than its wall
+"""Default limit of an agent's inactivity, seconds: longer than any pause for thought, far shorter than its wall
 limit."""
 _LOOK_S = 1.0
 _LOOKS = 20
 """Number of measurements of processor time within the limit of inactivity."""
 _BUSY_SHARE = 0.05
-"""Share of one core between two measurements above which the agent is active; a program that only waits and polls
-uses less."""
+"""Share of one core above which the agent is active; a program that only waits and polls uses less."""
 
 
 class AgentClock:
@@ -38,8 +37,8 @@ class AgentClock:
         self._held_s = 0.0
 
     def held(self, seconds: float) -> None:
-        """Sets the total time, seconds, in which its submits waited because hidden episodes occupied the machines;
-        it does not count."""
+        """Sets the total time (seconds) that its submits waited for machines busy with hidden episodes; it does not
+        count."""
         self._held_s = max(self._held_s, seconds)
 
     def left_s(self) -> float:
@@ -78,8 +77,7 @@ class Activity:
     def __init__(
         self, limit_s: float, workspace: Path, cpu_s: Callable[[], float] = processes.cpu_below
     ) -> None:
-        """Inactive after `limit_s` seconds; `cpu_s` returns the processor seconds that the agent's processes have
-        used."""
+        """Inactive after `limit_s` seconds; `cpu_s` returns the processor seconds used by the agent's processes."""
         self.limit_s = limit_s
         self.submits = 0
         """Number of submits that it has requested."""
@@ -116,8 +114,8 @@ class Activity:
 
 
 def _last_change(folder: Path) -> float:
-    """Time of the latest change of a file below a folder, Unix time, seconds; ignores feedback, which the agent does
-    not write."""
+    """Time of the latest change of a file below a folder (Unix time, seconds), except in feedback, which is not the
+    agent's."""
     last = 0.0
     for root, folders, files in os.walk(folder):
         if Path(root) == folder and "feedback" in folders:

@@ -120,8 +120,7 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
-    """Variables whose values may be secrets; those in the settings' `pass_environment` always count, whatever their
-    names."""
+    """Variables whose values may be secrets; the settings' `pass_environment` always count, whatever their names."""
     named = (
         {}
         if config is None

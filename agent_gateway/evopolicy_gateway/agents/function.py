@@ -79,7 +79,7 @@ def _fail(message: str) -> NoReturn:
 
 def main() -> None:
     """Runs the function in the current directory. Exit code 0 when a submit was charged and the return value is
-    valid JSON."""
+    JSON."""
     import cloudpickle
 
     try:

@@ -17,8 +17,7 @@ from pathlib import Path
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
 
 METADATA = frozenset({"_meta.json", "metrics.json"})
-"""Equals `records.checkpoints.METADATA`, which is not importable here: an agent's jail shows only the agents'
-modules."""
+"""Equals `records.checkpoints.METADATA`; that module is not in an agent's jail, which shows only the agents."""
 
 
 def policies_in(folder: Path) -> list[Path]:
@@ -51,8 +50,7 @@ def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
 
 
 def stage(policy: Path, system: Path) -> None:
-    """Replaces `system` by a copy of `policy` without a run's metadata files; links are copied as links, for the
-    service to judge."""
+    """Replaces `system` by a copy of `policy` without a run's metadata; links stay links, for the service to judge."""
     system.mkdir(exist_ok=True)
     for old in system.iterdir():
         if old.is_dir() and not old.is_symlink():
@@ -68,7 +66,7 @@ def stage(policy: Path, system: Path) -> None:
 
 
 def play(client: Client, folder: Path, workspace: Path) -> int:
-    """Submits all policies and returns how many submits were accepted. Raises ProtocolError when the gateway stays
+    """Submits all policies and returns the number of accepted submits. Raises ProtocolError if the gateway is
     unreachable."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])

@@ -18,8 +18,7 @@ from evopolicy_gateway.harnesses.usage import Prices
 
 
 class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where an event reports token counts: dotted paths such as `usage.input_tokens`; empty for counts that it does
-    not report."""
+    """Where an event reports token counts: dotted paths such as `usage.input_tokens`; empty for unreported counts."""
 
     input: str = ""
     cache_read: str = ""
@@ -85,8 +84,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     provider: str | None = None
     """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
     user_config: bool = False
-    """Lets the CLI read the user's own settings, rules and memory; off by default, so that a run depends on this
-    file alone."""
+    """Lets the CLI read the user's own settings, rules and memory; off, so that a run depends on this file alone."""
     retries: int = 5
     """Most retries in a row, for one turn."""
     backoff_s: float = 4.0

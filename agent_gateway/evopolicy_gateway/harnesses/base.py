@@ -72,8 +72,8 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
             await asyncio.wait_for(self.over.wait(), seconds)
 
     async def start(self, program: list[str], *, talks: bool) -> AgentProcess:
-        """Starts a program of the agent in the workspace. `talks`: its stdin is a pipe. Raises AgentError when it
-        cannot be started."""
+        """Starts a program of the agent in the workspace. `talks`: its stdin is a pipe. Raises AgentError when that
+        fails."""
         way = None if self.jail is None else self.jail.way(program)
         try:
             process = await AgentProcess.start(
@@ -111,7 +111,7 @@ class Harness(ABC):
     """Whether it resumes from `Stage.session_file` after all its processes were killed."""
 
     def known(self) -> dict[str, Any]:
-        """Facts for `run.json` that do not depend on the agent's end, for runs whose supervisor cannot report the
+        """Facts for `run.json` that do not depend on the agent's end, in case its supervisor cannot report the
         others."""
         return {}
 

@@ -101,8 +101,7 @@ class _Talk:
 
     async def go_on(self) -> None:
         """Exchanges turns until the program sends stop, or its stdout ends."""
-        # A task apart from reading: the stdin of a program that never reads it fills up, and its output must still be
-        # read.
+        # A task of its own: a program that never reads its stdin fills it, and its output must still be read.
         prompting = asyncio.create_task(self._prompt())
         activity = self._stage.activity
         submits = 0

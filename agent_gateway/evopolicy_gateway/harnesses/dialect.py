@@ -70,8 +70,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
-        """Arguments after the program's name. `session`: the session to resume or start; `options`: the CLI's help
-        text."""
+        """Arguments after the program's name. `session`: the session to resume or start; `options`: the help text."""
 
     @abstractmethod
     def reader(self) -> TurnReader:

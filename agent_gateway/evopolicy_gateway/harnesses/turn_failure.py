@@ -80,8 +80,9 @@ def turn_failure_of(message: str, status: int | None = None, now: float | None =
 
 
 def backoff_s(attempt: int, base_s: float, chance: float) -> float:
-    """Seconds before retry `attempt` (from 1): base · 2^(attempt − 1), times 0.75 to 1.25 by `chance` in [0, 1); at
-    most `MAX_BACKOFF_S`."""
+    """Seconds before retry `attempt` (from 1): base · 2^(attempt − 1), times 0.75 to 1.25 by `chance` in [0, 1).
+
+    At most `MAX_BACKOFF_S`."""
     whole = base_s * 2.0 ** min(attempt - 1, 16)
     return min(MAX_BACKOFF_S, float(whole) * (0.75 + 0.5 * chance))
 

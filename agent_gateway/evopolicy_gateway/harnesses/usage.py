@@ -77,8 +77,7 @@ class Usage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 MAX_COUNT = 10**12
-"""Limit of one reported count, above any real turn, so that sums of a stream's claims stay numbers that every reader
-accepts."""
+"""Limit of one reported count, above any real turn, so that sums of counts stay numbers that every reader accepts."""
 
 
 def count(value: Any) -> int:

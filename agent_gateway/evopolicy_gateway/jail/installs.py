@@ -64,7 +64,7 @@ def needs_of(command: Sequence[str], search: str | None) -> Needs:
 
 
 def hidden_below(folder: str) -> Iterator[str]:
-    """Yields files and folders of packages that no agent may see, in the Python installations at and directly below
+    """Yields files and folders of packages that no agent may see, in Python installations at and directly below
     `folder`."""
     root = Path(folder)
     sites: list[Path] = []
@@ -84,8 +84,7 @@ def hidden_below(folder: str) -> Iterator[str]:
 
 
 def _our_python(needs: Needs) -> None:
-    """Adds the interpreter with its standard library, numpy, cloudpickle, and the agents of this package; nothing
-    else."""
+    """Adds the interpreter with its standard library, numpy, cloudpickle, and this package's agents; nothing else."""
     prefix, base = os.path.abspath(sys.prefix), os.path.abspath(sys.base_prefix)
     needs.path(base)
     if os.path.realpath(base) != base:

@@ -63,8 +63,8 @@ class Way:
         self._supervisor: socket.socket | None = None
         self._child: socket.socket | None = None
         self._serving: asyncio.Task[None] | None = None
-        # Passed by --args, not on the command line: the jail's first process shows that to the agent, and it names the
-        # hidden folders.
+        # By --args: the jail's first process shows its command line to the agent, and the arguments name hidden
+        # folders.
         self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
         self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
         if (filter_ := filter_program()) is not None:
@@ -123,8 +123,7 @@ def _readable(data: bytes) -> int:
     return fd
 
 
-# bubblewrap ends at once on SIGTERM, and takes the program with it; the shell makes it ignore the signal, so that only
-# the program receives it.
+# bubblewrap would end at once on SIGTERM and take the program with it; it ignores the signal, so the program gets it.
 _PATIENT = ("/bin/sh", "-c", 'trap "" TERM INT; exec "$@"', "jail")
 
 

@@ -45,8 +45,8 @@ class JailProxy:
         return (*self._forwards, self.proxy_port)
 
     async def serve(self, control: socket.socket) -> None:
-        """Receives the listening sockets from the jail and serves them; does nothing if the program ended without
-        sending them."""
+        """Receives the listening sockets from the jail and serves them; returns if the program ended before sending
+        them."""
         loop = asyncio.get_running_loop()
         control.setblocking(False)
         ready = asyncio.Event()

@@ -69,7 +69,7 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def host(text: str) -> Host:
-    """Parses `HOST` or `HOST:PORT` into lower-case name and port. Raises ConfigError for anything else, including
+    """Parses `HOST` or `HOST:PORT` into lower-case name and port. Raises ConfigError for anything else, and
     patterns."""
     found = _HOST.fullmatch(text)
     port = HTTPS if found is None or found["port"] is None else int(found["port"])

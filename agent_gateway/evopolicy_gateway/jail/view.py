@@ -53,8 +53,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     open_network: bool
 
     def prepare(self) -> None:
-        """Creates the agent's home and /tmp; existing ones stay, for an agent that resumes after its agent
-        supervisor died."""
+        """Creates the agent's home and /tmp; existing ones stay, for an agent that resumes after its supervisor
+        died."""
         for name in ("home", "tmp", "proc"):
             (self.private / name).mkdir(mode=0o700, parents=True, exist_ok=True)
         for name in _PROC_COPIES:

@@ -47,8 +47,7 @@ __all__ = [
 ]
 
 ENTRY_POINTS = "evopolicy.environments"
-"""Group of entry points by which a package offers environments: `name = "package:FILE.toml"`, an environment file in
-it."""
+"""Entry point group of packages that offer environments: `name = "package:FILE.toml"`, an environment file in it."""
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -77,8 +76,8 @@ class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of `families/`. An environment's id is `prefix` plus its key, which is Gymnasium's id unless the row
-    sets another."""
+    """A file of `families/`. An environment's id is `prefix` plus its key; the key is Gymnasium's id unless the row
+    differs."""
 
     family: str
     title: str
@@ -236,8 +235,8 @@ def is_foreign(env_id: str) -> bool:
 
 
 def entry(env_id: str) -> Entry:
-    """The entry of `env_id`, for a foreign one perhaps only its id. Raises ConfigError, with similar names, for an
-    impossible id."""
+    """The entry of `env_id`, perhaps with only its id if foreign. Raises ConfigError with similar names for a wrong
+    id."""
     found = known(env_id)
     if found is not None:
         return found
@@ -247,8 +246,8 @@ def entry(env_id: str) -> Entry:
 
 
 def suite_of(env_id: str) -> Suite:
-    """The first suite that contains `env_id`: its numbers are the defaults of a run on it. Raises ConfigError as
-    `entry` does."""
+    """The first suite with `env_id`: its numbers are the defaults of a run on it. Raises ConfigError as `entry`
+    does."""
     entry(env_id)
     return next((suite for suite in suites().values() if env_id in suite.environments), OTHER)
 

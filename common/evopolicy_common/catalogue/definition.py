@@ -45,8 +45,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     id: str
     """Suite id by which users, runs and cases name it, such as `gym/acrobot`."""
     gymnasium_id: str | None = None
-    """The argument of `gymnasium.make`, `module:Id` for one that a module registers on import; None for our own
-    environments (`toy/…`)."""
+    """The argument of `gymnasium.make`, `module:Id` if a module registers it on import; None for our own (`toy/…`)."""
     family: str = "other"
     """Key of the family in which the environment's scores are averaged, such as `gym_box2d`."""
     title: str = ""
@@ -70,8 +69,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     wrappers: tuple[Wrapper, ...] = ()
     """Wrappers around the environment, the innermost first."""
     task: str = ""
-    """Markdown for agents; empty: the text written for the id, or else one generated from its documentation and
-    spaces."""
+    """Markdown for agents; empty: the text written for the id, or else one generated from documentation and spaces."""
     reward_components: dict[str, str] = {}
     """Names under which `info`, or its `rewards`, reports parts of the reward, and what each stands for."""
     reward_vector: tuple[str, ...] = ()

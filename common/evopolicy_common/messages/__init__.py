@@ -1,2 +1,1 @@
-"""The wire messages, one module per kind of client (worker, gateway, operator); all are msgspec structs over
-msgpack."""
+"""The wire messages, one module per kind of client (worker, gateway, operator): msgspec structs over msgpack."""

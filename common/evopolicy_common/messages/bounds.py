@@ -48,8 +48,7 @@ def plain_parts(message: Struct) -> Iterator[object]:
 
 @cache
 def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
-    """The fields of a struct that are `Plain` (True), or that are structs (or tuples of structs) with such fields
-    (False)."""
+    """The fields of a struct that are `Plain` (True), or structs or tuples of structs with such fields (False)."""
     found = inspect.type_info(kind)
     assert isinstance(found, inspect.StructType)
     fields = []

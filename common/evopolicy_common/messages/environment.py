@@ -61,8 +61,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     definition: Plain = {}
     """How it is constructed: `gymnasium_id`, plus `kwargs` and `wrappers` where it has any."""
     reward_weights: Named[Number] = {}
-    """For a vector reward: the weights of its elements, in their order, in the return. Empty: the reward is a
-    number."""
+    """For a vector reward: the weights of its elements, in order, in the return. Empty: the reward is a number."""
     success: Word = ""
     """Key in `info` that reports whether the task was solved; empty when no key does."""
     success_at: Literal["end", "any"] = "end"

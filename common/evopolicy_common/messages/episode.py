@@ -138,8 +138,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: Int = 0
     """An episode is cut after this many steps; 0: only its environment ends it."""
     begun: BlobRef | None = None
-    """What the policy returned in an earlier attempt, which stays valid (`JobResult.begun`); None: the job starts
-    from the beginning."""
+    """What the policy returned in an earlier attempt, which stays valid (`JobResult.begun`); None: start afresh."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):

@@ -94,8 +94,7 @@ class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
     waits_for: Text = ""
     """What it waits for while none of its episodes runs, in words for the agent; empty while episodes run."""
     held_s: Number = 0.0
-    """Seconds in which none of its episodes ran because hidden work occupied the machines; they count against no
-    limit."""
+    """Seconds in which none of its episodes ran because hidden work had the machines; they count against no limit."""
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
@@ -220,8 +219,7 @@ class SubmitDone(msgspec.Struct, frozen=True, kw_only=True):
     failure: PolicyFailure | None
     """Why the status is not ok; None when it is ok."""
     n_kept: Int
-    """Number of episodes whose feedback is kept: all when ok; with `rollout_timeout` those before the first
-    unfinished one."""
+    """Number of episodes with feedback: all when ok; with `rollout_timeout` those before the first unfinished one."""
 
 
 class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):

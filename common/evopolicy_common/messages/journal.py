@@ -8,7 +8,7 @@ from evopolicy_common.messages.bounds import Int, Word
 
 
 class Committed(msgspec.Struct, frozen=True, kw_only=True):
-    """What the coordinator committed to before the run's agent started, and the journal entries that prove it. See
+    """What the coordinator committed to before the run's agent started, with its journal entries. See
     `records.journal`."""
 
     commitment: Word

@@ -34,8 +34,7 @@ for all or part of the run. waived: the operator vouched for where the agent was
 this was recorded."""
 
 HiddenCases = Literal["shared", "per_run"]
-"""Validation and held-out cases: the same for all runs of an environment, or separate for each run (no paired
-statistics)."""
+"""Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
 
 ELSEWHERE = "elsewhere"
 """Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
@@ -168,8 +167,7 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """None when nothing was audited and no forger is known."""
     hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: Many[Text] = ()
-    """`CLASS → CLASS: why` for each time an operator let the run continue with workers of other versions, oldest
-    first."""
+    """`CLASS → CLASS: why` for each time an operator let the run continue with other versions, oldest first."""
     reference_by_case: bool = False
     """The reference's random actions depend on split and case only; False for runs created by an earlier version."""
     committed: Committed | None = None
@@ -244,8 +242,7 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     sandbox_tier: Tier = "bwrap"
     limits: ResourceLimits = ResourceLimits()
     replays: Many[BlobRef] = ()
-    """A trajectory for each of `cases`, whose actions are played in place of a policy's; uploaded beforehand,
-    `bundle` None."""
+    """A trajectory for each of `cases`, whose actions replace a policy's; uploaded beforehand, `bundle` None."""
     as_in: PlayedAs | None = None
     """None for episodes that were not played in a run before."""
     step_limit: StepLimit = "natural"
@@ -319,14 +316,12 @@ class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
 
 
 class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
-    """The operator declares that a run's agent is no longer alive, which ends its permit. For machines lost for
-    good."""
+    """The operator declares a run's agent dead, which ends its permit. For machines that are lost for good."""
 
     token: Word
     run: Word
     boot_id: Word = ""
-    """Boot id of the kernel that it is gone from; empty: from every kernel. The run may continue elsewhere
-    meanwhile."""
+    """Boot id of the kernel that it is gone from; empty: from every kernel. The run may continue elsewhere."""
 
 
 class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
@@ -345,8 +340,7 @@ class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
     token: Word
     worker: Word
     state: Literal["active", "paused", "draining"]
-    """paused: the worker gets no more work and stays. draining: it gets no more work, and exits once its jobs are
-    done."""
+    """paused: it gets no more work and stays. draining: it gets no more work, and exits once its jobs are done."""
 
 
 class Done(Message, frozen=True, kw_only=True, tag="ok"):
@@ -354,8 +348,8 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
 
 
 class Claim(Message, frozen=True, kw_only=True, tag="claim"):
-    """One run of a sweep, claimed for this host to play: taken, renewed, released or settled, so that no run is
-    played twice."""
+    """One run of a sweep, for this host to play: taken, renewed, released or settled, so that no run is played
+    twice."""
 
     token: Word
     suite: Word

@@ -1,4 +1,4 @@
-"""Messages between workers and the coordinator. A worker sends requests and the coordinator replies; never the
+"""Messages between workers and the coordinator. Workers send requests and the coordinator replies; never the
 reverse."""
 
 from __future__ import annotations
@@ -106,8 +106,7 @@ class Registered(Message, frozen=True, kw_only=True, tag="registered"):
     """A lease without a heartbeat for this many seconds expires."""
     heartbeat_s: Number
     refused: Named[Text] = {}
-    """Run id to the reason why this worker gets no work of that run, such as versions other than the run started
-    with."""
+    """Run id to the reason why this worker gets no work of that run, such as versions that differ from the run's."""
     hidden_bar: Text = ""
     """Why this worker gets no hidden work of any run; empty when it gets some."""
     refused_environments: Named[Text] = {}
@@ -125,7 +124,7 @@ class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
     warm_bundles: Many[Text] = ()
     warm_environments: Many[Text] = ()
     serial: Int = 0
-    """The worker's own number of this poll; increases, also across its restarts. 0: the worker does not number its
+    """The worker's own number of this poll; increases, also across restarts. 0: the worker does not number its
     polls."""
 
 

@@ -1,5 +1,4 @@
-"""Remedies for this machine's distribution: its install command, and the kernel setting that forbids user
-namespaces."""
+"""Remedies for this machine's distribution: install commands, and the kernel setting that forbids user namespaces."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ _SETTINGS = (
         "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with `userns,`",
     ),
 )
-"""Files below `/proc/sys`, the value that forbids user namespaces, and the remedy (effective until reboot without a
-file in `/etc/sysctl.d`)."""
+"""Files below `/proc/sys`, the value that forbids user namespaces, and the remedy. Without a file in
+`/etc/sysctl.d`, it lasts until the next reboot."""
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 
 

@@ -39,8 +39,7 @@ _SOON_S = 60.0
 
 
 WORKERS_ENDED = "workers-ended"
-"""File in a kept state folder: all workers of its last command have ended, so the next coordinator expects none of
-them."""
+"""File in a kept state folder: all workers of its last command have ended; the next coordinator expects none."""
 
 
 class Workers(NamedTuple):
@@ -208,8 +207,7 @@ def _is_held(lock: Path) -> bool:
 
 
 async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:
-    """Waits for `work`; raises the local cluster's error if that comes first. `failed` None: the cluster is not
-    ours."""
+    """Waits for `work`; raises the local cluster's error if that is first. `failed` None: the cluster is not ours."""
     try:
         await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
         if failed is not None and failed.done() and not work.done():

@@ -15,8 +15,7 @@ AFTER_S = 3.0
 
 @contextlib.contextmanager
 def notify_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
-    """Warns that the command waits for `what` if the body takes longer than `after_s` seconds. Needs a running event
-    loop."""
+    """Warns that the command waits for `what` if the body takes longer than `after_s` seconds. Needs an event loop."""
     timer = asyncio.get_running_loop().call_later(after_s, lambda: log.warning(f"waiting for {what}"))
     try:
         yield

@@ -24,8 +24,7 @@ def ending_with_parent(program: Sequence[str], death_signal: signal.Signals = si
 
 
 def end_with_parent(death_signal: signal.Signals) -> None:
-    """Makes the kernel send this process `death_signal` when the thread that started it ends; it stays set after an
-    exec."""
+    """Makes the kernel send this process `death_signal` when the thread that started it ends, also after an exec."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, death_signal, 0, 0, 0)
 
 

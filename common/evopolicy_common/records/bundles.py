@@ -21,8 +21,7 @@ from evopolicy_common.records.blobs import digest_of
 
 MAX_FILES = 2000
 MAX_ENTRIES = 5000
-"""Most files and folders in a snapshot's folder, ignored ones included: countless empty folders would stall a
-snapshot."""
+"""Most files and folders in a snapshot's folder, ignored ones included: endless empty folders would stall it."""
 MAX_BYTES = 64 << 20
 """Sum of the files' sizes, bytes."""
 MAX_DEPTH = 16

@@ -47,7 +47,7 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     remaining_budget_after: int
     snapshot_size_bytes: int = 0
     snapshot_files: Any = ()
-    """Paths of the policy's files. Other software may have written this field or `import_scan`, so nothing relies on
+    """Paths of the policy's files. Nothing relies on this field or `import_scan`: other software may have written
     them."""
     import_scan: Any = None
     """An `ImportScan`."""
@@ -87,8 +87,7 @@ _old_metrics = msgspec.json.Decoder(_OldMetrics)
 
 
 def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None) -> CodeMetrics:
-    """Creates `folder` anew and returns the metrics written to it. `meta` describes the submit; its fields on files
-    are filled in here."""
+    """Creates `folder` anew and returns its metrics. `meta` describes the submit; its fields on files are set here."""
     if folder.exists():
         shutil.rmtree(folder)
     files = () if bundle is None else bundle.files

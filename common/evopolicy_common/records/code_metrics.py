@@ -45,8 +45,7 @@ class CodeMetrics(msgspec.Struct, frozen=True, kw_only=True):
     """Top-level names of absolute imports, sorted."""
     import_count: int
     cyclomatic_total: int
-    """Sum over all functions, nested ones counted in their parents too; for a file without functions, the module's
-    value."""
+    """Sum over all functions, nested ones counted in their parents too; without functions, the module's value."""
     cyclomatic_max: int
     parse_errors: tuple[str, ...]
     """Paths of the Python files that cannot be parsed."""

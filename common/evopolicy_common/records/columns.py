@@ -181,8 +181,7 @@ class Tuples(Column):
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of `Column.values()` with their paths: keys and positions joined by `/`; a single leaf has an empty
-    path."""
+    """The leaves of `Column.values()` by path: keys and positions joined by `/`; a single leaf has an empty path."""
     if isinstance(values, dict):
         for key, item in values.items():
             yield from leaves(item, f"{path}/{key}" if path else str(key))
@@ -276,8 +275,7 @@ def count_values(packed: bytes, most: int) -> int:
 
 
 _SIZES = [(0, 0)] * 256
-"""By a value's first byte: the number of bytes that follow it, and the width of a length field that counts further
-bytes."""
+"""By a value's first byte: the number of bytes after it, and the width of a length field that counts further ones."""
 for _head, _fixed in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
     _SIZES[_head] = _fixed, 0
 for _head, _fixed in zip(range(0xD4, 0xD9), (2, 3, 5, 9, 17), strict=True):

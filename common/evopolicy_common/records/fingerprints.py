@@ -15,8 +15,7 @@ _CODE = "evopolicy-worker"
 
 
 def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
-    """The relevant parts of the fingerprints of runs of one environment, in their order; runs with equal dicts are
-    comparable."""
+    """The relevant parts of fingerprints of runs of one environment, in order; runs with equal dicts are comparable."""
     told = [each for each in fingerprints if "adapter" in each]
     names = {name for each in told for name in each}
     definitions = {each.get("definition", "") for each in told}

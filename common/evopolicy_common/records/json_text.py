@@ -127,8 +127,8 @@ def rows_text(
         text = orjson.dumps(rows, option=orjson.OPT_SERIALIZE_NUMPY)
     except orjson.JSONEncodeError:
         text = b""
-    # A policy's text may look like the border of two rows; then there are more matches than borders. Likewise null may
-    # be text, or stand for NaN.
+    # Texts of a policy may contain the border of two rows: then there are more matches than borders. The same holds for
+    # null, which also stands for NaN.
     nulls = len(rows) if obs is None else 0
     if text and text.count(_BETWEEN) == len(rows) - 1 and text.count(b"null") == nulls:
         return text[1:-1].replace(_BETWEEN, b'}\n{"t":') + b"\n"

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from evopolicy_common.errors import ProtocolError
 
 LEVEL = 1
-"""zlib level. Level 1 reduces CarRacing's frames from 27,648 to 1,870 bytes; level 6 reaches 1,160 and takes 2.6
-times as long."""
+"""zlib level. 1 reduces CarRacing's frames from 27,648 to 1,870 bytes; 6 reaches 1,160 and takes 2.6 times as long."""
 MAX_BYTES = (1 << 32) - (1 << 20)
 """Limit of a member, unpacked, and of the file, bytes; readers need no ZIP64."""
 

@@ -233,8 +233,7 @@ class Container:
         self._files = dict(zip(self.header.files, parts[2:], strict=True))
 
     def files(self) -> dict[str, bytes]:
-        """The unpacked files by name. Raises ProtocolError when they are missing, too large, or not of the declared
-        size."""
+        """The unpacked files by name. Raises ProtocolError when they are missing, too large, or of another size."""
         if self.header.left_out or not self._files:
             raise ProtocolError(self.header.left_out or "a rendered episode without files")
         try:
@@ -326,8 +325,7 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
 
 
 def is_picture(shape: tuple[int, ...], dtype: str) -> bool:
-    """Whether arrays of this shape and dtype are pictures: uint8 of height × width, optionally stacked, with
-    channels, or both."""
+    """Whether such arrays are pictures: uint8 of height × width, optionally stacked, with channels, or both."""
     if dtype != "uint8" or not 2 <= len(shape) <= 4:
         return False
     channels = len(shape) > 2 and shape[-1] < MIN_PICTURE_SIDE

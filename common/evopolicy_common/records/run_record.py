@@ -23,8 +23,7 @@ from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation, Run
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 RECORD_VERSION = 2
-"""Version of our own fields. Incremented only when an older reader would misunderstand a file; adding fields does
-not need it."""
+"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
@@ -78,8 +77,8 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     video: VideoOption = "off"
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
-    """Whether the agent's rules allow it to simulate the environment. Runs from before this was recorded had no rule
-    against it."""
+    """Whether the agent's rules allow it to simulate the environment. Runs without this field had no rule against
+    it."""
     finish: FinishRule = "early"
     """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
     step_limit: StepLimit = "natural"
@@ -88,8 +87,7 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     profile: Profile = "own"
     """`published`: all choices of the published protocol together, including its public case files."""
     hidden_cases: HiddenCases = "shared"
-    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run`, which allows no paired
-    statistics."""
+    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run` (no paired statistics)."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -162,8 +160,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """`ok` checkpoints that made their slot fail in hidden evaluation: not eligible."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
-    """Why no more submits were accepted: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
-    `cancelled`."""
+    """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}
@@ -181,8 +178,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def agent_never_played(self) -> bool:
-        """Whether the agent failed before it used any budget, such as a CLI that did not start: this is no run of
-        that agent."""
+        """Whether the agent failed before it used any budget, such as a CLI that did not start: no run of that
+        agent."""
         return (
             self.status == "no_ok_submit" and self.closed_reason == "agent_failed" and self.budget_used == 0
         )
@@ -248,8 +245,7 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: dict[str, str] = {}
     """Library to version, as reported by the workers with which the run started."""
     fingerprint_overrides: tuple[str, ...] = ()
-    """`CLASS → CLASS: why` for each time an operator let the run continue with workers of other versions; empty when
-    one class played all of it."""
+    """`CLASS → CLASS: why` for each time an operator let the run continue with other versions; empty with one class."""
     data_secret: bool = True
     """False when the splits derive from a small public seed."""
     initial_policy_hash: str | None = None
@@ -320,8 +316,7 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 
 def decode_run_record(data: bytes) -> RunRecord:
-    """The record in `data`. Raises ProtocolError when this version cannot read it, such as a file of the published
-    software."""
+    """The record in `data`. Raises ProtocolError when this version cannot read it, such as the published software's."""
     try:
         header = _headers.decode(data)
         if header.schema_version == 1:
@@ -346,8 +341,7 @@ def sha256_text(digest: str) -> str:
 
 
 def upgraded(old: dict[str, Any]) -> dict[str, Any]:
-    """Converts the fields of a version 1 `run.json` to this version. Raises AttributeError, TypeError or ValueError
-    when it is none."""
+    """Converts a version 1 `run.json` to this version. Raises AttributeError, TypeError or ValueError if it is none."""
     timing, artifacts, versions = (dict(old.get(name) or {}) for name in ("timing", "artifacts", "versions"))
     outcome = dict(old.get("outcome") or {})
     if outcome.get("status") == "no_ok_submit":

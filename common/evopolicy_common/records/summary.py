@@ -84,6 +84,5 @@ def decode_summary(data: bytes) -> Summary:
 
 
 def utc_text(unix_s: float) -> str:
-    """`unix_s` (seconds since 1970, UTC) as `2026-01-31T12:00:00.123456Z`; always with microseconds, so that texts
-    sort."""
+    """`unix_s` (seconds since 1970, UTC) as `2026-01-31T12:00:00.123456Z`; always microseconds, so that texts sort."""
     return datetime.fromtimestamp(unix_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

@@ -24,8 +24,7 @@ WIRE_VERSION = 1
 """Incremented when older peers would not understand a change; the first message of a session carries it."""
 
 CHUNK_BYTES = 256 * 1024
-"""Payload of one blob chunk, bytes: as large as a page of results, so that a chunk occupies its lane no longer than
-a page."""
+"""Payload of one blob chunk, bytes: as large as a page of results, so that it occupies its lane no longer."""
 
 INLINE_BYTES = 24 * 1024
 """A blob up to this many bytes is sent inside the message that refers to it."""
@@ -55,8 +54,7 @@ T = TypeVar("T")
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of `message`. Raises ProtocolError when its peer would refuse them, or the transport would drop
-    them."""
+    """The bytes of `message`. Raises ProtocolError when its peer would refuse them, or the transport drop them."""
     try:
         data = _encoder.encode(message)
         _decoder_of(type(message)).decode(data)

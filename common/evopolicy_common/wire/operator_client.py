@@ -125,8 +125,7 @@ class OperatorClient:
     # Publication.
 
     async def disclose(self, runs: tuple[str, ...]) -> None:
-        """Makes the cases of finished runs public. Raises RefusedError while any run with cases of the same secret
-        is open."""
+        """Makes the cases of finished runs public. Raises RefusedError while any run with the same secret is open."""
         await self._done("disclose", Disclose(token=self._token, runs=runs))
 
     async def journal(self) -> list[bytes]:

@@ -45,8 +45,7 @@ class Requester(Generic[Reply]):
     def __init__(
         self, link: Link, key_of: Callable[[str], str], replies: msgspec.msgpack.Decoder[Reply]
     ) -> None:
-        """`key_of` maps a verb (`lease`, `submit`) to the full key; `replies` decodes the replies to this kind of
-        client."""
+        """`key_of` maps a verb (`lease`, `submit`) to the full key; `replies` decodes this kind of client's replies."""
         self._link = link
         self._key_of = key_of
         self._replies = replies
@@ -70,8 +69,7 @@ class Requester(Generic[Reply]):
         wait_s: float = 0.0,
         timeout_s: float | None = None,
     ) -> Wanted:
-        """As `once`, repeated until a reply comes. Raises TransportError after `timeout_s` seconds without one
-        (None: never)."""
+        """As `once`, repeated until a reply comes. Raises TransportError after `timeout_s` seconds (None: never)."""
         pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
         started = time.monotonic()
         while True:

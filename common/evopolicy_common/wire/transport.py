@@ -235,8 +235,7 @@ async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -
 async def serve(
     config: zenoh.Config, on_queries: Callable[[list[IncomingQuery]], None]
 ) -> AsyncIterator[Server]:
-    """A listening session with a configuration of `server_config`, open inside the `async with`; `declare` what it
-    serves."""
+    """A listening session for a `server_config`, open inside the `async with`; `declare` its key expressions."""
     try:
         session = await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
@@ -249,8 +248,7 @@ async def serve(
 
 
 def client_config(credentials: Credentials) -> zenoh.Config:
-    """The configuration of a worker's, gateway's or operator's session. Raises ConfigError as `check_endpoints`
-    does."""
+    """The configuration of a worker's, gateway's or operator's session. Raises ConfigError like `check_endpoints`."""
     check_endpoints(credentials)
     return _config(
         {

@@ -138,8 +138,7 @@ class Agent:
 
 
 def main() -> int:
-    """Runs the agent in the current folder. Returns 0 when the budget is spent, 1 when the gateway could not be
-    used."""
+    """Runs the agent in the current folder. Returns 0 when the budget is spent, 1 when the gateway is unusable."""
     try:
         Agent(Client.from_environment(), Path.cwd()).run()
     except KeyError as missing:

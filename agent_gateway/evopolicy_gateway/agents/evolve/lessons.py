@@ -1,5 +1,4 @@
-"""Learns from trajectories more than returns: families of controllers that need a model of the environment's
-reactions."""
+"""Learns from trajectories more than returns: families of controllers that need a model of the environment."""
 
 from __future__ import annotations
 
@@ -28,8 +27,7 @@ class Lessons:
         return self._wants_plant or self._wants_views
 
     def learn(self, episodes: list[list[Step]]) -> list[Family]:
-        """Families that these trajectories, with the earlier ones, make possible; a known family may have newer
-        settings."""
+        """Families that these and the earlier trajectories make possible; a known family may have newer settings."""
         families: list[Family] = []
         if self._wants_plant:
             plant = find_plant(*self._spaces, episodes)

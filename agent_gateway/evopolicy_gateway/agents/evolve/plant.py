@@ -24,8 +24,7 @@ REACTION_STEPS = 2
 
 
 def find_plant(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> dict[str, Any] | None:
-    """Settings for the `pusher` and `carrier` controllers; None if the spaces or the trajectories do not determine
-    them."""
+    """Settings for the `pusher` and `carrier` controllers; None if spaces or trajectories do not determine them."""
     if not goal_keys(obs_space) or action_space["type"] != "Box":
         return None
     n_axes = math.prod(obs_space["spaces"]["desired_goal"]["shape"])
@@ -78,8 +77,8 @@ def _correlations(displacement: Rows, actions: Rows) -> Rows:
 
 
 def _lift_axis(achieved: Rows, step: float) -> int:
-    """The axis along which the disturbed thing moved least, as it rests on something. The last axis if it did not
-    move."""
+    """The axis along which the disturbed thing moved least, as it rests on something. If it did not move, the last
+    axis."""
     moved = np.ptp(achieved, axis=0)
     return int(np.argmin(moved)) if moved.max() > max(step / 2, 3 * moved.min()) else N_AXES - 1
 

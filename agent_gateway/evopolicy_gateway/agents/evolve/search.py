@@ -29,8 +29,7 @@ FIRST_STRENGTH, STRENGTH_DECAY = 0.8, 0.7
 SPARSE_SHARE = 0.6
 """Returns are sparse when more than this share of them is equal."""
 NOISY_RATIO, VERY_NOISY_RATIO = 0.5, 1.2
-"""Ratios of the noise variance to that of candidate effects above which a candidate plays two and four cases per
-round."""
+"""Ratios of noise variance to that of candidate effects above which a candidate plays two and four cases per round."""
 TIED_SHARE = 0.15
 """Share of a round with the best return above which one case counts as too easy."""
 NOVELTY_BONUS = 0.3
@@ -191,8 +190,7 @@ class Search:
         return sorted(tried, key=lambda c: worth[id(c)], reverse=True)
 
     def worth(self) -> dict[int, float]:
-        """By `id` of each evaluated candidate: its effect, shrunk towards its family's mean while it has few
-        episodes."""
+        """By `id` of each evaluated candidate: its effect, shrunk towards its family's mean if it has few episodes."""
         tried = [c for c in self.candidates if c.episodes]
         if not tried:
             return {}
@@ -207,8 +205,7 @@ class Search:
 
     @property
     def repeats(self) -> int:
-        """Number of cases that each candidate of the next round should play: more if one case does not distinguish
-        them."""
+        """Number of cases that each candidate of the next round should play: more if one does not distinguish them."""
         tried = [c for c in self.candidates if c.episodes]
         if not tried or self.is_flat:
             return 1
@@ -224,8 +221,8 @@ class Search:
         return 4 if ratio > VERY_NOISY_RATIO else 2 if tied or ratio > NOISY_RATIO else 1
 
     def _effects(self, tried: list[Candidate]) -> tuple[Vector, float]:
-        """Effects of `tried`, and the ratio of one episode's noise variance to the variance of the better half's
-        effects, ≤ 2."""
+        """Effects of `tried`, and the noise variance of one episode over the variance of the better half's effects,
+        ≤ 2."""
         effects, noise = _fit(self._scores(tried))
         better = np.sort(effects)[len(effects) // 2 :]
         return effects, min(noise**2 / max(float(np.var(better)), 1e-12), 2.0)
@@ -274,8 +271,7 @@ class Search:
         return kept + [c for c in ranked if c not in kept][: n - len(kept)]
 
     def _mutant(self, parents: list[Candidate], strength: float) -> Candidate:
-        """Mutates a parent, drawn with preference for better ones: a random step, half the time after a step towards
-        a relative."""
+        """Mutates a parent, preferring better ones: a random step, half the time after a step towards a relative."""
         able = [p for p in parents if p.family.scale.any()]
         if not able:
             return self._draw(parents)
@@ -314,8 +310,7 @@ class Search:
 
 
 def _distinct(kept: list[Candidate], ranked: list[Candidate]) -> list[Candidate]:
-    """`ranked` without candidates whose returns equal those of a kept or better one on all shared cases: the same
-    behaviour."""
+    """`ranked` without candidates whose returns equal those of a kept or better one on all shared cases."""
     seen = list(kept)
     distinct: list[Candidate] = []
     for candidate in ranked:

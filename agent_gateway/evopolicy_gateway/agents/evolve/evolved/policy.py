@@ -18,8 +18,7 @@ CANDIDATES_FILE = "candidates.json"
 
 
 class Policy:
-    """The interface of a run's policies: `__init__(obs_space, action_space, env_meta)`, `reset(episode_index)`,
-    `act(obs)`."""
+    """The interface of policies: `__init__(obs_space, action_space, env_meta)`, `reset(episode_index)`, `act(obs)`."""
 
     def __init__(
         self, obs_space: dict[str, Any], action_space: dict[str, Any], env_meta: dict[str, Any]
