@@ -282,7 +282,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     agent: Agent
     sandbox_tier: Tier
     jail: str
-    """How the agent was confined: `bwrap` or `none`; `bwrap+open-network` on request."""
+    """How the agent was confined: `bwrap`, `bwrap, open network` or `none`."""
     hidden_isolation: HiddenIsolation = "unknown"
     """Whether hidden episodes and agents could share a kernel. `exclusive`: never. `shared`: possible. `waived`: the
     operator vouched for where the agent was. `unknown`: the run is from before this was recorded."""
