@@ -1,1 +1,1 @@
-"""The worker: leases episode jobs and plays them, the environment here, the policy locked in a sandbox."""
+"""The worker: leases jobs and plays their episodes, with each environment in a jail and each policy in a sandbox."""

@@ -1,4 +1,4 @@
-"""Unpacked bundles by digest, kept for the episodes to come."""
+"""A cache of unpacked bundles by digest."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from evopolicy_common.records import bundles
 
 
 class BundleCache:
-    """A folder of unpacked bundles, least recently used first to go; a bundle in use is never removed."""
+    """A folder of unpacked bundles. Evicts the least recently used; a bundle in use is never removed."""
 
     def __init__(self, root: Path, fetch: Callable[[str], Awaitable[bytes]], limit: int = 64) -> None:
-        """`fetch` brings a bundle's packed bytes by digest; `limit` is how many are kept."""
+        """`fetch` returns a bundle's packed bytes by digest; `limit` is the number of bundles kept."""
         self._root = root
         self._fetch = fetch
         self._limit = limit
@@ -25,12 +25,12 @@ class BundleCache:
 
     @property
     def warm(self) -> tuple[str, ...]:
-        """Digests of the bundles that are here, most recently used last."""
+        """Digests of the cached bundles, most recently used last."""
         return tuple(digest for digest, task in self._ready.items() if task.done())
 
     @contextlib.asynccontextmanager
     async def use(self, digest: str) -> AsyncIterator[Path]:
-        """The bundle's folder, which stays while the `async with` lasts. Raises what fetching or unpacking raises."""
+        """The bundle's folder, kept for the duration of the `async with`. Raises the errors of fetching and unpacking."""
         task = self._ready.get(digest)
         if task is None:
             task = self._ready[digest] = asyncio.create_task(self._bring(digest))
@@ -38,7 +38,7 @@ class BundleCache:
         self._users[digest] = self._users.get(digest, 0) + 1
         try:
             try:
-                # Shielded: another job of the same bundle may wait for the same fetch.
+                # Shielded: another job with the same bundle may wait for the same fetch.
                 folder = await asyncio.shield(task)
             except asyncio.CancelledError:
                 raise

@@ -1,4 +1,4 @@
-"""What a worker's numbers depend on, read without importing a simulator."""
+"""The worker's fingerprint: what its results depend on. Computed without importing a simulator."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ PACKAGES = (
     "pygame-ce",
     "pandas",
 )
-"""Distributions that Core16's environments are made of; those that decide an environment's numbers its description names."""
+"""Distributions that Core16's environments are made of. An environment's description names those that decide its results."""
 
 
 def fingerprint() -> Fingerprint:
-    """This worker's fingerprint; a package that is not installed is left out."""
+    """This worker's fingerprint. Packages that are not installed are left out."""
     return Fingerprint(
         code_version=f"{evopolicy_common.__version__}+{_source_digest()[:12]}",
         python=platform.python_version(),
@@ -48,7 +48,7 @@ def _source_digest() -> str:
 
 
 def _simd_features() -> str:
-    """The instruction sets that numpy dispatches on here: numerical libraries choose their code by them."""
+    """The instruction sets that numpy dispatches on here. Numerical libraries select their code by them."""
     found = np.show_config(mode="dicts")
     simd = found.get("SIMD Extensions", {}) if isinstance(found, dict) else {}
     return "+".join([*simd.get("baseline", []), *simd.get("found", [])])

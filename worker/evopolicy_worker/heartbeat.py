@@ -1,4 +1,4 @@
-"""The heartbeat, from a thread of its own: a busy event loop must not lose its leases."""
+"""The heartbeat, sent from its own thread so that a busy event loop does not lose its leases."""
 
 from __future__ import annotations
 
@@ -18,54 +18,56 @@ from evopolicy_common.wire.transport import Link
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 ANSWERED_PAUSE_S = 0.02
-"""Least time between beats: what was told to stop is named until it is reported, and told again."""
+"""Minimum time between heartbeats. The coordinator repeats a cancellation, without delay, in each reply until the job is
+reported."""
 FAILED_PAUSE_S = 0.25
 
 
 class HeldLeases:
-    """The leases this worker holds, shared between the event loop, which changes them, and the heartbeat."""
+    """The leases that this worker holds. The event loop changes them, and the heartbeat thread reads them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._held: dict[str, HeldLease] = {}
+        # Larger than any number of an earlier process of this worker.
         self._settled = time.time_ns() // 1_000_000
 
     def put(self, lease: HeldLease) -> None:
-        """Tell of a lease from the next beat on, or tell how it stands now."""
+        """Adds a lease, or updates its progress; reported from the next heartbeat on."""
         with self._lock:
             self._held[lease.lease_id] = lease
 
     def drop(self, lease_id: str) -> None:
-        """Tell of it no more."""
+        """Removes a lease from the heartbeats."""
         with self._lock:
             self._held.pop(lease_id, None)
 
     def settle(self, serial: int) -> None:
-        """The poll of that number, and all before it, are over: what they brought was put here."""
+        """Marks the poll with this number and all before it as finished: their leases have been put here."""
         with self._lock:
             self._settled = serial
 
     @property
     def settled(self) -> int:
-        """Number of the last poll that is over; larger than any of an earlier process of this worker."""
+        """Number of the last finished poll."""
         with self._lock:
             return self._settled
 
     def snapshot(self) -> tuple[tuple[HeldLease, ...], int]:
-        """What the next beat tells: the leases, and which polls' leases are among them."""
+        """Content of the next heartbeat: the leases, and the number of the last poll whose leases they include."""
         with self._lock:
             return tuple(self._held.values()), self._settled
 
 
 def clock() -> float:
-    """Seconds that go on while the machine sleeps, where the system has such a clock."""
+    """Monotonic seconds, including the time the machine sleeps where the system has such a clock."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class HeartbeatThread:
-    """Sends what is held every `every_s` seconds and hands the answers to the event loop.
+    """Sends the held leases every `every_s` seconds and passes the replies to the event loop.
 
-    One beat is always waiting at the coordinator, so that a lease to stop is told at once.
+    One heartbeat always waits at the coordinator, so that a cancellation arrives without delay.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class HeartbeatThread:
         on_reply: Callable[[HeartbeatReply | Refused], None],
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """Both are called on the event loop that makes this object; `on_failure` when no more beats can be sent."""
+        """Both callbacks run on the event loop that creates this object; `on_failure` when no further heartbeat can be sent."""
         self._link = link
         self._key = keys.worker_key(cluster, "beat")
         self._worker = worker
@@ -92,25 +94,25 @@ class HeartbeatThread:
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self, session: str, every_s: float) -> None:
-        """Begins, or goes on with a new session after a new registration."""
+        """Starts the thread, or switches it to a new session after a new registration."""
         self._session, self._every_s = session, every_s
         if not self._thread.is_alive():
             self._thread.start()
 
     @property
     def silent_s(self) -> float:
-        """Seconds since the last beat that was answered was sent."""
+        """Seconds since the last answered heartbeat was sent."""
         return clock() - self._answered_at
 
     def stop(self) -> None:
-        """Send no more; the beat that waits is not waited for."""
+        """Stops sending. Does not wait for the reply to the pending heartbeat."""
         self._stop.set()
 
     def _run(self) -> None:
         try:
             self._beat_until_stopped()
         except Exception as error:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the worker is on its way out
+            with contextlib.suppress(RuntimeError):  # the loop is closed: the worker is exiting
                 self._loop.call_soon_threadsafe(self._on_failure, error)
 
     def _beat_until_stopped(self) -> None:
@@ -126,7 +128,7 @@ class HeartbeatThread:
             reply = self._beat()
             if isinstance(reply, HeartbeatReply):
                 self._answered_at = sent_at
-                # The answer was held back for as long as there was nothing to stop: the next beat goes at once.
+                # The coordinator delays a reply without cancellations, so the next heartbeat can be sent at once.
                 pause = ANSWERED_PAUSE_S if reply.cancelled else 0.0
             else:
                 pause = FAILED_PAUSE_S
@@ -135,11 +137,11 @@ class HeartbeatThread:
             if reply is not None:
                 try:
                     self._loop.call_soon_threadsafe(self._on_reply, reply)
-                except RuntimeError:  # the loop is closed: the worker is on its way out
+                except RuntimeError:  # the loop is closed: the worker is exiting
                     return
 
     def _beat(self) -> HeartbeatReply | Refused | None:
-        """One beat; None when it was not answered."""
+        """Sends one heartbeat; None when it was not answered."""
         wait_s = self._every_s
         held, settled = self._held.snapshot()
         message = Heartbeat(

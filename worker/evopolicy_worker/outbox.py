@@ -1,12 +1,12 @@
-"""Results on their way to the coordinator.
+"""The queue of results that are to be reported to the coordinator.
 
 Rules:
-- A result leaves the outbox when the coordinator answered that it is durable, or has refused it for good. Sending it
-  twice is safe.
-- What is large goes first, as blobs, and its bytes are kept until the result is answered: a coordinator that was
-  restored from a backup has lost what it had, says so, and gets them again.
-- A result that is refused for good is reported as failed, with the reason; when that is refused too, it is dropped, and
-  the coordinator gives the job to another worker. Neither holds up the results behind it.
+- A result leaves the outbox when the coordinator acknowledges it as durable or refuses it for good. Sending it twice is
+  safe.
+- Large parts are uploaded first, as blobs, and their bytes are kept until the result is acknowledged: a coordinator
+  restored from a backup may have lost them. It then refuses the result as missing a blob, and they are uploaded again.
+- A result that is refused for good is reported as failed, with the reason. If that report is refused too, it is dropped, and
+  the coordinator gives the job to another worker. Neither blocks the results behind it.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from evopolicy_common.wire.requests import Requester
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_RESULTS = 256
-"""Results that wait before the slots stop taking jobs: a coordinator that is away must not fill memory."""
+"""Waiting results at which the worker stops leasing jobs, so that memory stays bounded while the coordinator is unreachable."""
 MAX_BYTES = 512 << 20
-"""The same for what they hold, in bytes."""
+"""The same limit for their total size, in bytes."""
 MAX_HAND_IN = 64
 MAX_HAND_IN_BYTES = 4 << 20
-"""A message with more than one result is no larger."""
+"""Maximum size of a message with more than one result, in bytes."""
 MAX_RESULT_BYTES = 1 << 20
-"""Episodes that take more, without their large blobs, go as a blob themselves."""
+"""A result that is larger than this without its large blobs sends its episodes as one blob."""
 MANY_EPISODES = 300
-"""Of a job with more, recordings of more than 1 KiB go as blobs too, so that its outcomes fit into one."""
+"""In jobs with more episodes, recordings over 1 KiB are uploaded as blobs too, so that all outcomes fit into one blob."""
 MAX_LOST = 5
-"""So often the coordinator may lose what was uploaded for one result before that counts as a refusal."""
+"""How often the coordinator may lose the blobs of one result before that counts as a refusal."""
 UNPACK_S = 30.0
-"""What the coordinator may take to read outcomes from a blob before it is asked again."""
+"""How long the coordinator may take to read outcomes from a blob before the report is sent again."""
 PAUSE_S = 1.0
 
 
 class Outbox:
-    """Takes results at any time and hands them in, oldest first. Used by one asyncio loop."""
+    """Accepts results at any time and reports them, oldest first. Used by one asyncio loop."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Outbox:
         register_again: Callable[[str], Awaitable[None]],
         on_settled: Callable[[JobResult], None],
     ) -> None:
-        """`register_again` is told the session that the coordinator did not know; `on_settled` each result that left."""
+        """`register_again` receives the session that the coordinator did not know, `on_settled` each result that left."""
         self._ask = ask
         self._worker = worker
         self._session = session
@@ -69,29 +69,29 @@ class Outbox:
         self._emptied = asyncio.Event()
         self._emptied.set()
         self._uploaded: set[str] = set()
-        """Blobs of waiting results that the coordinator has."""
+        """Digests of waiting results' blobs that are uploaded."""
         self._n_lost = 0
         self._one_by_one = 0
-        """So many results are reported alone, since one of them was refused."""
+        """How many results are still to be reported one by one, because a batch with them was refused."""
 
     @property
     def full(self) -> bool:
-        """Whether no more work should be taken on."""
+        """Whether the worker should stop leasing jobs."""
         return len(self._results) >= MAX_RESULTS or self._n_bytes >= MAX_BYTES
 
     def put(self, result: JobResult) -> None:
-        """Hand it in as soon as those before it are answered."""
+        """Queues a result; it is reported after those before it."""
         self._results.append(result)
         self._n_bytes += _n_bytes(result)
         self._filled.set()
         self._emptied.clear()
 
     async def wait_empty(self) -> None:
-        """Returns when everything was reported."""
+        """Returns when all results have left."""
         await self._emptied.wait()
 
     async def run(self) -> None:
-        """Hands in for as long as it is not cancelled."""
+        """Reports results until cancelled."""
         while True:
             while not self._results:
                 self._emptied.set()
@@ -114,7 +114,7 @@ class Outbox:
                     self._settle()
 
     async def _batch(self) -> list[JobResult]:
-        """The oldest results as they can be sent, their large parts uploaded; of several, no more than fit together."""
+        """The oldest results that fit into one message, ready to send; their large parts are uploaded."""
         batch: list[JobResult] = []
         size = 0
         for result in list(self._results)[: 1 if self._one_by_one else MAX_HAND_IN]:
@@ -123,7 +123,7 @@ class Outbox:
             except (RefusedError, ProtocolError):
                 if not batch:
                     raise
-                # Told when it is the first.
+                # The error is handled once this result is the oldest.
                 break
             if batch and size + weight > MAX_HAND_IN_BYTES:
                 break
@@ -132,7 +132,7 @@ class Outbox:
         return batch
 
     async def _portable(self, result: JobResult) -> tuple[JobResult, int]:
-        """The result with its large parts by digest, and its size in bytes."""
+        """The result with its large parts replaced by digests, and its encoded size in bytes."""
         most = codec.INLINE_BYTES if len(result.episodes) <= MANY_EPISODES else 1024
         outcomes = [
             msgspec.structs.replace(
@@ -152,7 +152,7 @@ class Outbox:
         return msgspec.structs.replace(ready, episodes=(), packed=packed), 1000
 
     async def _by_digest(self, blob: BlobRef | None, most: int) -> BlobRef | None:
-        """The blob as it is named in a message, its bytes uploaded if there are more than `most`."""
+        """The blob as a message refers to it; uploads it and drops its bytes when it is larger than `most` bytes."""
         if blob is None or blob.inline is None or blob.size <= most:
             return blob
         if blob.digest not in self._uploaded:
@@ -176,7 +176,8 @@ class Outbox:
         await asyncio.sleep(PAUSE_S)
 
     def _refused_for_good(self, why: str, n: int) -> None:
-        """Finds out which of `n` results it is; that one is reported as failed, or dropped when it is already."""
+        """Handles a refusal of the oldest `n` results. Several are sent again one by one; a single one is reported as failed, or
+        dropped when it was such a report."""
         if n > 1:
             self._one_by_one = n
             return
@@ -198,7 +199,7 @@ class Outbox:
             self._one_by_one += 1
 
     def _settle(self, *, told: bool = True) -> None:
-        """The oldest result has left."""
+        """Removes the oldest result; `told`: whether to call `on_settled`."""
         result = self._results.popleft()
         self._n_bytes -= _n_bytes(result)
         self._n_lost = 0
@@ -210,7 +211,7 @@ class Outbox:
 
 
 def _n_bytes(result: JobResult) -> int:
-    """Bytes of what is bulky in it."""
+    """Approximate size of a result in bytes: its bulky parts, and 1000 for the rest."""
     begun = 0 if result.begun is None else result.begun.size
     return (
         1000

@@ -1,15 +1,15 @@
-"""The worker's supervisor: registers, leases jobs, gives them to its slots, reports what came of them.
+"""The worker's supervisor: registers, leases jobs, passes them to its slots, and reports the results.
 
 Rules:
-- A lease is held from the moment it arrives until its result was answered; every heartbeat lists what is held, so that a
-  restarted coordinator adopts it again.
-- A result leaves the outbox only when the coordinator answered that it is durable; sending it twice is safe.
-- What is leased with `stop_in_silence` is stopped when no heartbeat was answered for the leases' time to live: from some
-  time after that the coordinator may let an agent onto this kernel.
-- What is given back unfinished takes with it what its policy has returned: the next attempt goes on from there.
-- A slot that is ended from outside takes its own job with it and nothing else, and that is played again. What a policy can do to
-  its slot is an outcome of its job (`endings`).
-- On SIGTERM nothing new is asked for, what waits is given back, what runs may finish within the grace time.
+- A lease is held from its arrival until its result is acknowledged. Every heartbeat lists all held leases, so that a restarted
+  coordinator can adopt them.
+- A result stays in the outbox until the coordinator acknowledges it as durable (`outbox`). Sending it twice is safe.
+- Jobs leased with `stop_in_silence` are stopped once no heartbeat has been answered for the lease TTL. Some time later the
+  coordinator may let an agent onto this kernel.
+- A job that is returned unfinished includes what its policy has returned so far. The next attempt resumes from there.
+- A slot that is killed from outside loses only its current job, which is played again. Anything that a policy can do to its slot
+  is an outcome of its job (`endings`).
+- On SIGTERM the worker stops requesting leases and returns waiting jobs. Running jobs may finish within the grace time.
 """
 
 from __future__ import annotations
@@ -63,15 +63,15 @@ LEASE_POLL_S = 10.0
 RESTART_PAUSE_S = 1.0
 LONGEST_RESTART_PAUSE_S = 30.0
 CANCEL_TIMEOUT_S = 2.0
-"""What a slot gets to stop its job, before the worker goes without it."""
+"""How long the worker waits, when it exits, for slots to stop their cancelled jobs."""
 WITHDRAW_TIMEOUT_S = 1.0
 SILENCE_LOOK_S = 0.5
 MAX_PREPARED = 4
-"""A worker that offers so many environments has its slots import all of their simulators before there is work."""
+"""A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
 
 
 class SlotLike(Protocol):
-    """What the supervisor needs of a slot; `slot.Slot` is the one there is."""
+    """The slot interface that the supervisor uses, implemented by `slot.Slot`."""
 
     @property
     def begun(self) -> HandedBack | None: ...
@@ -90,7 +90,7 @@ class SlotLike(Protocol):
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker is started with."""
+    """A worker's start options."""
 
     name: str
     slots: int
@@ -99,15 +99,15 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: Fingerprint
     host: str
     boot_id: str = ""
-    """Of this kernel; empty: unknown, and no hidden episodes are leased to this worker."""
+    """Boot id of this kernel. Empty: unknown; this worker gets no hidden episodes."""
     machine_id: str = ""
     scratch: Path
     grace_s: float = 10.0
-    """How long running episodes may go on after SIGTERM."""
+    """How long running episodes may continue after SIGTERM."""
 
 
 class Supervisor:
-    """One worker's life: `run()` until `drain()`."""
+    """One worker: `run()` works until `drain()` is called."""
 
     def __init__(self, link: Link, options: Options, make_slot: Callable[[int, Tier], SlotLike]) -> None:
         self._link = link
@@ -139,7 +139,7 @@ class Supervisor:
         self._session = ""
         self._lease_ttl_s = 0.0
         self._leased: dict[str, Lease] = {}
-        """What runs here."""
+        """Leases of running jobs, by lease id."""
         self._registering = asyncio.Lock()
         self._draining = asyncio.Event()
         self._warm_environments: OrderedDict[str, None] = OrderedDict()
@@ -148,12 +148,12 @@ class Supervisor:
     async def run(self) -> None:
         """Works until drained.
 
-        Raises RefusedError when the coordinator will not have this worker, PartFailedError when a part of it cannot go on: a
-        worker that beats no more, or hands nothing in, only holds up what others could play.
+        Raises RefusedError when the coordinator refuses this worker, and PartFailedError when the heartbeat or the reporting of
+        results fails: without either, the worker would only hold jobs that others could play.
         """
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
-        # The result report task outlives the others: what was played is reported before the worker goes.
+        # The reporting task outlives the others, so that finished results are reported before the worker exits.
         report_results = asyncio.create_task(self._outbox.run())
         report_results.add_done_callback(self._report_ended)
         working = asyncio.create_task(self._work_and_report())
@@ -185,7 +185,7 @@ class Supervisor:
             self._failed.set_exception(PartFailedError(f"{part} failed: {type(error).__name__}: {error}"))
 
     async def _work(self) -> None:
-        """Leases and plays until drained; what runs here is worth nothing any more once the coordinator refuses us."""
+        """Leases and plays until drained. A refusal by the coordinator stops all running jobs, as their results are worthless."""
         refused: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as group:
@@ -202,7 +202,7 @@ class Supervisor:
             raise refused
 
     def drain(self) -> None:
-        """Asks for nothing more and ends `run` when what runs is done or the grace time is over."""
+        """Stops requesting leases; `run` returns when the running jobs are done or the grace time is over."""
         self._draining.set()
         self._work_arrived.set()
         self._capacity_freed.set()
@@ -253,7 +253,7 @@ class Supervisor:
             self.drain()
 
     def _cancel(self, lease_id: str) -> None:
-        """Stops what a lease was for that is this worker's no more."""
+        """Returns the waiting job, or stops the running one, of a lease that this worker no longer holds."""
         if lease_id in self._queue:
             log.info("lease is gone", lease=lease_id, was="waiting")
             lease = self._queue.pop(lease_id)
@@ -269,8 +269,8 @@ class Supervisor:
     # Leasing.
 
     async def _lease_loop(self) -> None:
-        """Keeps a poll waiting at the coordinator, but for the time that what was leased ahead lasts by half: so the
-        slots never wait for a round trip, and short episodes still come in batches."""
+        """Keeps a poll waiting at the coordinator while no more than half of the jobs leased ahead are left. So slots never wait
+        for a round trip, and short episodes still arrive in batches."""
         depth = 0
         while not self._draining.is_set():
             self._capacity_freed.clear()
@@ -335,9 +335,9 @@ class Supervisor:
                 await _close_slot(slot)
 
     async def _prepared(self, index: int) -> SlotLike | None:
-        """A slot of the safest tier with its simulators imported, before there is work: the first submit waits for neither.
+        """Starts a slot of the safest tier and imports its simulators before work arrives, so that the first submit need not wait.
 
-        None where that fails, which the first lease meets again and reports, or when the worker is drained meanwhile.
+        None when that fails (the first lease hits the same failure and reports it), or when the worker is drained meanwhile.
         """
         offered = [each.env for each in self._options.environments]
         slot = self._make_slot(index, self._options.tiers[0])
@@ -368,7 +368,7 @@ class Supervisor:
             await self._work_arrived.wait()
 
     async def _start_slot(self, index: int, lease: Lease) -> SlotLike | None:
-        """A slot for the lease's tier; None, with the lease handed back as failed, when it does not start."""
+        """A slot for the lease's tier. None when it does not start; the lease is then reported as failed."""
         slot = self._make_slot(index, lease.job.tier)
         try:
             await slot.start()
@@ -380,7 +380,7 @@ class Supervisor:
         return slot
 
     async def _play(self, slot: SlotLike, lease: Lease) -> bool:
-        """Plays one lease and puts its result into the outbox; False when the slot must be replaced."""
+        """Plays one leased job and puts its result into the outbox. Returns False when the slot must be replaced."""
         job = lease.job
         self._running[lease.lease_id] = slot
         self._leased[lease.lease_id] = lease
@@ -404,7 +404,7 @@ class Supervisor:
                 job = await self._with_recordings(job)
                 if (
                     lease.lease_id in self._cancelled
-                ):  # while it waited for its files, when there was nothing to stop
+                ):  # cancelled while its files were fetched, before the slot had anything to stop
                     self._put_result(lease, "returned")
                     return healthy
                 playing = True
@@ -433,7 +433,7 @@ class Supervisor:
         return healthy
 
     async def _with_recordings(self, job: Job) -> Job:
-        """The job with the recordings that it plays again, or goes on from, inline."""
+        """The job with the recordings that it replays or resumes from downloaded inline."""
         if job.begun is not None and job.begun.inline is None:
             data = await self._ask.download(self._options.name, self._session, job.begun.digest)
             job = msgspec.structs.replace(job, begun=msgspec.structs.replace(job.begun, inline=data))
@@ -451,7 +451,7 @@ class Supervisor:
     async def _fetch_bundle(self, digest: str) -> bytes:
         return await self._ask.download(self._options.name, self._session, digest)
 
-    # Handing in.
+    # Reporting results.
 
     def _put_result(
         self,
@@ -506,7 +506,7 @@ class Supervisor:
                 task.cancel()
 
     async def _withdraw_poll(self, lease: asyncio.Task[None]) -> None:
-        """Takes back the waiting poll, lest it be answered with leases that nobody here will see."""
+        """Withdraws the waiting poll, which could otherwise be answered with leases that nothing here would receive."""
         request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
         with contextlib.suppress(EvopolicyError):
             await self._ask.once("lease", request, Leases)
