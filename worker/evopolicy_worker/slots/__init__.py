@@ -1,1 +1,1 @@
-"""Slots: one core's worth of episodes each, as the supervisor sees them."""
+"""Slots, as the supervisor sees them: each plays one episode at a time on one core."""

@@ -1,4 +1,4 @@
-"""How a worker's child processes begin: they end with their parent, and talk to it where nothing else can talk."""
+"""Start-up of a worker's child processes: they end with their parent, and talk to it over pipes that no other code writes to."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from evopolicy_common.processes.parent_death import end_with_parent
 
 
 def take_pipes() -> tuple[int, int]:
-    """What standard input and output were, as descriptors of this process's own: commands and answers.
+    """Moves standard input and output to new descriptors and returns these: commands, answers.
 
-    From now on standard input is empty, and what simulators and drivers print goes to standard error. Ctrl-C is left to
-    the parent, whose end is this process's.
+    From now on standard input is empty, and prints of simulators and drivers go to standard error. Ctrl-C is ignored; the
+    parent handles it, and this process ends with its parent.
     """
     end_with_parent(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

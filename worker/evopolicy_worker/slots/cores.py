@@ -1,6 +1,6 @@
-"""Which CPU core a slot is pinned to, agreed between all workers of this machine by file locks.
+"""Assigns a CPU core to each slot. The workers of one machine coordinate by file locks.
 
-Env and policy process of a slot share one core: a pipe round trip costs 7 µs there and over 100 µs across cores.
+A slot's environment and policy processes share one core: a pipe round trip costs 7 µs there and over 100 µs across cores.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import IO
 
 
 class Cores:
-    """Hands out cores; those not taken by any worker of this machine first."""
+    """Assigns cores, preferring those that no worker of this machine has taken."""
 
     def __init__(self) -> None:
         self._allowed = sorted(os.sched_getaffinity(0))
@@ -24,11 +24,11 @@ class Cores:
 
     @property
     def count(self) -> int:
-        """How many cores this process may use: the default number of slots."""
+        """Number of cores that this process may use; the default number of slots."""
         return len(self._allowed)
 
     def take(self) -> int:
-        """A core for one more slot: a free one, or when all are taken the next in turn."""
+        """A core for one more slot: a free one, or the next in turn when all are taken."""
         for core in self._allowed:
             if core in self._locks:
                 continue
@@ -45,7 +45,7 @@ class Cores:
         return core
 
     def close(self) -> None:
-        """Gives the cores back."""
+        """Releases the cores."""
         for lock in self._locks.values():
             lock.close()
         self._locks.clear()

@@ -1,8 +1,8 @@
-"""How a slot can end, and whose doing each end is: a table, without I/O.
+"""How a slot's processes can end, and who is responsible: a table, without I/O.
 
-The principle: whatever a policy's process can bring about by itself is the policy's result; whatever it provably cannot is ours,
-and is played again. The seal is the proof: it refuses a policy every signal but those to itself, and of these SIGKILL and the
-stops (`sandbox.seccomp`), so that a SIGKILL that no limit explains came from outside.
+Rule: an ending that a policy's process can cause by itself is the policy's result. An ending that it provably cannot cause is
+an infrastructure failure, and the episode is played again. The proof is the seal (`sandbox.seccomp`): it refuses a policy all
+signals to others, and SIGKILL and stop signals to itself. So a SIGKILL that no limit explains came from outside.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 
 First = Literal["policy", "sandbox", "environment", "supervisor"]
-"""Which process ended first. `sandbox`: bubblewrap or the zygote, whose end is the policy's. `supervisor`: the worker."""
+"""Which process ended first. `sandbox`: bubblewrap or the zygote, whose end also ends the policy's process. `supervisor`: the
+worker."""
 How = Literal["exit", "fault", "signal", "SIGKILL", "stop", "pipe", "frame"]
-"""`exit`: with a status. `fault`: by a signal that a process brings upon itself (`FAULTS`). `signal`: by another one.
-`stop`: stopped, and not let go on. `pipe`: it closed its pipe and lives. `frame`: it sent what is none."""
+"""`exit`: with a status. `fault`: by a signal that a process's own error causes (`FAULTS`). `signal`: by any other signal but
+SIGKILL. `stop`: stopped and not resumed. `pipe`: it closed its pipe but is alive. `frame`: it sent an invalid frame."""
 
 FAULTS = frozenset(
     {
@@ -29,37 +30,37 @@ FAULTS = frozenset(
 
 
 class EndedFromOutsideError(SandboxError):
-    """A process of the slot's was ended or stopped, and the policy cannot have done it."""
+    """A process of the slot was ended or stopped, and the policy cannot have caused it."""
 
 
 class Ending(NamedTuple):
-    """What is known of an end."""
+    """What is known about an ending."""
 
     first: First
     how: How
     limit: FailureCategory | None = None
-    """The category of the limit that explains it."""
+    """Category of the limit that explains it; None when none does."""
     began: bool = True
-    """Of the policy: whether any of its bundle's code had run. Of the environment: whether an action of the policy's had
-    reached it in this episode."""
+    """For the policy: whether any code of its bundle had run. For the environment: whether an action of the policy had reached
+    it in this episode."""
     held: bool = True
-    """Whether the policy's process cannot have signalled itself: it is sealed, and under no CPU limit of the system's."""
+    """Whether the policy's process cannot have killed or stopped itself: it is sealed, and has no CPU limit of the system."""
 
 
 class Row(NamedTuple):
-    """Endings of one kind, and their verdict; None in a condition: any."""
+    """A kind of ending and its verdict. None in a condition matches anything."""
 
     what: str
     first: frozenset[First]
     how: frozenset[How] | None
     verdict: FailureCategory | Literal["limit", "outside"]
-    """The policy's failure; `limit`: that of the limit. `outside`: ours, to be played again."""
+    """The policy's failure; `limit`: the category of that limit. `outside`: an infrastructure failure, to be played again."""
     limit: bool | None = None
     began: bool | None = None
     held: bool | None = None
 
     def fits(self, ending: Ending) -> bool:
-        """Whether it is of this kind."""
+        """Whether an ending is of this kind."""
         return (
             ending.first in self.first
             and (self.how is None or ending.how in self.how)
@@ -132,7 +133,7 @@ TABLE: tuple[Row, ...] = (
 
 
 def verdict(ending: Ending) -> FailureCategory | None:
-    """The policy's failure; None when it is ours, and played again."""
+    """The category of the policy's failure; None for an infrastructure failure, which is played again."""
     (row,) = [row for row in TABLE if row.fits(ending)]
     if row.verdict == "outside":
         return None
@@ -140,7 +141,7 @@ def verdict(ending: Ending) -> FailureCategory | None:
 
 
 def broken_down(ending: Ending) -> PolicyFailure | None:
-    """The policy's failure for an end of the environment's process; None when it is ours."""
+    """The policy's failure for an ending of the environment's process; None for an infrastructure failure."""
     category = verdict(ending)
     if category is None:
         return None
@@ -149,7 +150,7 @@ def broken_down(ending: Ending) -> PolicyFailure | None:
 
 
 def how(status: int) -> How:
-    """How a process ended, by its status as from waitpid."""
+    """How a process ended, from its waitpid status."""
     if not os.WIFSIGNALED(status):
         return "exit"
     number = os.WTERMSIG(status)

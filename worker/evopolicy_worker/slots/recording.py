@@ -1,8 +1,10 @@
-"""The slot's end of its video process: hands it episodes, gets MP4 bytes back, and does without it when it must.
+"""The slot's client of its video process: sends it episodes and receives MP4 bytes.
 
-Rules: a video is an extra. Where an environment does not draw here, the renderer crashes or takes too long, the
-episode keeps its outcome, there is no video, and a note on standard error says why. The process draws one environment
-only (a second one with MuJoCo's renderer has crashed processes) and is the slot's child: pinned to its core, ended with it.
+Rules:
+- A video is optional. Where an environment cannot be rendered here, or the renderer crashes or times out, the episode keeps
+  its outcome without a video, and a note on standard error gives the reason.
+- The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes.
+- It is the slot's child: pinned to the same core, and ended with the slot.
 """
 
 from __future__ import annotations
@@ -24,22 +26,22 @@ from evopolicy_worker.episodes.video import Made, Order
 from evopolicy_worker.slots.slot_messages import LENGTH, NOTE
 
 START_S = 120.0
-"""For the process to start and import its simulator."""
+"""Time for the process to start and import its simulator."""
 FRAME_S = 1.0
-"""For each frame; the slowest take some 0.06 s."""
+"""Time for each frame. The slowest take about 0.06 s."""
 MAX_S = 1800.0
-"""For one video; below the hour of grace that a lease has beyond its episode's limits."""
+"""Maximum time for one video; below the hour of grace that a lease has beyond its episode's limits."""
 MAX_FAILURES = 3
-"""After so many failures in a row an environment's videos are given up in this slot."""
+"""After so many consecutive failures this slot makes no more videos of an environment."""
 _LOOK_S = 0.1
 _PIECE = 1 << 20
 
 
 class VideoRecorder:
-    """Records videos of episodes that were played. Not thread-safe."""
+    """Makes videos of played episodes. Not thread-safe."""
 
     def __init__(self, start_s: float = START_S, frame_s: float = FRAME_S) -> None:
-        """Time allowed for a start and for each frame, seconds."""
+        """Timeouts for the start and for each frame, in seconds."""
         self._start_s = start_s
         self._frame_s = frame_s
         self._process: subprocess.Popen[bytes] | None = None
@@ -55,7 +57,7 @@ class VideoRecorder:
         length: int,
         cancelled: Callable[[], bool],
     ) -> bytes | None:
-        """MP4 bytes of an episode of `length` rows; None where there can be none, or once `cancelled` says so.
+        """MP4 bytes of an episode of `length` rows; None when it cannot be made, or once `cancelled()` is true.
 
         `actions`: the episode's trajectory with record "actions".
         """
@@ -85,7 +87,7 @@ class VideoRecorder:
         return made.mp4
 
     def close(self) -> None:
-        """End the process; it is started again when it is needed. A second close does nothing."""
+        """Ends the process; the next `record` starts it again. A second close does nothing."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -95,7 +97,7 @@ class VideoRecorder:
                 pipe.close()
 
     def _ask(self, env: str, order: bytes, deadline: float, cancelled: Callable[[], bool]) -> Made | None:
-        """The answer; None when it was cancelled. Raises OSError, or WorkerError for a process that gives none."""
+        """The process's answer; None when cancelled. Raises OSError, or WorkerError when the process ends or times out."""
         process = self._running(env)
         assert process.stdin is not None
         assert process.stdout is not None
@@ -133,7 +135,7 @@ class VideoRecorder:
         return self._process
 
     def _note(self, text: str) -> None:
-        """Said once a slot."""
+        """Prints each note once per slot."""
         if text not in self._noted:
             self._noted.add(text)
             print(f"{NOTE}{text}", file=sys.stderr, flush=True)

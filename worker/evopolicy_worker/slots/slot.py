@@ -1,8 +1,11 @@
-"""A slot: one core's worth of episodes. The supervisor's end of an environment process and its sandbox.
+"""A slot: plays one job at a time on one core. The supervisor's handle of an environment process and its sandbox.
 
-Rules: a job's failure is its policy's (an outcome) or ours (WorkerError, SandboxError, SlotDiedError: played elsewhere), as the
-table of `endings` says. Where the environment's process crashes on a policy's actions, a new one plays the episode with random
-actions, and what is left of the job. `cancel` leaves the slot usable; after an error `start` makes it new. One job at a time.
+Rules:
+- A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError: the job
+  is played elsewhere), as the table in `endings` decides.
+- If the environment's process crashes on a policy's actions, a new process plays the episode with random actions, and then the
+  rest of the job.
+- After `cancel` the slot is usable. After an error `start` restarts it.
 """
 
 from __future__ import annotations
@@ -35,16 +38,17 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 START_TIMEOUT_S = 120.0
 CANCEL_TIMEOUT_S = 20.0
+"""A cancelled job that has not stopped after this time has its processes killed."""
 LAST_WORDS_S = 5.0
-"""A cancelled job that has not stopped by then takes its processes with it."""
+"""How long to wait for an ended process's status, and for its jail to be gone."""
 STOPPED_S = 30.0
-"""Processes that are stopped from outside for so long are ended, and their job is played elsewhere."""
+"""Processes that have been stopped from outside for this long are killed, and their job is played elsewhere."""
 _LOOK_S = 5.0
 MAX_ANSWER_BYTES = 1 << 31
 
 
 class Slot:
-    """An environment process in a jail of its own and, inside a sandbox, the policies that it plays. Used by one asyncio loop."""
+    """An environment process in its own jail, with the policies that it plays in a sandbox inside. Used by one asyncio loop."""
 
     def __init__(
         self,
@@ -56,10 +60,10 @@ class Slot:
         sealed: bool = True,
         definitions: tuple[Entry, ...] = (),
     ) -> None:
-        """`core` is the CPU that all its processes are pinned to; None leaves that to the system. `definitions`: environments
-        that do not ship.
+        """`core`: the CPU that all processes are pinned to; None for no pinning. `scratch`: a folder for this slot alone.
+        `definitions`: environments that do not ship.
 
-        `scratch` is a folder of the slot's own. `sealed=False` (tests only) leaves the policy's process unsealed.
+        `sealed=False` (tests only) leaves the policy's process unsealed.
         """
         self._start = messages.Start(
             tier=tier,
@@ -72,7 +76,7 @@ class Slot:
         )
         self._foreign = {each.id for each in definitions}
         self._saw_hidden = False
-        """Whether code that does not ship has played a hidden episode in the process there is."""
+        """Whether an environment that does not ship has played a hidden episode in the current process."""
         self._scratch = scratch
         self._cancelled = False
         self._sent = ""
@@ -84,15 +88,15 @@ class Slot:
         self._idle.set()
 
     async def start(self) -> None:
-        """Start the processes, ending those of before.
+        """Starts the processes, after ending any earlier ones.
 
-        SandboxError, with what to do, when this machine cannot provide the tier; WorkerError for other failures.
+        Raises SandboxError, with a remedy, when this machine cannot provide the tier, and WorkerError for other failures.
         """
         await self.close()
         self._scratch.mkdir(parents=True, exist_ok=True)
         self._sent = ""
         self._saw_hidden = False
-        for name in ("home", "tmp"):  # what the process before has written there is not for this one
+        for name in ("home", "tmp"):  # must not pass files from the previous process to this one
             remove_tree(self._scratch / name)
         self._process = await asyncio.create_subprocess_exec(
             *env_jail.command(self._start.tier, self._scratch, draws=self._start.draws),
@@ -120,8 +124,8 @@ class Slot:
             raise _error(answer)
 
     async def prepare(self, env_ids: Sequence[str]) -> None:
-        """Start the processes, unless they are, and make these environments, which the jobs to come find ready. Raises as
-        `start`."""
+        """Starts the processes if necessary and makes these environments, so that later jobs find them ready. Raises as
+        `start` and `describe`."""
         if self._process is None:
             await self.start()
         if env_ids:
@@ -130,11 +134,11 @@ class Slot:
     async def play(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
     ) -> tuple[EpisodeOutcome, ...]:
-        """Play a job: an outcome for each of its episodes, in order, trajectories inline.
+        """Plays a job and returns an outcome for each of its episodes, in order, with trajectories inline.
 
-        `bundle` is the unpacked bundle's folder, None for random actions; `on_progress` is told episodes and steps done.
-        A cancelled job gives nothing; what its policy had returned is in `begun` then, as after an error. Raises SlotDiedError,
-        SandboxError or WorkerError.
+        `bundle`: the unpacked bundle's folder; None for random actions. `on_progress` receives the numbers of finished episodes
+        and steps. A cancelled job returns an empty tuple. After a cancellation or an error, `begun` has what the policy had
+        returned. Raises SlotDiedError, SandboxError or WorkerError.
         """
         self._begun = begun.unpack(job)
         if self._process is None:
@@ -149,7 +153,7 @@ class Slot:
             if job.video and not self._start.draws and env_jail.graphics_devices():
                 self._start = msgspec.structs.replace(self._start, draws=True)
                 await self.start()
-            # What is not ours may keep what it saw of a hidden episode, and tell a train episode's policy by it.
+            # An environment that does not ship could remember a hidden episode and leak it to a train episode's policy.
             if self._saw_hidden and job.record == "full":
                 await self.start()
             self._saw_hidden = self._saw_hidden or (job.env in self._foreign and job.record != "full")
@@ -189,7 +193,7 @@ class Slot:
                 await self.start()
                 files = await asyncio.to_thread(bundle_files, bundle)
         except asyncio.CancelledError:
-            # Nobody reads the rest of this job's answers: the processes are of no more use.
+            # The rest of this job's answers will not be read, so the processes cannot be used again.
             self._end_process()
             raise
         finally:
@@ -198,11 +202,11 @@ class Slot:
 
     @property
     def begun(self) -> HandedBack | None:
-        """What stands of the job that was played last and not finished; None for nothing."""
+        """What the policy has returned in the last, unfinished job; None for nothing."""
         return begun.pack(self._begun)
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
-        """What these environments are: they are made in the slot's process, and jobs find them there. Raises as `play`."""
+        """Descriptions of these environments, which are made in the slot's process and stay there for jobs. Raises as `play`."""
         if self._process is None:
             raise WorkerError("the slot is not started")
         await self._send(messages.Describe(environments=tuple(env_ids)))
@@ -212,7 +216,7 @@ class Slot:
         raise _error(answer)
 
     async def cancel(self) -> None:
-        """Stop the running job at once; its `play` returns and the slot can be used again. Nothing runs: no effect."""
+        """Stops the running job, if any; its `play` returns, and the slot can be used again."""
         if self._idle.is_set():
             return
         process = self._process
@@ -227,12 +231,12 @@ class Slot:
                 self._end_process()
 
     async def close(self) -> None:
-        """End the slot's processes and remove its scratch folder; a second close does nothing."""
+        """Ends the slot's processes and removes its scratch folder. A second close does nothing."""
         process, self._process = self._process, None
         if process is not None:
             _kill(process)
             await process.wait()
-            # Open as long as anyone in the jail lives, whom the kernel ends after the jail's first process.
+            # Open as long as any process in the jail lives; the kernel kills those after the jail's first process.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LAST_WORDS_S):
                     while process.stdout is not None and await process.stdout.read(1 << 20):
@@ -273,7 +277,7 @@ class Slot:
             raise SlotDiedError(await self._last_words()) from error
 
     async def _end_what_is_stopped(self) -> None:
-        """Ends the processes when the environment's has been stopped from outside for long."""
+        """Kills the slot's processes when one of them has been stopped from outside for `STOPPED_S`."""
         stood_s = 0.0
         while True:
             await asyncio.sleep(_LOOK_S)
@@ -289,7 +293,7 @@ class Slot:
         if code is None:
             return "pipe"
         if self._start.tier == "bwrap" and code > 128:
-            code = 128 - code  # bubblewrap's word for a signal
+            code = 128 - code  # bubblewrap reports a signal as 128 + its number
         return endings.how(-code if code < 0 else code << 8)
 
     async def _last_words(self) -> str:
@@ -303,7 +307,7 @@ class Slot:
         return f"the slot's process ended with status {status}; {' | '.join(self._said) or 'it said nothing'}"
 
     async def _listen(self, process: asyncio.subprocess.Process) -> None:
-        """Keeps what the process says on standard error (simulators' notices, our tracebacks)."""
+        """Keeps the last lines of the process's standard error (simulators' notices, our tracebacks) and logs them."""
         assert process.stderr is not None
         while True:
             try:
@@ -321,7 +325,8 @@ class Slot:
 
 
 def _children(pid: int, tier: Tier) -> list[int]:
-    """The environment's process inside its jail, and what stands between; of tier bwrap, below which the policies' is."""
+    """In tier bwrap, the processes below `pid` (bubblewrap) down to the environment's own. Empty in other tiers, where `pid` is the
+    environment's process."""
     found: list[int] = []
     with contextlib.suppress(OSError, ValueError):
         for _ in range(2 if tier == "bwrap" else 0):
@@ -331,7 +336,7 @@ def _children(pid: int, tier: Tier) -> list[int]:
 
 
 def bundle_files(folder: Path, sent: str = "") -> messages.Files:
-    """The unpacked bundle in `folder`; without its contents when it is the one that was sent last."""
+    """The unpacked bundle in `folder`, without contents when its key is `sent`. Raises WorkerError when it cannot be read."""
     key = str(folder)
     names: list[tuple[str, bool, int]] = []
     data: list[bytes] = []
@@ -342,7 +347,7 @@ def bundle_files(folder: Path, sent: str = "") -> messages.Files:
         for name in sorted(files):
             path = os.path.join(root, name)
             try:
-                # Never through a link: an unpacked bundle has none.
+                # An unpacked bundle has no links, so never follow one.
                 with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
                     content = file.read()
                     executable = bool(os.fstat(file.fileno()).st_mode & 0o100)
@@ -361,5 +366,5 @@ def _error(answer: messages.Answer) -> WorkerError | SandboxError:
 
 def _kill(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(ProcessLookupError):
-        # Its group: the sandbox dies with its parent, simulators' helpers with the group.
+        # The whole group: the sandbox dies with its parent, but simulators' helper processes only with the group.
         os.killpg(process.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What a slot and its environment process say to each other over their pipes: length-prefixed msgpack."""
+"""Messages between a slot and its environment process over their pipes: length-prefixed msgpack."""
 
 from __future__ import annotations
 
@@ -13,106 +13,106 @@ from evopolicy_worker.episodes.begun import PackedBegun
 
 LENGTH = struct.Struct("<I")
 NOTE = "note: "
-"""Begins a line on the process's standard error that an operator should see."""
+"""Prefix of a line on the process's standard error that an operator should see."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
-    """One message; `op` names its type."""
+    """A message; `op` names its type."""
 
 
 class Start(Message, frozen=True, kw_only=True, tag="start"):
-    """The first message: what kind of slot to be."""
+    """The first message: how to set up the slot. Answered by Ready or Fault."""
 
     tier: Tier
     core: int | None
     scratch: str
     allowed_packages: tuple[str, ...]
     user: int | None
-    """As root: who policies, and the process once it is sealed, are outside the jail."""
+    """As root: the user id outside the jail of policies, and of the process once it is sealed."""
     draws: bool = False
-    """With the graphics devices of this machine."""
+    """Whether the jail shows this machine's graphics devices."""
     sealed: bool = True
     definitions: tuple[Entry, ...] = ()
     """Environments that do not ship."""
 
 
 class Files(msgspec.Struct, frozen=True, kw_only=True):
-    """A bundle, which the process has no file of."""
+    """A bundle's files, which the process cannot read from disk."""
 
     key: str
     names: list[tuple[str, bool, int]] | None
-    """Path, executable, size in bytes of each; None: the process was sent this bundle last."""
+    """Path, executable flag and size in bytes of each file. None: this bundle is the one that was sent last."""
     data: bytes
-    """Their contents, one after another."""
+    """The files' contents, concatenated."""
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job; answered by Told, again and again, Finished for each episode, then by Played or Fault (or, given up, by
-    Begun before these)."""
+    """Play this job. Answered by any number of Told, by Acting and Finished for each episode, and last by Played or Fault; by Begun
+    before these when an episode is given up."""
 
     job: Job
     bundle: Files | None
     first: int = 0
-    """The episode to begin with, counted in the job."""
+    """Index in the job of the first episode to play."""
     failure: PolicyFailure | None = None
-    """Of the policy in that episode: it brought down the process that played it before."""
+    """The policy's failure in that episode: it crashed the process that played it before."""
 
 
 class Describe(Message, frozen=True, kw_only=True, tag="describe"):
-    """Say what these environments are; answered by Described or Fault."""
+    """Describe these environments. Answered by Described or Fault."""
 
     environments: tuple[str, ...]
 
 
 class Cancel(Message, frozen=True, kw_only=True, tag="cancel"):
-    """Stop the running job, which is answered by Played."""
+    """Stop the running job, which then ends with Played."""
 
 
 class Ready(Message, frozen=True, kw_only=True, tag="ready"):
-    """Started, sandbox and all."""
+    """The process and its sandbox have started."""
 
 
 class Told(Message, frozen=True, kw_only=True, tag="progress"):
-    """How far the running job is."""
+    """Progress of the running job."""
 
     episodes_done: int
     steps: int
 
 
 class Acting(Message, frozen=True, kw_only=True, tag="acting"):
-    """The first action of a policy is about to reach the environment in the job's next episode."""
+    """In the job's next episode, the first action of the policy is about to reach the environment."""
 
 
 class Finished(Message, frozen=True, kw_only=True, tag="finished"):
-    """What came of the job's next episode."""
+    """The outcome of the job's next episode."""
 
     outcome: EpisodeOutcome
     begun: PackedBegun | None = None
-    """What the policy returned in it; of jobs of several episodes only, which are given back as a whole."""
+    """What the policy returned in it. Only in jobs of several episodes, which are given back as a whole."""
 
 
 class Begun(Message, frozen=True, kw_only=True, tag="begun"):
-    """What the policy has returned so far in the episode that is given up: told on Cancel, and before a Fault."""
+    """What the policy has returned so far in an episode that is given up. Sent on Cancel, and before a Fault."""
 
     place: int
-    """The episode's, counted in the job."""
+    """The episode's index in the job."""
     begun: PackedBegun
 
 
 class Played(Message, frozen=True, kw_only=True, tag="played"):
-    """The job is done: every episode of it has been told, or it was cancelled."""
+    """The job is over: every episode has been reported by Finished, or it was cancelled."""
 
     cancelled: bool = False
 
 
 class Described(Message, frozen=True, kw_only=True, tag="described"):
-    """The environments that were asked for, in their order."""
+    """The requested environments, in the order of the request."""
 
     environments: tuple[EnvironmentDescription, ...]
 
 
 class Fault(Message, frozen=True, kw_only=True, tag="fault"):
-    """Our own failure, never the policy's."""
+    """An infrastructure failure, never the policy's."""
 
     kind: str
     """`sandbox` or `worker`."""
@@ -128,6 +128,6 @@ answers: msgspec.msgpack.Decoder[Answer] = msgspec.msgpack.Decoder(Answer)
 
 
 def framed(message: Message) -> bytes:
-    """A message's bytes with their length before them."""
+    """The encoded message, prefixed by its length."""
     data = encoder.encode(message)
     return LENGTH.pack(len(data)) + data
