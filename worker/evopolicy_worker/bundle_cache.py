@@ -30,7 +30,8 @@ class BundleCache:
 
     @contextlib.asynccontextmanager
     async def use(self, digest: str) -> AsyncIterator[Path]:
-        """The bundle's folder, kept for the duration of the `async with`. Raises the errors of fetching and unpacking."""
+        """The bundle's folder, kept for the duration of the `async with`. Raises the errors of fetching and
+        unpacking."""
         task = self._ready.get(digest)
         if task is None:
             task = self._ready[digest] = asyncio.create_task(self._bring(digest))

@@ -24,7 +24,8 @@ PACKAGES = (
     "pygame-ce",
     "pandas",
 )
-"""Distributions that Core16's environments are made of. An environment's description names those that decide its results."""
+"""Distributions that Core16's environments are made of. An environment's description names those that decide its
+results."""
 
 
 def fingerprint() -> Fingerprint:

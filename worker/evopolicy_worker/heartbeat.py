@@ -18,8 +18,8 @@ from evopolicy_common.wire.transport import Link
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 ANSWERED_PAUSE_S = 0.02
-"""Minimum time between heartbeats. The coordinator repeats a cancellation, without delay, in each reply until the job is
-reported."""
+"""Minimum time between heartbeats. The coordinator repeats a cancellation, without delay, in each reply until the job
+is reported."""
 FAILED_PAUSE_S = 0.25
 
 
@@ -79,7 +79,8 @@ class HeartbeatThread:
         on_reply: Callable[[HeartbeatReply | Refused], None],
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """Both callbacks run on the event loop that creates this object; `on_failure` when no further heartbeat can be sent."""
+        """Both callbacks run on the event loop that creates this object; `on_failure` when no further heartbeat can be
+        sent."""
         self._link = link
         self._key = keys.worker_key(cluster, "beat")
         self._worker = worker

@@ -5,8 +5,8 @@ Rules:
   safe.
 - Large parts are uploaded first, as blobs, and their bytes are kept until the result is acknowledged: a coordinator
   restored from a backup may have lost them. It then refuses the result as missing a blob, and they are uploaded again.
-- A result that is refused for good is reported as failed, with the reason. If that report is refused too, it is dropped, and
-  the coordinator gives the job to another worker. Neither blocks the results behind it.
+- A result that is refused for good is reported as failed, with the reason. If that report is refused too, it is
+  dropped, and the coordinator gives the job to another worker. Neither blocks the results behind it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from evopolicy_common.wire.requests import Requester
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_RESULTS = 256
-"""Waiting results at which the worker stops leasing jobs, so that memory stays bounded while the coordinator is unreachable."""
+"""Waiting results at which the worker stops leasing jobs, so that memory stays bounded while the coordinator is
+unreachable."""
 MAX_BYTES = 512 << 20
 """The same limit for their total size, in bytes."""
 MAX_HAND_IN = 64
@@ -38,7 +39,8 @@ MAX_HAND_IN_BYTES = 4 << 20
 MAX_RESULT_BYTES = 1 << 20
 """A result that is larger than this without its large blobs sends its episodes as one blob."""
 MANY_EPISODES = 300
-"""In jobs with more episodes, recordings over 1 KiB are uploaded as blobs too, so that all outcomes fit into one blob."""
+"""In jobs with more episodes, recordings over 1 KiB are uploaded as blobs too, so that all outcomes fit into one
+blob."""
 MAX_LOST = 5
 """How often the coordinator may lose the blobs of one result before that counts as a refusal."""
 UNPACK_S = 30.0
@@ -57,7 +59,8 @@ class Outbox:
         register_again: Callable[[str], Awaitable[None]],
         on_settled: Callable[[JobResult], None],
     ) -> None:
-        """`register_again` receives the session that the coordinator did not know, `on_settled` each result that left."""
+        """`register_again` receives the session that the coordinator did not know, `on_settled` each result that
+        left."""
         self._ask = ask
         self._worker = worker
         self._session = session
@@ -176,8 +179,8 @@ class Outbox:
         await asyncio.sleep(PAUSE_S)
 
     def _refused_for_good(self, why: str, n: int) -> None:
-        """Handles a refusal of the oldest `n` results. Several are sent again one by one; a single one is reported as failed, or
-        dropped when it was such a report."""
+        """Handles a refusal of the oldest `n` results. Several are sent again one by one; a single one is reported as
+        failed, or dropped when it was such a report."""
         if n > 1:
             self._one_by_one = n
             return

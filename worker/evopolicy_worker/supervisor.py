@@ -1,14 +1,14 @@
 """The worker's supervisor: registers, leases jobs, passes them to its slots, and reports the results.
 
 Rules:
-- A lease is held from its arrival until its result is acknowledged. Every heartbeat lists all held leases, so that a restarted
-  coordinator can adopt them.
+- A lease is held from its arrival until its result is acknowledged. Every heartbeat lists all held leases, so that a
+  restarted coordinator can adopt them.
 - A result stays in the outbox until the coordinator acknowledges it as durable (`outbox`). Sending it twice is safe.
-- Jobs leased with `stop_in_silence` are stopped once no heartbeat has been answered for the lease TTL. Some time later the
-  coordinator may let an agent onto this kernel.
+- Jobs leased with `stop_in_silence` are stopped once no heartbeat has been answered for the lease TTL. Some time later
+  the coordinator may let an agent onto this kernel.
 - A job that is returned unfinished includes what its policy has returned so far. The next attempt resumes from there.
-- A slot that is killed from outside loses only its current job, which is played again. Anything that a policy can do to its slot
-  is an outcome of its job (`endings`).
+- A slot that is killed from outside loses only its current job, which is played again. Anything that a policy can do to
+  its slot is an outcome of its job (`endings`).
 - On SIGTERM the worker stops requesting leases and returns waiting jobs. Running jobs may finish within the grace time.
 """
 
@@ -148,8 +148,8 @@ class Supervisor:
     async def run(self) -> None:
         """Works until drained.
 
-        Raises RefusedError when the coordinator refuses this worker, and PartFailedError when the heartbeat or the reporting of
-        results fails: without either, the worker would only hold jobs that others could play.
+        Raises RefusedError when the coordinator refuses this worker, and PartFailedError when the heartbeat or the
+        reporting of results fails: without either, the worker would only hold jobs that others could play.
         """
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
@@ -185,7 +185,8 @@ class Supervisor:
             self._failed.set_exception(PartFailedError(f"{part} failed: {type(error).__name__}: {error}"))
 
     async def _work(self) -> None:
-        """Leases and plays until drained. A refusal by the coordinator stops all running jobs, as their results are worthless."""
+        """Leases and plays until drained. A refusal by the coordinator stops all running jobs, as their results are
+        worthless."""
         refused: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as group:
@@ -269,8 +270,8 @@ class Supervisor:
     # Leasing.
 
     async def _lease_loop(self) -> None:
-        """Keeps a poll waiting at the coordinator while no more than half of the jobs leased ahead are left. So slots never wait
-        for a round trip, and short episodes still arrive in batches."""
+        """Keeps a poll waiting at the coordinator while no more than half of the jobs leased ahead are left. So slots
+        never wait for a round trip, and short episodes still arrive in batches."""
         depth = 0
         while not self._draining.is_set():
             self._capacity_freed.clear()
@@ -335,9 +336,11 @@ class Supervisor:
                 await _close_slot(slot)
 
     async def _prepared(self, index: int) -> SlotLike | None:
-        """Starts a slot of the safest tier and imports its simulators before work arrives, so that the first submit need not wait.
+        """Starts a slot of the safest tier and imports its simulators before work arrives, so that the first submit
+        need not wait.
 
-        None when that fails (the first lease hits the same failure and reports it), or when the worker is drained meanwhile.
+        None when that fails (the first lease hits the same failure and reports it), or when the worker is drained
+        meanwhile.
         """
         offered = [each.env for each in self._options.environments]
         slot = self._make_slot(index, self._options.tiers[0])

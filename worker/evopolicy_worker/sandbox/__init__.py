@@ -1,4 +1,4 @@
-"""The sandbox's tiers: which of them work here, found out by starting each."""
+"""Sandboxes of environment and policy processes, and which of their tiers work here, tested by starting each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evopolicy_worker.sandbox.zygote import START_TIMEOUT_S
 from evopolicy_worker.slots import slot_messages as messages
 
 SANDBOXED: tuple[Tier, ...] = ("bwrap", "landlock")
-"""Tiers that lock policies in, the strongest first."""
+"""Tiers that confine policies, strongest first."""
 
 
 def available_tiers(
@@ -27,9 +27,10 @@ def available_tiers(
     unsandboxed: bool = False,
     wanted: Collection[str] = SANDBOXED,
 ) -> tuple[Tier, ...]:
-    """Tiers that this machine offers, the strongest first; `none` only when its operator says so.
+    """Tiers that this machine offers, strongest first; `none` only with `unsandboxed`.
 
-    `wanted`: sandboxed tiers that are tried, each of which takes about a second. Nothing falls back from one tier to another: a job names its tier.
+    `wanted`: the sandboxed tiers to test; each takes about a second. A job names its tier, and nothing falls back to
+    another.
     """
     found = [tier for tier in SANDBOXED if tier in wanted and why_not(tier, allowed_packages) is None]
     return (*found, "none") if unsandboxed else tuple(found)
@@ -37,12 +38,12 @@ def available_tiers(
 
 @cache
 def why_not(tier: Tier, allowed_packages: tuple[str, ...] = ("numpy",)) -> str | None:
-    """Why this tier does not work here, with what to do; None when it works.
+    """Why this tier does not work here, with a remedy; None when it works.
 
-    Starts an environment process in its jail, and the policies' sandbox in that. Call it on the main thread.
+    Starts an environment process in its jail, with the policies' sandbox inside. Call it on the main thread.
     """
     with scratch_folder("tier") as folder:
-        # A folder of its own kind, as a slot's: the other one is locked by us.
+        # A subfolder, as for a slot: this process holds the lock of `folder` itself.
         scratch = folder / "slot"
         scratch.mkdir()
         try:

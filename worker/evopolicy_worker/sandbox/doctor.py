@@ -1,4 +1,4 @@
-"""What this machine gives to a worker's sandbox, and why: rows that `evopolicy-worker doctor` prints."""
+"""Checks what this machine provides for a worker's sandbox: the rows of `evopolicy-worker doctor`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evopolicy_worker.fingerprint import fingerprint
 from evopolicy_worker.sandbox import jail, seccomp, why_not
 
 Verdict = Literal["ok", "missing", "note"]
-"""`missing` names what to do about it; `note` is for information."""
+"""`missing` comes with a remedy; `note` is information."""
 
 _NAMESPACES = {
     "user": 0x10000000,
@@ -38,19 +38,19 @@ _UNMASK = (
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing that was looked at."""
+    """The result of one check."""
 
     name: str
     verdict: Verdict
     found: str
     advice: str = ""
-    """What to do, when something is missing."""
+    """The remedy when something is missing."""
     without: str = ""
-    """What works where it is missing."""
+    """What works without it."""
 
 
 def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]:
-    """All checks, in the order in which to show them. Starts each sandbox tier once: takes about a second."""
+    """All checks, in display order. Starts each sandbox tier once, which takes about a second."""
     return (
         _kernel(),
         _boot_id(),
@@ -115,7 +115,7 @@ def _no_bubblewrap(found: str) -> Check:
 
 
 def _namespace(name: str, flag: int) -> Check:
-    # An ordinary user makes the others inside a user namespace; tried in a process of its own.
+    # An ordinary user can make the other namespaces only inside a user namespace.
     flags = flag | (0 if os.geteuid() == 0 else _CLONE_NEWUSER)
     error = _tried(flags)
     if error == 0:
@@ -130,7 +130,7 @@ def _namespace(name: str, flag: int) -> Check:
 
 
 def _tried(flags: int) -> int:
-    """errno of unshare(flags) in a forked process; 0 when it worked."""
+    """errno of unshare(flags) in a forked process; 0 on success."""
     libc = ctypes.CDLL(None, use_errno=True)
     child = os.fork()
     if child == 0:

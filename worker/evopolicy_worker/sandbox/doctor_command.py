@@ -1,4 +1,4 @@
-"""`evopolicy doctor`: the whole machine, and what works without each part that is missing."""
+"""`evopolicy doctor`: checks the whole machine, and prints what works without each missing part."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
-"""The jail of a slot's environment process: what simulators, which are other people's code, can see and do.
+"""The jail of a slot's environment process. It limits what simulators, which are third-party code, can see and do.
 
 Rules:
-- No credentials, no network, no variable beside those listed here. Installed code is read-only; the slot's scratch folder
-  is all that can be written to. Only the supervisor has a session with the coordinator.
-- Tier bwrap: namespaces of its own, so that the machine's processes, sockets and files are not there at all. Tier landlock:
-  Landlock and a filter of system calls in their place. Tier none: the listed variables, and nothing else that holds.
-- The process starts the policies' sandbox inside its jail, then seals itself, and only then imports a simulator. Policies
-  stay below it: it must be able to end them, and a process cannot signal into a namespace beside its own.
+- No credentials, no network, and no environment variables but those listed here. Installed code is read-only; only the
+  slot's scratch folder is writable. Only the supervisor has a session with the coordinator.
+- Tier bwrap: its own namespaces, in which the machine's processes, sockets and other files do not exist. Tier landlock:
+  Landlock and a filter of system calls instead. Tier none: only the environment variables are restricted.
+- The process starts the policies' sandbox inside its jail, then seals itself, and only then imports a simulator.
+  Policies are its descendants, because it must be able to kill them, and a process cannot signal into a sibling
+  namespace.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64")
 _ETC = ("ld.so.cache", "alternatives", "fonts", "glvnd", "drirc", "localtime", "nvidia", "vulkan", "OpenCL")
 _DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 _GRAPHICS = ("/dev/dri", "/dev/nvidia*", "/sys/dev/char", "/sys/devices", "/sys/bus/pci")
-"""What a driver needs to draw with a graphics card; without one Mesa draws on the CPU, and needs none of it."""
+"""What a driver needs to render with a graphics card. Without one Mesa renders on the CPU and needs none of it."""
 _SCOPES_SIGNALS = 6
-"""Landlock's ABI version from which on it keeps signals from processes outside."""
+"""First ABI version of Landlock that blocks signals to processes outside."""
 _SET_MODE_FILTER, _ALL_THREADS, _SPECULATION = 1, 1, 4
 _CHECK_S = 20.0
 
@@ -54,13 +55,13 @@ _PASSED_ON_PREFIXES = (
     "__GLX_",
 )
 _LATER_PATH = "EVOPOLICY_SIMULATORS_PATH"
-"""The operator's PYTHONPATH on its way into the jail: what is there may come before a standard module of that name."""
+"""Passes the operator's PYTHONPATH into the jail, where `seal` applies it: its modules could shadow standard ones."""
 _PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH", _LATER_PATH)
-"""Variables whose folders the jail shows."""
+"""Variables whose folders are visible in the jail."""
 
 
 def variables(scratch: Path) -> dict[str, str]:
-    """The whole environment of the process."""
+    """All environment variables of the process."""
     passed_on = {
         name: value
         for name, value in os.environ.items()
@@ -80,28 +81,28 @@ def variables(scratch: Path) -> dict[str, str]:
 
 
 def command(tier: Tier, scratch: Path, *, draws: bool = False) -> tuple[str, ...]:
-    """The arguments that start an environment process of that tier.
+    """The command line that starts an environment process in that tier.
 
-    `draws`: with the graphics devices of this machine. SandboxError when bubblewrap is not installed.
+    `draws`: whether this machine's graphics devices are visible. Raises SandboxError when bubblewrap is not installed.
     """
     python = (sys.executable, "-P", "-m", "evopolicy_worker.episodes.env_process")
     return (*_bubblewrap(scratch, draws), *python) if tier == "bwrap" else python
 
 
 def graphics_devices() -> tuple[str, ...]:
-    """What this machine has to draw with; empty where Mesa draws on the CPU."""
+    """Paths that rendering with this machine's graphics card needs; empty where Mesa renders on the CPU."""
     if not any(Path("/").glob(pattern.lstrip("/")) for pattern in _GRAPHICS[:2]):
         return ()
     return tuple(str(path) for pattern in _GRAPHICS for path in sorted(Path("/").glob(pattern.lstrip("/"))))
 
 
-# In the process itself, before anything of a simulator's is imported.
+# The rest runs in the process itself, before any simulator is imported.
 
 
 def enclose(tier: Tier, scratch: Path, *, draws: bool) -> None:
-    """The first half of the seal, before the policies' sandbox is started: tier landlock sees few files from here on.
+    """The first half of the seal, before the policies' sandbox starts: in tier landlock, restricts the visible files.
 
-    `draws`: graphics devices are among them. SandboxError when it cannot be done.
+    `draws`: whether graphics devices stay visible. Raises SandboxError when it fails.
     """
     for name in ("home", "tmp"):
         (scratch / name).mkdir(exist_ok=True)
@@ -116,11 +117,11 @@ def enclose(tier: Tier, scratch: Path, *, draws: bool) -> None:
 
 
 def seal(tier: Tier, scratch: Path, user: int | None, *, draws: bool) -> None:
-    """The second half, once the policies' sandbox runs: no capability, no namespace, few system calls. Only from here on
-    modules are found in the folders of the operator's PYTHONPATH.
+    """The second half, once the policies' sandbox runs: drops all capabilities, and refuses namespaces and many system
+    calls. Then adds the folders of the operator's PYTHONPATH to the module search path.
 
-    `user` (as root, tier bwrap): whom it goes on as; the policies' user, whose processes it may end so.
-    SandboxError when it cannot be done.
+    `user` (as root, tier bwrap): the policies' user, which this process becomes so that it may kill their processes.
+    Raises SandboxError when it fails.
     """
     if tier != "none":
         _seal(tier, scratch, user, graphics_devices() if draws else ())
@@ -137,7 +138,7 @@ def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ..
             os.setgroups(groups)
             os.setresgid(user, user, user)
             os.setresuid(user, user, user)
-            # Changing the user closed /proc/self to this process.
+            # Changing the user made this process undumpable, which denies it /proc/self.
             inside.check(inside.libc.prctl(4, 1, 0, 0, 0), "dumpable")
         inside.drop_capabilities()
         inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
@@ -148,7 +149,7 @@ def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ..
 
 @contextlib.contextmanager
 def expendable() -> Iterator[None]:
-    """What is started inside goes first when the machine runs out of memory."""
+    """Processes started inside are the first to be killed when the machine runs out of memory."""
     path = Path("/proc/self/oom_score_adj")
     before = path.read_text()
     with contextlib.suppress(OSError):
@@ -161,7 +162,8 @@ def expendable() -> Iterator[None]:
 
 
 def _install(program: bytes) -> None:
-    """For all threads; without slowing down code that speculates, as older kernels do for filtered processes."""
+    """Installs a filter for all threads, without the mitigations of speculation with which older kernels slow filtered
+    processes."""
     program = program.replace(struct.pack("<I", seccomp.PID_MARK), struct.pack("<I", os.getpid()))
     buffer = ctypes.create_string_buffer(program, len(program))
     arguments = struct.pack("<HxxxxxxQ", len(program) // 8, ctypes.addressof(buffer))
@@ -179,14 +181,14 @@ def _told(what: str) -> Iterator[None]:
         raise SandboxError(f"the environment process cannot {what}: {error}") from error
 
 
-# What it is shown.
+# What the process can see.
 
 
 def _bubblewrap(scratch: Path, draws: bool) -> list[str]:
     arguments = [jail.bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "slot"]
     arguments += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
     if os.geteuid() == 0:
-        # For the policies' sandbox, which it starts; it gives them up with its user.
+        # Needed to start the policies' sandbox; dropped when `seal` changes the user.
         arguments += ["--cap-add", "ALL"]
     else:
         arguments += ["--unshare-user", "--uid", "65534", "--gid", "65534"]
@@ -217,7 +219,8 @@ def _etc() -> list[str]:
 
 
 def _code() -> list[str]:
-    """Python, what is installed for it, and what the operator's path variables name; a folder in another is left out."""
+    """Python, its installed packages, and the folders in the operator's path variables. Folders inside other ones are
+    left out."""
     named = [entry for name in _PATHS for entry in os.environ.get(name, "").split(os.pathsep) if entry]
     listed = [path for path in (*_python_path(), *named) if not _holds_home(os.path.realpath(path))]
     wanted = [sys.prefix, sys.exec_prefix, sys.base_prefix, *_our_folders(), *listed]
@@ -243,7 +246,7 @@ def _below(path: str, folder: str) -> bool:
 
 @cache
 def _python_path() -> tuple[str, ...]:
-    """Where a fresh interpreter looks for modules: what .pth files add is known to nobody else."""
+    """Module search path of a fresh interpreter, the only way to learn what .pth files add."""
     asked = "import sys; print('\\0'.join(sys.path), end='')"
     said = subprocess.run(
         [sys.executable, "-P", "-c", asked], capture_output=True, text=True, check=True, timeout=_CHECK_S

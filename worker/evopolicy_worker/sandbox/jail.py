@@ -1,4 +1,4 @@
-"""How the zygote is started: inside bubblewrap, or as a plain process that Landlock holds."""
+"""How a zygote is started: inside bubblewrap, or as a plain process confined by Landlock."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from evopolicy_common.processes import distribution
 from evopolicy_worker.sandbox import python_files, seccomp
 
 INSIDE = Path(__file__).parent / "inside"
-"""Our code that the sandbox shows: the zygote and the player, nothing else."""
+"""The only code of ours that the sandbox shows: `zygote`, `player` and `files`."""
 
 
 POLICY_HOME = "/home/policy"
 _PACKAGES = "/packages"
 _PLACE = "/own"
 _DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
-"""Not `/dev/zero`: mapped, it is shared memory without a file, whose inode numbers are counted for the whole machine."""
+"""Without `/dev/zero`: mapped, it is shared memory without a file, and its inode numbers come from a machine-wide
+counter."""
 _FIRST_UID = 0x6D000000
-"""As root, policies run as users from here on, which no machine gives to anyone."""
+"""As root, policies run under user ids from here on, which no machine assigns."""
 
 ENVIRONMENT = {
     "PATH": "/usr/bin:/bin",
@@ -38,22 +39,22 @@ ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    # An arena per thread reserves 64 MiB of address space, which is what a policy's memory is counted in.
+    # Each arena reserves 64 MiB of address space, and a policy's memory limit counts address space.
     "MALLOC_ARENA_MAX": "2",
 }
-"""The whole environment of a policy's process."""
+"""All environment variables of a policy's process."""
 
 
 class Jail(msgspec.Struct, frozen=True, kw_only=True):
-    """A command that starts a zygote, and what it is told."""
+    """A command that starts a zygote, and the zygote's configuration."""
 
     command: tuple[str, ...]
-    """To be followed by the number of the control socket's descriptor."""
+    """The caller appends the number of the control socket's descriptor."""
     config: dict[str, object]
     user: int | None
-    """User outside to whom the sandbox's user is mapped by the worker; None when nothing is to be mapped."""
+    """User id outside that the worker maps the sandbox's user to; None for no mapping."""
     home: str | None
-    """Where a policy's files are; None when each policy gets a folder in the slot's scratch."""
+    """Folder of a policy's files; None when each policy gets a folder in the slot's scratch folder."""
 
 
 def plan(
@@ -64,10 +65,10 @@ def plan(
     sealed: bool = True,
     user: int | None = None,
 ) -> Jail:
-    """The jail of that tier. SandboxError, with what to do, when this machine cannot build it.
+    """The jail of that tier. Raises SandboxError, with a remedy, when this machine cannot build it.
 
-    `user`: as root, who the sandbox's user is outside; None picks one (`some_user`). `sealed=False` leaves off what a policy's process does to itself (limits, Landlock, the filter), for tests that
-    show what these defend against.
+    `user`: as root, the user id outside of the sandbox's user; None picks one (`some_user`). `sealed=False` omits what
+    a policy's process does to itself (limits, Landlock, the filter), for tests that show the attacks that these stop.
     """
     files = python_files.find(allowed_packages)
     config: dict[str, object] = {
@@ -75,7 +76,7 @@ def plan(
         "namespaces": tier == "bwrap",
         "home": POLICY_HOME,
         "devices": [device for device in _DEVICES if os.path.exists(device)],
-        # An interpreter that is installed there must stay visible; the policy's TMPDIR is elsewhere in any case.
+        # An interpreter installed below /tmp must stay visible. The policy's TMPDIR is elsewhere in any case.
         "own_tmp": not any(path.startswith("/tmp/") for path in files.read),
         "packages": _PACKAGES,
         "warm": [name for name in allowed_packages if name != "numpy"],
@@ -111,12 +112,12 @@ def plan(
 
 
 def some_user() -> int:
-    """A user that no machine gives to anyone, most likely another one each time."""
+    """A random user id that no machine assigns, most likely a different one each time."""
     return _FIRST_UID + secrets.randbelow(0x10000)
 
 
 def bubblewrap() -> str:
-    """Where it is. SandboxError, with how to install it, when it is not."""
+    """Path of bubblewrap. Raises SandboxError, with how to install it, when it is missing."""
     found = shutil.which("bwrap")
     if found is None:
         raise SandboxError(f"bubblewrap is not installed: {distribution.install('bubblewrap')}")
@@ -124,7 +125,7 @@ def bubblewrap() -> str:
 
 
 def landlock_version() -> int:
-    """ABI version of the kernel's Landlock; 0 when there is none."""
+    """ABI version of the kernel's Landlock; 0 without Landlock."""
     import ctypes
 
     libc = ctypes.CDLL(None, use_errno=True)
@@ -132,7 +133,8 @@ def landlock_version() -> int:
 
 
 def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
-    # No site (-S), no user site (-s), no script folder on the path (-P): the path is stdlib and allowed packages.
+    # No site (-S), no user site (-s), no script folder on the path (-P): only the standard library and allowed
+    # packages.
     return (files.interpreter, "-s", "-S", "-P", "-B", f"{folder}/zygote.py")
 
 
@@ -140,7 +142,7 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     command = [bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "policy"]
     command += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
     if as_root:
-        # The zygote makes the user namespace itself, so that the policy's user is nobody outside either.
+        # The zygote makes the user namespace itself, so that the policy's user is unprivileged outside too.
         command += ["--cap-add", "CAP_SYS_ADMIN", "--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID"]
     else:
         command += ["--unshare-user", "--uid", "65534", "--gid", "65534", "--cap-add", "CAP_SYS_ADMIN"]
@@ -179,7 +181,8 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
 
 
 def _own_files(files: python_files.PythonFiles) -> dict[str, object]:
-    """What the zygote is to put copies in place of, and where it may work on them."""
+    """Folders that the zygote replaces by copies (of `libraries`, only the files needed), and the folder where it makes
+    them."""
     folders: list[str] = []
     libraries: list[str] = []
     for path in filter(os.path.isdir, files.read):
@@ -189,17 +192,18 @@ def _own_files(files: python_files.PythonFiles) -> dict[str, object]:
 
 
 def _shown_at(path: str) -> str:
-    """Where a folder lies: links to folders are links in the sandbox too."""
+    """The folder's real path when it is a link: the sandbox shows it there, with the same link."""
     return os.path.realpath(path) if os.path.islink(path) else path
 
 
 def parents(paths: list[str]) -> list[str]:
-    """The folders above these: those that bubblewrap makes by itself are closed to other users than its own."""
+    """All parent folders of these paths, to be made explicitly: bubblewrap makes them accessible to its own user
+    alone."""
     return sorted({str(parent) for path in paths for parent in Path(path).parents} - {"/"})
 
 
 def _package_links(files: python_files.PythonFiles, scratch: Path) -> Path:
-    """A folder with links to the allowed packages only."""
+    """Makes a folder that has only links to the allowed packages."""
     folder = scratch / "packages"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""What the whole machine gives to evopolicy, beside the sandbox: rows of `evopolicy doctor`."""
+"""Checks what this machine provides, apart from the sandbox: rows of `evopolicy doctor`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLAYS = {
 
 
 def examine_machine() -> tuple[Check, ...]:
-    """All checks, in the order in which to show them. Nothing is started."""
+    """All checks, in display order. Starts no process."""
     return (_python(), *_extras(), _graphics(), _browser(), _scratch(), _disk(), _ports(), _date(), _files())
 
 
@@ -130,7 +130,7 @@ def _ports() -> Check:
 
 
 def _date() -> Check:
-    # Nothing newer than the present can lie here, as long as the clock is right.
+    # With a correct clock, no installed file is newer than the present.
     newest = Path(__file__).stat().st_mtime
     if time.time() >= newest:
         return Check(name="date", verdict="ok", found=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))

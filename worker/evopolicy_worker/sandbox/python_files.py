@@ -1,6 +1,6 @@
-"""Which files a policy's interpreter needs: the standard library, shared libraries, and the allowed packages alone.
+"""The files that a policy's interpreter needs: the standard library, shared libraries, and only the allowed packages.
 
-Never the site-packages folder as a whole: simulators and our own code are in it.
+The site-packages folder is never shown as a whole, since it has simulators and our own code.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ _SYSTEM_PREFIXES = ("/usr",)
 
 
 class PythonFiles(msgspec.Struct, frozen=True, kw_only=True):
-    """What to show of this machine, read-only."""
+    """Files of this machine that the sandbox shows, read-only."""
 
     interpreter: str
-    """The interpreter's own file, no link and no launcher of a virtual environment."""
+    """The interpreter's real file: not a link, nor the launcher of a virtual environment."""
     read: tuple[str, ...]
-    """Files and folders, to be seen at their own paths."""
+    """Files and folders, shown at their own paths."""
     libraries: tuple[str, ...]
-    """Those of them that hold the system's shared libraries, of which Python needs a few."""
+    """Those paths in `read` that hold the system's shared libraries, of which Python needs only a few."""
     hidden: tuple[str, ...]
-    """Folders below those in `read` that must look empty."""
+    """Folders below those in `read` that must appear empty."""
     packages: dict[str, str]
-    """Name in the packages folder, and where it is: modules, packages and their bundled libraries."""
+    """Modules, packages and their bundled libraries: name in the packages folder → path on this machine."""
 
 
 def find(allowed_packages: tuple[str, ...]) -> PythonFiles:
-    """The files for this interpreter and these importable packages with what they depend on.
+    """The files for this interpreter, and these importable packages with their dependencies.
 
-    SandboxError naming a package that is not installed.
+    Raises SandboxError, naming the package, when an allowed package is not installed.
     """
     interpreter = os.path.realpath(getattr(sys, "_base_executable", sys.executable))
     prefix = os.path.realpath(sys.base_prefix)
@@ -47,11 +47,11 @@ def find(allowed_packages: tuple[str, ...]) -> PythonFiles:
     if prefix in _SYSTEM_PREFIXES:
         read += [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
     else:
-        # A prefix of Python's own (pyenv, conda, uv, /usr/local): libraries beside the standard library too.
+        # A separate prefix (pyenv, conda, uv, /usr/local) also has shared libraries beside the standard library.
         read.append(f"{prefix}/lib")
     libraries = _shared_libraries()
     read += libraries
-    # Resolved one by one: `/lib` is a link to `/usr/lib` on most systems, and both names are used.
+    # Not resolved: `/lib` is a link to `/usr/lib` on most systems, and both names are used.
     existing = tuple(dict.fromkeys(path for path in read if os.path.exists(path)))
     return PythonFiles(
         interpreter=interpreter,
@@ -76,7 +76,7 @@ def _shared_libraries() -> list[str]:
 
 
 def _site_folders(read: tuple[str, ...]) -> set[str]:
-    """Folders of installed packages below what is shown."""
+    """Folders of installed packages below the shown folders."""
     found: set[str] = set()
     for root in read:
         if not os.path.isdir(root):
@@ -104,9 +104,10 @@ def _packages(allowed: tuple[str, ...]) -> dict[str, str]:
 
 
 def _one_package(name: str, *, required: bool) -> tuple[dict[str, str], list[str]]:
-    """Folders and modules of one package, and the distributions it depends on."""
+    """Folders and modules of one package, and its dependencies. Raises SandboxError when a `required` one is not
+    installed."""
     if name == "numpy":
-        # The usual case, without reading every distribution's metadata.
+        # The common case, handled without reading every distribution's metadata.
         spec = importlib.util.find_spec("numpy")
         if spec is None or not spec.submodule_search_locations:
             raise SandboxError(

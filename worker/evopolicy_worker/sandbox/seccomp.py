@@ -1,19 +1,19 @@
-"""The system calls that a policy may make, and those that an environment process may not: seccomp filters by hand.
+"""Seccomp filters, assembled by hand: the system calls that a policy may make, and those that an environment process
+may not.
 
 Rules of the policy's filter, which this module owns:
-- What is not listed is refused (EPERM; ENOSYS for numbers younger than the lists, so that a C library falls back).
-- No process is ever made: `fork` and the like answer EAGAIN, as at a process limit. Threads are allowed.
-- No signals to anyone else, and none to itself that nobody can tell from one of outside: SIGKILL and the stops, also by a timer
-  or a limit of its own. `endings` rests on this.
-- No sockets, no mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any
-  limit) or CPU affinity.
-- Nothing that moves or shows a number of the whole machine: pipes and shared memory without a file (inode numbers), free
-  blocks and huge pages, mount ids, which `statx` shows whatever it is asked for. Nor does a `sync` reach a disk: how long it
-  takes depends on what others write.
-- Sandboxes show the same read-only files, and nothing of them may carry a message: no locks, no waiting for each other on a
-  mapped page (a futex that is not private to the process), no looking at or changing what of them is in memory. Nor is
-  there a view of the machine's memory and load.
-- The filter is for one process: its own pid is put in place of `PID_MARK` when it seals itself.
+- Unlisted calls are refused with EPERM; with ENOSYS for numbers newer than the lists, so that a C library falls back.
+- New processes are impossible: `fork` and the like fail with EAGAIN, as at a process limit. Threads are allowed.
+- Signals to other processes are refused. So are those to itself that could not be told from signals from outside:
+  SIGKILL and the stop signals, also by a timer or a limit of its own. `endings` depends on this.
+- No sockets, mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any limit) or CPU affinity.
+- No call may change or show a machine-wide number: pipes and shared memory without a file (inode numbers), free blocks
+  and huge pages, and mount ids, which `statx` always shows. `sync` calls do nothing, because the time that they take
+  depends on other processes' writes.
+- All sandboxes show the same read-only files, which must not carry messages: no locks, no futex on a shared mapped page
+  (one that is not private to the process), and no view of or change to which pages are in memory. The machine's memory
+  and load are hidden too.
+- The filter is for one process: its pid replaces `PID_MARK` when it seals itself.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from evopolicy_common.seccomp import (
 from evopolicy_common.seccomp.numbers import NUMBERS, REACHING_OUT, REFUSED, SOCKET
 
 PID_MARK = 0x7FFFABCD
-"""Stands in the filter for the pid of the process that installs it; instructions are 8 bytes, this is their last word."""
+"""Placeholder in the filter for the pid of the process that installs it. It is the last word of an 8-byte
+instruction."""
 
 _FCNTL = (
     0,
@@ -82,26 +83,26 @@ _CLONE_NAMESPACES = 0x7E020000
 _YOUNGEST = 450
 
 Interval = tuple[int, list[Instruction]]
-"""The first number, and what to do with it: instructions that end in a verdict."""
+"""The first system call number of an interval, and the instructions that decide on its calls."""
 
 
 def supported() -> bool:
-    """Whether there are lists for this machine's processor."""
+    """Whether the lists cover this machine's processor."""
     return platform.machine() in NUMBERS
 
 
 def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
-    """The program: 8 bytes an instruction, to be given to seccomp(2) with `PID_MARK` replaced.
+    """The policy's filter program, 8 bytes per instruction, for seccomp(2) once `PID_MARK` is replaced.
 
-    `sees_the_machines_files`: where only Landlock stands before them, which lets an owner change modes and times, and on
-    older kernels cut a file off. Those calls are then refused, modes and times without a word, as `shutil.copy` sets them.
-    Raises SandboxError on a processor that the lists do not cover.
+    `sees_the_machines_files`: only Landlock protects these, which lets an owner change modes and times, and on older
+    kernels truncate files. These calls are then blocked; those for modes and times report success, because
+    `shutil.copy` makes them. Raises SandboxError on a processor that the lists do not cover.
     """
     machine = _machine()
     numbers = NUMBERS[machine]
     blocks = {
-        # Its caller looks at the word again, as after any other wake, and again: the C library's join of a thread asks
-        # so, and computes while it waits.
+        # A wait on a futex that is not private returns EAGAIN, so its caller polls. The C library joins threads with
+        # such a wait, and so uses CPU while it waits.
         "futex": [
             (LOAD, 0, 0, argument(1)),
             (AND, 0, 0, _FUTEX_PRIVATE),
@@ -114,19 +115,19 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
             refuse(errno.EAGAIN),
             refuse(errno.EINVAL),
         ],
-        # Advice, which may be ignored.
+        # Advice, which may be ignored: success without effect.
         "fadvise64": [refuse(0)],
         "readahead": [refuse(0)],
         "madvise": one_of(2, _MADVISE, refuse(errno.EINVAL)),
         "fsync": [refuse(0)],
         "fdatasync": [refuse(0)],
         "msync": [refuse(0)],
-        # Pipes are for processes, of which there are no more: `subprocess` fails here as it would at `fork`.
+        # Pipes serve child processes, which are refused anyway: `subprocess` fails here as it would at `fork`.
         "pipe": [refuse(errno.EAGAIN)],
         "pipe2": [refuse(errno.EAGAIN)],
         "statfs": [refuse(errno.ENOSYS)],
         "fstatfs": [refuse(errno.ENOSYS)],
-        # Who asks so falls back to `newfstatat`, which shows no mount.
+        # Callers fall back to `newfstatat`, which shows no mount ids.
         "statx": [refuse(errno.ENOSYS)],
         "mmap": [
             (LOAD, 0, 0, argument(3)),
@@ -139,7 +140,7 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
             refuse(errno.ENOMEM),
             ALLOWED,
         ],
-        # The C library uses `preadv` where no flag is asked for.
+        # Without flags, the C library falls back to `preadv` and `pwritev`.
         "preadv2": [refuse(errno.ENOSYS)],
         "pwritev2": [refuse(errno.ENOSYS)],
         "ioctl": one_of(1, _IOCTL, refuse(errno.ENOTTY)),
@@ -147,7 +148,7 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         "prctl": one_of(0, _PRCTL, refuse(errno.EPERM)),
         "kill": _own_signals(1),
         "tgkill": _own_signals(2),
-        # Its limits may be looked at. Of another CPU limit it could be killed as if from outside.
+        # A process may read its own limits. With a CPU limit of its own it could be killed as if from outside.
         "prlimit64": [
             (LOAD, 0, 0, argument(2)),
             (JUMP_EQUAL, 1, 0, 0),
@@ -157,7 +158,7 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
             refuse(errno.EPERM),
             *one_of(0, (0, PID_MARK), refuse(errno.EPERM)),
         ],
-        # As on a file system without them: `shutil.copytree` goes on then, and with no other answer.
+        # As on a file system without them: `shutil.copytree` ignores this error, and no other.
         **{name: [refuse(errno.ENOTSUP)] for name in _EXTENDED_ATTRIBUTES},
         "clone": [
             (LOAD, 0, 0, argument(0)),
@@ -168,23 +169,24 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         ],
         "fork": [refuse(errno.EAGAIN)],
         "vfork": [refuse(errno.EAGAIN)],
-        # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
+        # Its flags are in memory, which a filter cannot read. The C library falls back to `clone`.
         "clone3": [refuse(errno.ENOSYS)],
     }
     if sees_the_machines_files:
         blocks |= {name: [refuse(0)] for name in _MODES_AND_TIMES}
         blocks |= {"truncate": [refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
-        # Its flags lie in memory.
+        # Its flags are in memory, which a filter cannot read.
         blocks["openat2"] = [refuse(errno.ENOSYS)]
     return _assembled(machine, _intervals(numbers, blocks))
 
 
 def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
-    """The program for an environment process, which lists what is refused: simulators start processes and open devices.
+    """The filter program of an environment process. It lists refused calls only, as simulators start processes and open
+    devices.
 
-    `namespaces`: those that it is in keep other processes and the network from it; else sockets are refused, and other
-    processes' limits. `signals`: it may send some, as they reach nobody outside. Raises SandboxError on a processor that
-    the lists do not cover.
+    `namespaces`: whether namespaces isolate it from other processes and the network. If not, the filter refuses sockets
+    and access to other processes' limits. `signals`: whether it may send signals, which then cannot reach processes
+    outside. Raises SandboxError on a processor that the lists do not cover.
     """
     machine = _machine()
     blocks = {number: [refuse(errno.EPERM)] for number in REFUSED[machine].values()}
@@ -202,7 +204,7 @@ def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
         ALLOWED,
         refuse(errno.EPERM),
     ]
-    # Its flags lie in memory, where a filter cannot look: without it the C library uses clone.
+    # Its flags are in memory, which a filter cannot read. The C library falls back to `clone`.
     blocks[numbers["clone3"]] = [refuse(errno.ENOSYS)]
     intervals: list[Interval] = []
     for number in range(max(blocks) + 2):
@@ -222,12 +224,12 @@ def _machine() -> str:
 
 
 def _assembled(machine: str, intervals: list[Interval]) -> bytes:
-    """The whole program: another architecture's calls end the process, the others are looked up."""
+    """The whole program: kills the process on a call of another architecture, and looks up all other calls."""
     return program(machine, KILLED, _search(intervals))
 
 
 def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) -> list[Interval]:
-    """What happens to every number, as intervals in ascending order; each lasts to where the next begins."""
+    """The code for every call number, as intervals in ascending order. Each extends to the start of the next."""
     by_number = {number: blocks.get(name, [ALLOWED]) for name, number in numbers.items()}
     found: list[Interval] = []
     for number in range(_YOUNGEST + 1):
@@ -238,7 +240,7 @@ def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) ->
 
 
 def _search(intervals: list[Interval]) -> list[Instruction]:
-    """A binary search for the number: the kernel runs the filter for each number when it is installed."""
+    """A binary search for the call number, because the kernel runs the filter once per number when it is installed."""
     if len(intervals) == 1:
         return intervals[0][1]
     half = len(intervals) // 2
@@ -247,7 +249,7 @@ def _search(intervals: list[Interval]) -> list[Instruction]:
 
 
 def _no_cutting(index: int) -> list[Instruction]:
-    """Allows opening a file unless it is opened for reading and cut off all the same."""
+    """Allows opening a file, unless it is opened read-only and truncated."""
     return [
         (LOAD, 0, 0, argument(index)),
         (AND, 0, 0, os.O_TRUNC | os.O_ACCMODE),
@@ -258,7 +260,8 @@ def _no_cutting(index: int) -> list[Instruction]:
 
 
 def _own_signals(index: int) -> list[Instruction]:
-    """Allows a signal to itself, in that argument, unless it is one of `_NOT_TO_ITSELF`."""
+    """Allows a signal to the process itself unless it is in `_NOT_TO_ITSELF`. `index`: the argument with the signal
+    number."""
     block: list[Instruction] = [(LOAD, 0, 0, argument(index))]
     for number in _NOT_TO_ITSELF:
         block += [(JUMP_EQUAL, 0, 1, number), refuse(errno.EPERM)]

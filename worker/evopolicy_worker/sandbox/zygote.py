@@ -1,7 +1,9 @@
-"""The worker's end of a zygote: starts it, has it fork policy processes, learns how they ended.
+"""The environment process's handle of a zygote: starts it, has it fork policy processes, and gets their exit statuses.
 
-Rules: the zygote is ours and answers at once; when it does not, the slot is dead. Everything that a policy's process
-is given, and all that it tells, passes over pipes of its own, never through the zygote: a later one could read it there.
+Rules:
+- The zygote runs our code and replies at once. If it does not, the slot is dead.
+- All data to and from a policy's process passes over its own pipes, never through the zygote, where a later policy's
+  process could read it.
 """
 
 from __future__ import annotations
@@ -28,14 +30,14 @@ ANSWER_TIMEOUT_S = 20.0
 DEATH_TIMEOUT_S = 10.0
 _MAX_MESSAGE = 1 << 16
 _REPORT = struct.Struct("8xi12xi100x5q")
-"""Of `siginfo_t` (128 bytes) the code and the status, of `struct rusage` user and system time and the largest memory."""
+"""Code and status from `siginfo_t` (128 bytes); user and system time and peak memory from `struct rusage`."""
 
 
 class Child(msgspec.Struct, kw_only=True):
-    """A forked process that waits for its first request, and our ends of its pipes."""
+    """A forked policy process, and our ends of its pipes."""
 
     host_pid: int
-    """In ours; 0 when it is gone already."""
+    """Its pid in our namespace; 0 when it is already gone."""
     pidfd: int
     requests: int
     replies: int
@@ -43,7 +45,7 @@ class Child(msgspec.Struct, kw_only=True):
     stderr: int
 
     def kill(self) -> None:
-        """SIGKILL. In its own pid namespace this ends everything that it may have started."""
+        """Sends SIGKILL. In a pid namespace of its own, this also kills everything that it may have started."""
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
@@ -56,10 +58,10 @@ class Exit(msgspec.Struct, frozen=True, kw_only=True):
     """How a child ended."""
 
     status: int
-    """As from waitpid."""
+    """A waitpid status."""
     cpu_s: float
     peak_bytes: int = 0
-    """The most memory that it held."""
+    """Peak resident memory."""
 
     def describe(self) -> str:
         if os.WIFSIGNALED(self.status):
@@ -74,7 +76,8 @@ class Zygote:
     """One running zygote. Not thread-safe."""
 
     def __init__(self, jail: Jail, scratch: Path) -> None:
-        """Starts it and waits until it can fork. SandboxError, with what bubblewrap or Python said, when it cannot."""
+        """Starts the zygote and waits until it can fork. Raises SandboxError, with the output of bubblewrap or Python,
+        when it cannot."""
         self._dying: list[Child] = []
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(START_TIMEOUT_S)
@@ -101,7 +104,8 @@ class Zygote:
                     f"the sandbox does not start: {error}; {words or 'it said nothing'}"
                 ) from error
         try:
-            # So that a host which cannot make processes here is told now. The first two forks leave traces for the next.
+            # Detects a host that cannot make processes here. Also, the first two forks leave traces that later ones
+            # could see.
             for _ in range(2):
                 self.bury_later(self.spawn())
             self.bury()
@@ -110,7 +114,8 @@ class Zygote:
             raise
 
     def spawn(self) -> Child:
-        """A new policy process. SlotDiedError when the zygote is gone; SandboxError when there can be no process."""
+        """Forks a policy process. Raises SlotDiedError when the zygote is gone, SandboxError when it cannot make a
+        process."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(ANSWER_TIMEOUT_S)
         try:
@@ -138,7 +143,7 @@ class Zygote:
         )
 
     def wait(self, child: Child) -> Exit:
-        """How a killed or ended child ended. Takes its entry from the process table."""
+        """Reaps a child that was killed or has ended. Raises SlotDiedError when the zygote does not reply."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with ours:
@@ -155,12 +160,12 @@ class Zygote:
         )
 
     def bury_later(self, child: Child) -> None:
-        """Kill the child now, and learn of its end when there is time: a process takes milliseconds to be taken down."""
+        """Kills the child now; `bury` reaps it later, because the kernel takes milliseconds to tear a process down."""
         child.kill()
         self._dying.append(child)
 
     def bury(self) -> None:
-        """Waits for the ends of those that were to be buried later. SandboxError when one does not end."""
+        """Waits for and reaps the children of `bury_later`. Raises SandboxError when one does not end."""
         while self._dying:
             child = self._dying[0]
             if not wait_dead(child.pidfd, DEATH_TIMEOUT_S):
@@ -170,7 +175,7 @@ class Zygote:
             child.close()
 
     def close(self) -> None:
-        """Ends the zygote and with it every process in its sandbox."""
+        """Ends the zygote, and with it every process in its sandbox."""
         with contextlib.suppress(OSError):
             self._control.send(b"q ")
         self._control.close()
@@ -203,7 +208,7 @@ class Zygote:
 
 
 def pid_of(pidfd: int) -> int:
-    """The process's id in our namespace; 0 when it is gone."""
+    """The process's pid in our namespace; 0 when it is gone."""
     with open(f"/proc/self/fdinfo/{pidfd}") as lines:
         for line in lines:
             if line.startswith("Pid:"):
@@ -212,7 +217,7 @@ def pid_of(pidfd: int) -> int:
 
 
 def wait_dead(pidfd: int, timeout_s: float) -> bool:
-    """Waits until the process has ended; False when it has not in that time."""
+    """Waits until the process has ended; False on timeout."""
     import select
 
     poller = select.poll()
@@ -225,7 +230,7 @@ def wait_dead(pidfd: int, timeout_s: float) -> bool:
 
 
 def _map_user(pid: int, user: int) -> None:
-    """Makes the namespace's user 65534 the unprivileged `user` of this machine."""
+    """Maps the namespace's user 65534 to the unprivileged user id `user` of this machine."""
     Path(f"/proc/{pid}/setgroups").write_text("deny")
     Path(f"/proc/{pid}/gid_map").write_text(f"65534 {user} 1\n")
     Path(f"/proc/{pid}/uid_map").write_text(f"65534 {user} 1\n")

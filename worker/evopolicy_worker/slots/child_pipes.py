@@ -1,4 +1,5 @@
-"""Start-up of a worker's child processes: they end with their parent, and talk to it over pipes that no other code writes to."""
+"""Start-up of a worker's child processes: they end with their parent, and talk to it over pipes that no other code
+writes to."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from evopolicy_common.processes.parent_death import end_with_parent
 def take_pipes() -> tuple[int, int]:
     """Moves standard input and output to new descriptors and returns these: commands, answers.
 
-    From now on standard input is empty, and prints of simulators and drivers go to standard error. Ctrl-C is ignored; the
-    parent handles it, and this process ends with its parent.
+    From now on standard input is empty, and prints of simulators and drivers go to standard error. Ctrl-C is ignored;
+    the parent handles it, and this process ends with its parent.
     """
     end_with_parent(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

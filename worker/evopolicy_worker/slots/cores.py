@@ -1,6 +1,7 @@
 """Assigns a CPU core to each slot. The workers of one machine coordinate by file locks.
 
-A slot's environment and policy processes share one core: a pipe round trip costs 7 µs there and over 100 µs across cores.
+A slot's environment and policy processes share one core: a pipe round trip costs 7 µs there and over 100 µs across
+cores.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """How a slot's processes can end, and who is responsible: a table, without I/O.
 
-Rule: an ending that a policy's process can cause by itself is the policy's result. An ending that it provably cannot cause is
-an infrastructure failure, and the episode is played again. The proof is the seal (`sandbox.seccomp`): it refuses a policy all
-signals to others, and SIGKILL and stop signals to itself. So a SIGKILL that no limit explains came from outside.
+Rule: an ending that a policy's process can cause by itself is the policy's result. An ending that it provably cannot
+cause is an infrastructure failure, and the episode is played again. The proof is the seal (`sandbox.seccomp`): it
+refuses a policy all signals to others, and SIGKILL and stop signals to itself. So a SIGKILL that no limit explains came
+from outside.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 
 First = Literal["policy", "sandbox", "environment", "supervisor"]
-"""Which process ended first. `sandbox`: bubblewrap or the zygote, whose end also ends the policy's process. `supervisor`: the
-worker."""
+"""Which process ended first. `sandbox`: bubblewrap or the zygote, whose end also ends the policy's process.
+`supervisor`: the worker."""
 How = Literal["exit", "fault", "signal", "SIGKILL", "stop", "pipe", "frame"]
-"""`exit`: with a status. `fault`: by a signal that a process's own error causes (`FAULTS`). `signal`: by any other signal but
-SIGKILL. `stop`: stopped and not resumed. `pipe`: it closed its pipe but is alive. `frame`: it sent an invalid frame."""
+"""`exit`: with a status. `fault`: by a signal that a process's own error causes (`FAULTS`). `signal`: by any other
+signal but SIGKILL. `stop`: stopped and not resumed. `pipe`: it closed its pipe but is alive. `frame`: it sent an
+invalid frame."""
 
 FAULTS = frozenset(
     {
@@ -41,10 +43,11 @@ class Ending(NamedTuple):
     limit: FailureCategory | None = None
     """Category of the limit that explains it; None when none does."""
     began: bool = True
-    """For the policy: whether any code of its bundle had run. For the environment: whether an action of the policy had reached
-    it in this episode."""
+    """For the policy: whether any code of its bundle had run. For the environment: whether an action of the policy had
+    reached it in this episode."""
     held: bool = True
-    """Whether the policy's process cannot have killed or stopped itself: it is sealed, and has no CPU limit of the system."""
+    """Whether the policy's process cannot have killed or stopped itself: it is sealed, and has no CPU limit of the
+    system."""
 
 
 class Row(NamedTuple):
@@ -54,7 +57,8 @@ class Row(NamedTuple):
     first: frozenset[First]
     how: frozenset[How] | None
     verdict: FailureCategory | Literal["limit", "outside"]
-    """The policy's failure; `limit`: the category of that limit. `outside`: an infrastructure failure, to be played again."""
+    """The policy's failure; `limit`: the category of that limit. `outside`: an infrastructure failure, to be played
+    again."""
     limit: bool | None = None
     began: bool | None = None
     held: bool | None = None

@@ -1,8 +1,8 @@
 """The slot's client of its video process: sends it episodes and receives MP4 bytes.
 
 Rules:
-- A video is optional. Where an environment cannot be rendered here, or the renderer crashes or times out, the episode keeps
-  its outcome without a video, and a note on standard error gives the reason.
+- A video is optional. Where an environment cannot be rendered here, or the renderer crashes or times out, the episode
+  keeps its outcome without a video, and a note on standard error gives the reason.
 - The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes.
 - It is the slot's child: pinned to the same core, and ended with the slot.
 """
@@ -97,7 +97,8 @@ class VideoRecorder:
                 pipe.close()
 
     def _ask(self, env: str, order: bytes, deadline: float, cancelled: Callable[[], bool]) -> Made | None:
-        """The process's answer; None when cancelled. Raises OSError, or WorkerError when the process ends or times out."""
+        """The process's answer; None when cancelled. Raises OSError, or WorkerError when the process ends or times
+        out."""
         process = self._running(env)
         assert process.stdin is not None
         assert process.stdout is not None

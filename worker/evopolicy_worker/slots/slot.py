@@ -1,10 +1,10 @@
 """A slot: plays one job at a time on one core. The supervisor's handle of an environment process and its sandbox.
 
 Rules:
-- A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError: the job
-  is played elsewhere), as the table in `endings` decides.
-- If the environment's process crashes on a policy's actions, a new process plays the episode with random actions, and then the
-  rest of the job.
+- A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError:
+  the job is played elsewhere), as the table in `endings` decides.
+- If the environment's process crashes on a policy's actions, a new process plays the episode with random actions, and
+  then the rest of the job.
 - After `cancel` the slot is usable. After an error `start` restarts it.
 """
 
@@ -48,7 +48,8 @@ MAX_ANSWER_BYTES = 1 << 31
 
 
 class Slot:
-    """An environment process in its own jail, with the policies that it plays in a sandbox inside. Used by one asyncio loop."""
+    """An environment process in its own jail, with the policies that it plays in a sandbox inside. Used by one asyncio
+    loop."""
 
     def __init__(
         self,
@@ -60,8 +61,8 @@ class Slot:
         sealed: bool = True,
         definitions: tuple[Entry, ...] = (),
     ) -> None:
-        """`core`: the CPU that all processes are pinned to; None for no pinning. `scratch`: a folder for this slot alone.
-        `definitions`: environments that do not ship.
+        """`core`: the CPU that all processes are pinned to; None for no pinning. `scratch`: a folder for this slot
+        alone. `definitions`: environments that do not ship.
 
         `sealed=False` (tests only) leaves the policy's process unsealed.
         """
@@ -90,7 +91,8 @@ class Slot:
     async def start(self) -> None:
         """Starts the processes, after ending any earlier ones.
 
-        Raises SandboxError, with a remedy, when this machine cannot provide the tier, and WorkerError for other failures.
+        Raises SandboxError, with a remedy, when this machine cannot provide the tier, and WorkerError for other
+        failures.
         """
         await self.close()
         self._scratch.mkdir(parents=True, exist_ok=True)
@@ -136,9 +138,9 @@ class Slot:
     ) -> tuple[EpisodeOutcome, ...]:
         """Plays a job and returns an outcome for each of its episodes, in order, with trajectories inline.
 
-        `bundle`: the unpacked bundle's folder; None for random actions. `on_progress` receives the numbers of finished episodes
-        and steps. A cancelled job returns an empty tuple. After a cancellation or an error, `begun` has what the policy had
-        returned. Raises SlotDiedError, SandboxError or WorkerError.
+        `bundle`: the unpacked bundle's folder; None for random actions. `on_progress` receives the numbers of finished
+        episodes and steps. A cancelled job returns an empty tuple. After a cancellation or an error, `begun` has what
+        the policy had returned. Raises SlotDiedError, SandboxError or WorkerError.
         """
         self._begun = begun.unpack(job)
         if self._process is None:
@@ -206,7 +208,8 @@ class Slot:
         return begun.pack(self._begun)
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
-        """Descriptions of these environments, which are made in the slot's process and stay there for jobs. Raises as `play`."""
+        """Descriptions of these environments, which are made in the slot's process and stay there for jobs. Raises as
+        `play`."""
         if self._process is None:
             raise WorkerError("the slot is not started")
         await self._send(messages.Describe(environments=tuple(env_ids)))
@@ -325,8 +328,8 @@ class Slot:
 
 
 def _children(pid: int, tier: Tier) -> list[int]:
-    """In tier bwrap, the processes below `pid` (bubblewrap) down to the environment's own. Empty in other tiers, where `pid` is the
-    environment's process."""
+    """In tier bwrap, the processes below `pid` (bubblewrap) down to the environment's own. Empty in other tiers, where
+    `pid` is the environment's process."""
     found: list[int] = []
     with contextlib.suppress(OSError, ValueError):
         for _ in range(2 if tier == "bwrap" else 0):
@@ -336,7 +339,8 @@ def _children(pid: int, tier: Tier) -> list[int]:
 
 
 def bundle_files(folder: Path, sent: str = "") -> messages.Files:
-    """The unpacked bundle in `folder`, without contents when its key is `sent`. Raises WorkerError when it cannot be read."""
+    """The unpacked bundle in `folder`, without contents when its key is `sent`. Raises WorkerError when it cannot be
+    read."""
     key = str(folder)
     names: list[tuple[str, bool, int]] = []
     data: list[bytes] = []

@@ -47,8 +47,8 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job. Answered by any number of Told, by Acting and Finished for each episode, and last by Played or Fault; by Begun
-    before these when an episode is given up."""
+    """Play this job. Answered by any number of Told; for each episode by Acting, when a policy's first action is due,
+    and Finished; by Begun when an episode is given up; and last by Played or Fault."""
 
     job: Job
     bundle: Files | None
