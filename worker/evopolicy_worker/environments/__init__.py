@@ -1,4 +1,4 @@
-"""Environments as the worker plays them: one interface, one adapter for Gymnasium, and toys without a simulator."""
+"""Environments as the worker plays them: one interface, an adapter for Gymnasium, and toys without a simulator."""
 
 from __future__ import annotations
 

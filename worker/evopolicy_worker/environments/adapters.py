@@ -1,7 +1,8 @@
-"""What of this software plays an environment, for its fingerprint: the adapter's revision and a digest of its code.
+"""The part of an environment's fingerprint that identifies our code: the adapter's revision and a digest of its source.
 
-The digest covers the modules that every episode goes through, the family's own, and the accelerations that serve the
-environment; tables of environments and task texts are no part of it, so that adding an environment changes no other's.
+The digest covers the modules that every episode uses, the family's own module, and the accelerations that serve the
+environment. Tables of environments and task texts are excluded, so that adding an environment changes no other's
+digest.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import evopolicy_worker
 from evopolicy_worker.environments.accelerations import ACCELERATIONS
 
 REVISION = 1
-"""Counts up when the modules that all environments share change what is played: scores of several are not compared."""
+"""Incremented when a change in the shared modules changes episodes. Scores of different revisions are not compared."""
 _ROOT = Path(evopolicy_worker.__path__[0])
 _SHARED = (
     *(
@@ -27,11 +28,14 @@ _SHARED = (
     "episodes/*.py",
     "sandbox/inside/*.py",
 )
-"""Modules that every episode goes through."""
+"""Modules that every episode uses."""
 
 
 def adapter(family: type, revision: int, gymnasium_id: str) -> str:
-    """`REVISION.FAMILY_REVISION+DIGEST` of what plays environments of that class, or that id where accelerations serve it."""
+    """`REVISION.FAMILY_REVISION+DIGEST` of the code that plays environments of this class.
+
+    `revision`: the family's. `gymnasium_id`: selects the accelerations that the digest includes.
+    """
     own = {str(Path(inspect.getfile(each)).resolve()) for each in family.__mro__ if _is_ours(each)}
     served = [each.name.partition("_")[0] for each in ACCELERATIONS if each.serves(gymnasium_id)]
     helpers = [f"environments/accelerations/{name}_*.py" for name in dict.fromkeys(served)]
@@ -49,7 +53,7 @@ def _digest(files: tuple[str, ...]) -> str:
 
 
 def versions(distributions: Iterable[str]) -> dict[str, str]:
-    """The installed versions by lowercase name; what is not installed is left out."""
+    """Installed versions by lowercase name. Distributions that are not installed are left out."""
     found: dict[str, str] = {}
     for name in distributions:
         try:

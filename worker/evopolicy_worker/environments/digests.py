@@ -1,6 +1,6 @@
-"""Writes the table of the definitions that ship: `python -m evopolicy_worker.environments.digests FILE`.
+"""Writes the digests of all shipped definitions: `python -m evopolicy_worker.environments.digests FILE`.
 
-An environment that cannot be made here keeps the digest that the file has. To be run with the versions of `constraints.txt`
+An environment that cannot be made here keeps its digest from the file. Run it with the versions of `constraints.txt`
 whenever a definition or a task text changes.
 """
 
@@ -16,7 +16,8 @@ from evopolicy_worker.environments import registry
 
 
 def digests(known: dict[str, str]) -> dict[str, str]:
-    """By id of each environment that ships, the first digits of its definition's digest; `known`: those of before."""
+    """The first `DEFINITION_DIGITS` digits of each shipped definition's digest, by environment id. `known`: the
+    previous ones."""
     offered = set(registry.offered())
     found = {
         env_id: registry.describe(env_id).digest()[:DEFINITION_DIGITS]
@@ -28,7 +29,7 @@ def digests(known: dict[str, str]) -> dict[str, str]:
 
 
 def main() -> None:
-    """The program."""
+    """Rewrites the file that the first argument names."""
     file = Path(sys.argv[1])
     known = json.loads(file.read_text()) if file.exists() else {}
     file.write_text(json.dumps(digests(known), indent=0) + "\n")

@@ -1,4 +1,4 @@
-"""Rewards that are vectors: recorded whole, and scored by a weighted sum."""
+"""Vector rewards: recorded in full, and scored by a weighted sum."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ _MAX_ELEMENTS = 64
 
 
 class Scalarisation:
-    """From a vector to the number that counts."""
+    """Maps reward vectors to scalar rewards."""
 
     def __init__(self, env_id: str, weights: Mapping[str, float]) -> None:
         self.weights = dict(weights)
-        """By name, in the order of the vector."""
+        """By element name, in the order of the vector."""
         self._env = env_id
         self._values = np.array(list(weights.values()), dtype=np.float64)
 
     @classmethod
     def of(cls, entry: Entry, env: gymnasium.Env[Any, Any]) -> Scalarisation | None:
-        """That of an environment; None where its rewards are numbers.
+        """The scalarisation of an environment; None when its rewards are scalars.
 
-        Its definition tells the elements' names, or else the environment's `reward_space` how many there are.
+        The definition names the elements; otherwise the environment's `reward_space` gives their number. Raises
+        WorkerError when the two disagree, or beyond `_MAX_ELEMENTS` elements.
         """
         space = getattr(env.unwrapped, "reward_space", None)
         shape = getattr(space, "shape", None)
@@ -48,14 +49,15 @@ class Scalarisation:
         return cls(entry.id, {name: entry.reward_weights.get(name, 1.0) for name in names})
 
     def texts(self, told: Mapping[str, str]) -> dict[str, str]:
-        """What each element stands for, as far as it is told; its weight is told in any case."""
+        """A text for each element: its description from `told`, or a default, and its weight."""
         return {
             name: f"{told.get(name, 'element of the reward vector')}; weight {weight:g}"
             for name, weight in self.weights.items()
         }
 
     def scalar(self, reward: Any, info: dict[str, Any]) -> float:
-        """The number that a vector counts; it is put into `info` whole, and by name under `rewards`."""
+        """The weighted sum of a vector. Puts the elements into `info`: as `reward_vector`, and by name as `rewards`.
+        Raises WorkerError when their number is wrong."""
         vector = np.asarray(reward, dtype=np.float64).reshape(-1)
         if vector.size != self._values.size:
             raise WorkerError(

@@ -1,7 +1,7 @@
-"""A few random steps in an environment that nobody vouches for, before it is announced: does it keep its word?
+"""Plays a few random steps in an environment that does not ship, to check it before the worker offers it.
 
-What is found here would otherwise fail an episode: an observation outside its space, a reward that is no number, spaces that
-change, a `reset` that raises.
+Finds errors that would otherwise fail an episode: an observation outside its space, a reward that is not finite, spaces
+that change, a `reset` or `step` that raises.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ SEEDS = (0, 1)
 
 
 def play(environment: Environment, bare: Callable[[], gymnasium.Env[Any, Any]], env_id: str) -> None:
-    """WorkerError that names the environment, the field, and what to change in it. `bare`: what it plays now."""
+    """Raises WorkerError that names the environment, the field and the remedy. `bare()` returns its current Gymnasium
+    environment."""
     rng = np.random.default_rng(0)
     told = environment.description
     for seed in SEEDS:

@@ -1,4 +1,4 @@
-"""The wrappers that an environment file asks for."""
+"""Wrappers that an environment file requests."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 def wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymnasium.Env[Any, Any]:
-    """`env` in that wrapper. WorkerError that names environment and wrapper when there is none of that name, or it does not
-    take its arguments."""
+    """`env` in that wrapper. Raises WorkerError, naming environment and wrapper, when the wrapper is unknown or cannot
+    be applied with its arguments."""
     where = f"environment {env_id}, wrapper {wrapper.wrapper!r}"
     module, colon, name = wrapper.wrapper.rpartition(":")
     try:

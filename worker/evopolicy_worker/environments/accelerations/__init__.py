@@ -1,15 +1,15 @@
-"""Faster ways to the same episode: small replacements of library functions where a simulator wastes its time.
+"""Accelerations: faster replacements of slow library functions that leave every episode the same.
 
 Rules that this package owns:
-- An acceleration changes no bit of any observation, reward, flag or `info`, and none of a rendered picture. Each module
-  says which library function it replaces and why the result is the same. Where floating point is involved, either the
-  library's own operations are made in the library's order, or a cheap estimate decides what *not* to compute, with a
-  margin far above its error.
-- It touches only the environment that it was given (`specialise` swaps the class of that one object for a subclass);
-  library modules and classes stay as they are.
-- It is used only with versions it was proved on (`PROVED`): with any other it stands aside, and says so once.
-- `tests/conformance/environments/test_accelerations.py` compares each with the plain environment;
-  `acceleration_checks.py` beside it does so for any number of seeds, with random actions and competent ones.
+- An acceleration changes no bit of any observation, reward, flag, `info` or rendered picture. Each module names the
+  library function that it replaces and gives the reason why the result is the same. With floating point, it either does
+  the library's own operations in the library's order, or uses a cheap estimate only to skip computations, with a margin
+  far above the estimate's error.
+- It changes only the given environment (`specialise` replaces the class of that one object by a subclass). Library
+  modules and classes stay unchanged.
+- It is used only with the versions it was proved on (`PROVED`). With any other it is off, and a warning is logged once.
+- `tests/conformance/environments/test_accelerations.py` compares each with the plain environment.
+  `acceleration_checks.py` beside it does so for any number of seeds, with random and with competent actions.
 
 They are on by default; `make(env_id, accelerations=False)` or `EVOPOLICY_ACCELERATIONS=off` switches them off.
 """

@@ -1,6 +1,6 @@
-"""Which accelerations there are, of which environments, and the versions of the libraries they were proved on.
+"""The table of accelerations: the environments that each serves, and the library versions on which they were proved.
 
-This module imports no simulator, and an acceleration's own module is imported only when its versions fit.
+This module imports no simulator. It imports an acceleration's own module only when the installed versions fit.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ PROVED: Mapping[str, tuple[str, ...]] = {
     "numpy": ("2.4.6",),
     "pygame-ce": ("2.5.8",),
 }
-"""Versions with which the exhaustive comparison was run and found no difference, by distribution.
+"""Versions for which the exhaustive comparison found no difference, by distribution.
 
-That was 128 seeds of each environment, half with random actions and half with a competent driver, whole episodes of
-MiniGrid (349,956 steps) and roundabout (991); of parking the first 200 steps (17,618 in all); of CarRacing the first 100 steps of 128 seeds, whole
-episodes of 24 more, and 4,000 pictures of a car put anywhere at any angle, speed and moment.
+It played 128 seeds of each environment, half with random actions and half with a competent driver: whole episodes of
+MiniGrid (349,956 steps) and roundabout (991), the first 200 steps of parking (17,618 in all), and the first 100 steps
+of CarRacing. For CarRacing it also played whole episodes of 24 more seeds, and rendered 4,000 pictures of a car at
+random positions, angles, speeds and times.
 """
 
 
 _told: set[str] = set()
-"""Accelerations that a warning was given about."""
+"""Accelerations that a warning was logged about."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,14 @@ class Acceleration:
     """The module's name."""
     gymnasium_ids: tuple[str, ...]
     distributions: tuple[str, ...]
-    """Whose versions must be among the proved ones."""
+    """Distributions whose installed versions must be in `PROVED`."""
 
     def serves(self, gymnasium_id: str) -> bool:
         return gymnasium_id in self.gymnasium_ids
 
     def holds(self) -> bool:
-        """What the module itself has to check of this machine, if anything; a warning, once, when it does not hold."""
+        """Whether the module's own check of this machine passes, if it has one. Logs a warning once when it does
+        not."""
         check = getattr(self._module(), "holds", None)
         if check is None or check():
             return True
@@ -78,11 +80,11 @@ ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("highway_vehicles", _HIGHWAY, ("highway-env", "numpy")),
     Acceleration("highway_observations", _HIGHWAY, ("highway-env", "numpy")),
 )
-"""In the order of application."""
+"""In order of application."""
 
 
 def accelerate(gymnasium_id: str, env: Any) -> list[str]:
-    """Apply to a bare environment all accelerations that serve it and are usable; their names, in order."""
+    """Applies all usable accelerations that serve this environment to a bare one. Returns their names, in order."""
     applied = []
     for acceleration in ACCELERATIONS:
         if acceleration.serves(gymnasium_id) and usable(acceleration) and acceleration.holds():
@@ -92,7 +94,7 @@ def accelerate(gymnasium_id: str, env: Any) -> list[str]:
 
 
 def usable(acceleration: Acceleration) -> bool:
-    """Whether the installed versions are proved ones; a warning, once per acceleration, when they are not."""
+    """Whether the installed versions are proved ones. Logs a warning, once per acceleration, when they are not."""
     installed = {name: _version(name) for name in acceleration.distributions}
     unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
     if unproved and acceleration.name not in _told:
@@ -107,7 +109,7 @@ def usable(acceleration: Acceleration) -> bool:
 
 
 def _warn(why: str, **about: Any) -> None:
-    # Every slot's process imports this module, and the logger is a fifth of what it would import.
+    # Imported late: every slot's process imports this module, and structlog would be a fifth of its imports.
     import structlog
 
     structlog.get_logger(__name__).warning(f"acceleration is off: {why}", **about)
