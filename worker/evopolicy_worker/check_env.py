@@ -1,4 +1,4 @@
-"""`evopolicy-worker check-env`: plays environments in two processes and prints what they keep of the interface's promises."""
+"""`evopolicy-worker check-env`: plays environments in two processes and prints which interface rules they violate."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Checked(msgspec.Struct, frozen=True):
         return self.here.verdict(self.there)
 
     def cells(self) -> tuple[str, ...]:
-        """Of the table, in the order of COLUMNS."""
+        """The table row, in the order of `COLUMNS`."""
         here = self.here
         same = "rebuilt" if here.rebuilt else "reused"
         return (
@@ -63,7 +63,8 @@ class Checked(msgspec.Struct, frozen=True):
 
 
 def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> Iterator[Checked]:
-    """Each environment, as soon as both processes have played it. WorkerError when one of them ends before it is through."""
+    """Yields each environment when both processes have played it. Raises WorkerError when one of them ends too
+    early."""
     told = msgspec.json.encode(list(definitions))
     processes = []
     for seed in HASH_SEEDS:
@@ -137,7 +138,7 @@ def command(
 
 
 def read(results: Path) -> dict[str, Checked]:
-    """What a file of results has, by environment; a line that was cut off is played again."""
+    """Results in the file, by environment id. Skips truncated lines, so that those environments are played again."""
     found: dict[str, Checked] = {}
     for line in results.read_bytes().splitlines() if results.exists() else ():
         try:
@@ -149,7 +150,7 @@ def read(results: Path) -> dict[str, Checked]:
 
 
 def page(results: Path) -> str:
-    """A Markdown table of a file of results; by family, with what has not been played."""
+    """A Markdown table of the results in a file, in catalogue order, with the number of environments played."""
     found = read(results)
     rows = [found[each].cells() for each in catalogue.entries() if each in found]
     head = [f"| {' | '.join(COLUMNS)} |", "|---|--:|--:|---|---|--:|--:|--:|---|"]

@@ -124,10 +124,11 @@ def work(
         lacking = [f"{env_id} needs {what}" for env_id in wanted if (what := environments.missing(env_id))]
         if lacking:
             raise ConfigError(f"not installed here: {'; '.join(lacking[:8])}")
-        # Until the worker can drain, SIGTERM ends it as an exception does: what it has begun is cleared away.
+        # Until the worker can drain, SIGTERM raises SystemExit, so that processes and temporary folders are cleaned up.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
-        # Wrong credentials are told at once; those of a coordinator that is starting are waited for once all is prepared.
+        # Wrong credentials are reported at once. With --ready-file they do not exist yet; `joined` waits for them
+        # later.
         found = None if ready_file else credentials.find("worker", tuple(connect or ()), credentials_file)
 
         async def joined() -> credentials.Credentials:
@@ -139,7 +140,7 @@ def work(
 
         needed = cast("tuple[Tier, ...]", tuple(need_tier or ()))
         if len(needed) == 1 and needed[0] in SANDBOXED:
-            # The first slot tries it.
+            # The first slot tests the tier when it starts.
             tiers: tuple[Tier, ...] = (*needed, "none") if unsandboxed else needed
         else:
             tiers = available_tiers(unsandboxed=unsandboxed, wanted=needed or SANDBOXED)
@@ -198,7 +199,7 @@ def _refused(tier: Tier, why: str | None, *, unsandboxed: bool) -> ConfigError:
 
 
 def _other_tier(tiers: tuple[Tier, ...]) -> str:
-    """What a run may ask for instead, the safest first."""
+    """Advice which tier a run can request instead: the safest that works here."""
     locked = [tier for tier in tiers if tier != "none"]
     if locked:
         return f"--tier {locked[0]} works here; run.json records it"
@@ -206,15 +207,15 @@ def _other_tier(tiers: tuple[Tier, ...]) -> str:
 
 
 def default_name(found: credentials.Credentials) -> str:
-    """The name that the machine's certificate was issued for, or the host's with a random part.
+    """The name that the machine's certificate was issued for; without one, the host's name with a random part.
 
-    A further worker with the same certificate on this machine has a random part too: no two have one name.
+    A second worker with the same certificate on this machine also gets a random part, so that names are unique.
     """
     certified = found.user.partition("/")[2]
     if not certified:
         return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
     assert found.tls is not None
-    # Never closed: the lock is held as long as this process lives.
+    # Never closed, so that the lock is held for the life of this process.
     fd = os.open(found.tls.certificate, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -225,14 +226,16 @@ def default_name(found: credentials.Credentials) -> str:
 
 
 def foreign(env_ids: list[str]) -> tuple[catalogue.Entry, ...]:
-    """The definitions of those that do not ship, for the processes that play them."""
+    """Definitions of the environments that do not ship, for the processes that play them."""
     return tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
 
 
 async def describe_all(env_ids: list[str], slot: Slot) -> tuple[EnvironmentDescription, ...]:
-    """Descriptions of environments, made in this slot, which stays started: this process must stay free of simulators.
+    """Descriptions of environments. They are made in the slot, as this process must not import simulators; it stays
+    started.
 
-    A slot whose processes are killed meanwhile is started again; the WorkerError of the last try, when all fail.
+    Starts the slot again when its processes are killed meanwhile; at most `DESCRIBE_TRIES` attempts. Raises the
+    WorkerError of the last one.
     """
     for tries_left in reversed(range(DESCRIBE_TRIES)):
         try:
@@ -307,7 +310,7 @@ async def _serve(
     supervisor: Supervisor | None = None
 
     def stop() -> None:
-        # A second signal, or one before there is anything to drain, ends the worker at once.
+        # A second signal, or one before the supervisor exists, ends the worker at once.
         if supervisor is None or supervisor.draining:
             main.cancel()
         else:
@@ -323,8 +326,8 @@ async def _serve(
 
 
 def main() -> None:
-    """The console script."""
-    # Simulators and numpy in slots take their thread counts from here; see `environments.process_environment`.
+    """Entry point of the console script."""
+    # Slots inherit these, such as the thread counts of simulators and numpy; see `environments.process_environment`.
     os.environ.update(environments.process_environment())
     if sys.platform != "linux":
         fail("evopolicy-worker runs on Linux (or WSL2): its sandbox is made of Linux namespaces")

@@ -1,8 +1,8 @@
-"""Whether environments keep what the interface promises: played, not believed.
+"""Checks by playing whether environments follow the rules of the interface.
 
-As a program, `python -m evopolicy_worker.environments.conformance STEPS ID…` prints a `Played` as JSON a line: it loads a family
-once and forks a process for each id, so that one that crashes or hangs takes no other with it. `evopolicy-worker check-env` runs two
-such programs of different hash seeds and compares them.
+As a program, `python -m evopolicy_worker.environments.conformance STEPS ID…` prints one line of JSON, a `Played`, for
+each id. It loads a family once and forks a process per id, so that a crash or hang affects only that environment.
+`evopolicy-worker check-env` runs two such programs with different hash seeds and compares the results.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ from evopolicy_worker.environments.base import Environment
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
 
 SEEDS = (20_011_117, 20_011_229)
-"""Large, so that they are found where an observation or an info gives them away."""
+"""Large, so that an occurrence in an observation or info is recognisable as a leak."""
 TIMEOUT_S = 300.0
-"""For one environment."""
+"""Time limit for one environment."""
 _TIMED_STEPS = 200
 _NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
 
 
 class Played(msgspec.Struct, kw_only=True):
-    """What came of playing one environment in one process."""
+    """Result of playing one environment in one process."""
 
     env: str
     faults: list[str] = []
-    """What it does not keep, in words; empty: it keeps all that was looked at."""
+    """Violations in words; empty when all checks passed."""
     steps: int = 0
-    """Played in the episode whose digests are compared."""
+    """Steps of the episode whose digests are compared."""
     limit: int = 0
     ended: str = ""
-    """How that episode ended: `terminated`, `truncated`, or `going on` where the steps were over before it."""
+    """How that episode ended: `terminated`, `truncated`, or `going on` when the maximum of steps came first."""
     digest: str = ""
-    """Of all observations, rewards, ends and infos of it."""
+    """Digest of all its observations, rewards, end flags and infos."""
     fresh: bool = False
-    """Another environment, made anew, played the same."""
+    """Whether a newly made environment played the same episode."""
     reused: bool = False
-    """The same environment played the same after another episode."""
+    """Whether the same environment, after another episode, played the same episode again."""
     rebuilt: bool = False
-    """It is made anew for each episode."""
+    """Whether it is made anew for each episode."""
     microseconds: float = 0.0
-    """A step of the bare environment."""
+    """Mean time of a step of the bare environment."""
     step_bytes: int = 0
-    """A step in the feedback of a train episode."""
+    """Mean bytes per step in the feedback of a train episode."""
     memory_mb: int = 0
-    """At most, of the process."""
+    """Peak memory of the process, MiB."""
     seconds: float = 0.0
     observation: str = ""
     action: str = ""
     success: list[str] = []
-    """Keys of its info that seem to tell success."""
+    """Keys of its info that contain "success"."""
 
     def verdict(self, other: Played | None) -> str:
-        """`ok`, or what is wrong. `other`: what came of it in another process."""
+        """`ok`, or all violations. `other`: the result in another process."""
         wrong = list(self.faults)
         if not wrong:
             wrong += [] if self.fresh else ["a fresh one plays another episode"]
@@ -79,7 +79,7 @@ class Played(msgspec.Struct, kw_only=True):
 
 
 def play(env_id: str, steps: int) -> Played:
-    """Plays an environment in this process, at most so many steps an episode."""
+    """Plays an environment in this process, at most `steps` steps per episode. Exceptions become faults."""
     began = time.monotonic()
     played = Played(env=env_id)
     try:
@@ -116,7 +116,7 @@ def _play(played: Played, steps: int) -> None:
 def _episode(
     played: Played, environment: Environment, seed: int, steps: int, *, looked_at: bool = False
 ) -> str:
-    """The digest of an episode of keyed uniform random actions; with `looked_at` everything in it is checked too."""
+    """Digest of an episode with random actions drawn from `seed`. `looked_at`: also check everything in it."""
     told = environment.description
     rng = np.random.default_rng(seed)
     digest = hashlib.sha256()
@@ -173,7 +173,7 @@ def _nonsense(played: Played, environment: Environment) -> None:
 
 
 def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
-    """Seconds a step of the environment alone, without the adapter; resets are not counted."""
+    """Mean seconds per step of the environment without the adapter and without resets."""
     rng = np.random.default_rng(0)
     bare, n, spent = environment.bare, 0, 0.0
     bare.reset(seed=0)
@@ -190,7 +190,7 @@ def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
 
 
 def _update(digest: Any, value: Any) -> None:
-    """Everything that tells one value from another, types and signs of zero included."""
+    """Hashes a value so that any difference shows, including types and signs of zero."""
     if isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str}{value.shape}".encode())
         digest.update(value.tobytes())
@@ -209,7 +209,7 @@ def _update(digest: Any, value: Any) -> None:
 
 
 def _numbers(value: Any) -> set[float]:
-    """The numbers in a small value; of a large array none, where a seed would be one of thousands."""
+    """All numbers in a value, except those in large arrays, where a seed could occur by chance."""
     if isinstance(value, np.ndarray):
         return set(np.ravel(value).astype(float).tolist()) if value.size <= 4096 else set()
     if isinstance(value, dict):
@@ -220,7 +220,7 @@ def _numbers(value: Any) -> set[float]:
 
 
 def play_all(env_ids: list[str], steps: int) -> Iterator[Played]:
-    """Each in a process forked for it."""
+    """Plays each environment in a process forked for it."""
     for env_id in env_ids:
         registry.load(env_id)
         yield _in_child(env_id, steps)
@@ -262,7 +262,7 @@ def _in_child(env_id: str, steps: int) -> Played:
 
 
 def main() -> None:
-    """The program; the definitions of environments that do not ship come on standard input, as JSON."""
+    """The program. Reads definitions of environments that do not ship from standard input, as JSON."""
     registry.define(msgspec.json.decode(sys.stdin.buffer.read() or b"[]", type=list[Entry]))
     for played in play_all(sys.argv[2:], int(sys.argv[1])):
         sys.stdout.buffer.write(msgspec.json.encode(played) + b"\n")

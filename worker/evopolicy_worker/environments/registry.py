@@ -1,7 +1,7 @@
-"""Which environments this installation offers, and how each is made from its suite id.
+"""The environments that this installation offers; makes them from their suite ids.
 
-An adapter is a module of this package, named by the environment's definition and imported when one of its environments is asked
-for; adapters import no simulator before `make`.
+An adapter is a module of this package. The environment's definition names it, and it is imported when one of its
+environments is requested. Adapters import no simulator before `make`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ _defined: dict[str, Entry] = {}
 
 
 def define(definitions: Iterable[Entry]) -> None:
-    """Environments that do not ship, which this process knows from now on."""
+    """Makes environments that do not ship known to this process."""
     _defined.update((each.id, each) for each in definitions)
 
 
 def definition(env_id: str) -> list[str]:
-    """The definition of an environment that does not ship, as an argument for another process; none for one that does."""
+    """The definition of an environment that does not ship, as a command-line argument; an empty list for a shipped
+    one."""
     found = _defined.get(env_id)
     return [] if found is None else [msgspec.json.encode(found).decode()]
 
@@ -38,8 +39,8 @@ def definition(env_id: str) -> list[str]:
 def make(env_id: str, *, render: bool = False, accelerations: bool | None = None) -> Environment:
     """A new environment, ready for its first `reset`. The first of a family imports its simulator.
 
-    `accelerations`: faster ways to the same episode; None is what the process environment says, on by default.
-    ConfigError for an id that is not known here; WorkerError for one whose packages are not installed.
+    `accelerations`: faster code for the same episodes; None takes the process environment's setting, which defaults to
+    on. Raises ConfigError for an unknown id, and WorkerError when packages are missing.
     """
     found = _entry(env_id)
     if found.adapter == "toy":
@@ -55,7 +56,7 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
 
 
 def load(env_id: str) -> None:
-    """Import what an environment is made with, where it is installed; processes forked afterwards have it already."""
+    """Imports an environment's simulator, if installed, so that processes forked afterwards have it already."""
     found = _entry(env_id)
     if found.adapter != "toy" and (family := _family(found)).installed():
         settings.apply()
@@ -64,8 +65,8 @@ def load(env_id: str) -> None:
 
 
 def describe(env_id: str) -> EnvironmentDescription:
-    """What is told of an environment. Makes one, so it imports the simulator; of one that does not ship it plays a few steps,
-    to see that it keeps its word. Raises as `make`.
+    """The description of an environment. Makes it, and so imports the simulator; one that does not ship is also tried
+    out for a few steps. Raises as `make`, and WorkerError when the trial fails.
     """
     environment = make(env_id)
     try:
@@ -77,18 +78,17 @@ def describe(env_id: str) -> EnvironmentDescription:
 
 
 def offered() -> list[str]:
-    """Suite ids of shipped environments that this installation can play, in catalogue order; no simulator is imported to find
-    out."""
+    """Suite ids of shipped environments that this installation can play, in catalogue order. Imports no simulator."""
     return [found.id for found in catalogue.entries().values() if offers(found.id)]
 
 
 def offers(env_id: str) -> bool:
-    """Whether this installation has the packages of an environment."""
+    """Whether this installation has the packages that an environment needs."""
     return not missing(env_id)
 
 
 def missing(env_id: str) -> str:
-    """What is to be installed for an environment to be played here; empty for nothing."""
+    """What must be installed to play an environment here, or why its id is unknown. Empty when it can be played."""
     try:
         found = _entry(env_id)
     except ConfigError as error:

@@ -1,5 +1,5 @@
-"""The task text of an environment for which nobody has written one: its documentation, its spaces, and what is known of its
-rewards and its end, in the form of the written ones.
+"""Generates the task text of an environment without a written one, in the same form: its documentation, its spaces, and
+what is known about its rewards and its end.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import gymnasium
 
 MAX_DOCUMENTATION = 12_000
-"""Characters of an environment's documentation that are shown."""
+"""Maximum characters of an environment's documentation that are shown."""
 MAX_SECTION = 6_000
-"""Characters of one section of it, of an environment that ships."""
+"""The same for one of its sections, for shipped environments."""
 _MAX_ROWS = 64
 _HEADING = re.compile(r"^\s*(#+)\s+(.+?)\s*$")
 _PLACES = {
@@ -31,7 +31,7 @@ _PLACES = {
     "End": ("terminat", "episode end", "truncat"),
     "": ("description", "mission", "goal", "task", "map"),
 }
-"""Words in the headings of a documentation, by the section of ours that they belong to."""
+"""Words in a documentation's headings that select a section, by the name of our section."""
 _REWARD = "What each step gave is in the feedback of submits."
 _SIGNS = re.compile(
     "|".join(
@@ -46,7 +46,7 @@ _SIGNS = re.compile(
         )
     )
 )
-"""Signs that a sentence gives equations of motion, a reward's formula, or constants; or that it speaks of options."""
+"""Matches sentences with equations of motion, reward formulas or constants, or about options."""
 _IN_CODE = re.compile(r"[\w)\]] [+*/×÷−<>-] [\w(]|\w[*/+]\w|\|.+ − .+\||=")
 _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
@@ -62,7 +62,7 @@ def text(
 ) -> str:
     """Markdown with the sections of every task text.
 
-    Of an environment that ships its documentation is told in words: formulas and constants of its dynamics are left out.
+    For a shipped environment, the documentation is reduced to words, without formulas and constants of its dynamics.
     """
     if is_shipped(entry.id):
         return _in_sections(entry, env, obs_space, action_space, components, limit)
@@ -90,7 +90,7 @@ def _in_sections(
     components: Mapping[str, str],
     limit: int,
 ) -> str:
-    """The documentation's sections sorted into ours, after what is written for the whole family."""
+    """The documentation sorted into our sections. A section that is written for the whole family replaces it."""
     told = _sections(clean(inspect.getdoc(type(env.unwrapped)) or ""))
     family = _sections(_family_text(entry.family))
 
@@ -117,19 +117,19 @@ def _in_sections(
 
 
 def _family_text(family: str) -> str:
-    """What is written for all environments of a family; empty for nothing."""
+    """The text written for all environments of a family; empty when there is none."""
     name = f"family_{family}.md"
     return read(name) if files(__package__).joinpath(name).is_file() else ""
 
 
 def read(name: str) -> str:
-    """A file of this folder, with those that it includes."""
+    """A file of this folder, with its includes expanded."""
     text = files(__package__).joinpath(name).read_text(encoding="utf-8")
     return _INCLUDE.sub(lambda match: read(match[1]).rstrip("\n"), text)
 
 
 def _maze(env: gymnasium.Env[Any, Any]) -> str:
-    """The map of an environment that has one, a letter a cell."""
+    """The map of an environment that has one, one character per cell; otherwise empty."""
     rows = getattr(getattr(env.unwrapped, "maze", None), "maze_map", None)
     if not rows:
         return ""
@@ -142,8 +142,8 @@ def _maze(env: gymnasium.Env[Any, Any]) -> str:
 
 
 def _sections(documentation: str) -> dict[str, str]:
-    """A documentation's text by the section of ours that it belongs to, the description under ""; the rest, such as arguments and
-    versions, is left out."""
+    """A documentation's text by our section names, the description under "". Other sections, such as arguments and
+    versions, are left out."""
     found: dict[str, list[str]] = {}
     ours: str | None = ""
     level = 9
@@ -165,7 +165,8 @@ def _place(heading: str) -> str | None:
 
 
 def in_words(documentation: str) -> str:
-    """A documentation without code, formulas, constants and links; sentences with one are left out whole, rows of tables too."""
+    """A documentation without code blocks and link targets. Leaves out sentences and table rows with formulas or
+    constants. At most `MAX_SECTION` characters."""
     text = re.sub(r"^\s*```.*?^\s*```", "", documentation, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r" ?\([^()$]*default[^()]*\)", "", text)
     text = re.sub(r"\$\$?[^$]+\$\$?", "∫", text)
@@ -203,12 +204,13 @@ def _is_formula(text: str) -> bool:
 
 
 def clean(given: str) -> str:
-    """A text of anyone's without control characters and invisible marks."""
+    """A third-party text without control characters and invisible marks."""
     return _UNSEEN.sub("", given.replace("\r\n", "\n"))
 
 
 def _documentation(env: gymnasium.Env[Any, Any]) -> str:
-    """The docstring of the environment's class, headings one level down; empty where it has none of its own."""
+    """The docstring of the environment's class, with headings two levels down; empty when the class has none of its
+    own."""
     found = clean(inspect.getdoc(type(env.unwrapped)) or "") if "__doc__" in vars(type(env.unwrapped)) else ""
     if len(found) > MAX_DOCUMENTATION:
         found = found[:MAX_DOCUMENTATION].rpartition("\n")[0] + "\n\n(The documentation goes on.)"
@@ -233,7 +235,7 @@ def _rows(space: SpaceSchema, name: str) -> list[tuple[str, str]]:
 
 
 def words(space: SpaceSchema) -> str:
-    """A space in words, in one line."""
+    """A one-line description of a space."""
     kind = space["type"]
     if kind == "Discrete":
         first = int(space.get("start", 0))
