@@ -63,7 +63,7 @@ class Checkers:
         self._plans: dict[str, PlannedRun] = {plan.name: plan for plan in simulation.plans}
         self._expected: dict[str, ExpectedRun] = {plan.name: expect(plan) for plan in simulation.plans}
         self._granted: dict[str, tuple[str, int]] = {}
-        self._attempts: dict[tuple[str, int], tuple[str, int]] = {}
+        self._granted_to: dict[tuple[str, int], tuple[str, int]] = {}
         """Job and attempt to the worker and incarnation of the grant."""
         self._attempts: dict[str, int] = {}
         """Job to its highest attempt."""
@@ -123,7 +123,7 @@ class Checkers:
         group = self._disk.outcomes.get(row.group, {})
         want(row.index not in group, "an episode is committed once", row)
         want(row.seq == len(group) + arrived, "arrivals are numbered one by one", row, len(group), arrived)
-        granted = self._attempts.get((row.job_id, row.attempt))
+        granted = self._granted_to.get((row.job_id, row.attempt))
         want(
             granted is not None and granted[0] == row.worker,
             "what is committed was leased to its player",
@@ -261,7 +261,7 @@ class Checkers:
         want(lease.attempt > highest, "attempts grow, over restarts too", lease, highest)
         self._attempts[job.job_id] = lease.attempt
         self._granted[lease.lease_id] = (worker, disk.incarnation)
-        self._attempts[lease.job.job_id, lease.attempt] = (worker, disk.incarnation)
+        self._granted_to[lease.job.job_id, lease.attempt] = (worker, disk.incarnation)
         for spec in job.episodes:
             want(disk.outcome(group, spec.index) is None, "what is done is not played again", lease)
         self._thrown_once(lease)
