@@ -1,7 +1,7 @@
 """A real worker process that cheats: `cheating_worker.py HOW OPTIONS…`, the options being the worker's own.
 
 HOW: `honest`; `rewards` adds to every reward that it reports, returns and recordings in accord; `return` to the returns
-alone; `old-code` tells another code version; `old-protocol` speaks another wire version. All but the last two tell the
+alone; `old-code` reports another code version and another adapter; `old-protocol` speaks another wire version. All but the last two tell the
 same fingerprint, whatever is edited meanwhile.
 """
 
@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.rendered import ROWS, Renderer, decode
@@ -70,12 +71,22 @@ class CheatingSlot(Slot):
         return tuple(forge(outcome) for outcome in await super().play(job, bundle, on_progress))
 
 
+class OldSlot(Slot):
+    """Describes environments as an older adapter does."""
+
+    async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
+        described = await super().describe(env_ids)
+        return tuple(msgspec.structs.replace(each, adapter="1.1+old") for each in described)
+
+
 if __name__ == "__main__":
     HOW = sys.argv.pop(1)
     told = msgspec.structs.replace(fingerprint(), code_version="old" if HOW == "old-code" else "cheats")
     cli.fingerprint = lambda: told  # type: ignore[attr-defined]
     if HOW in FORGERIES:
         cli.Slot = CheatingSlot  # type: ignore[attr-defined]
+    if HOW == "old-code":
+        cli.Slot = OldSlot  # type: ignore[attr-defined]
     if HOW == "old-protocol":
         codec.WIRE_VERSION = 0
     cli.main()

@@ -287,7 +287,7 @@ def test_worker_of_old_code_gets_no_work_of_a_run_and_is_told_why(tmp_path: Path
                 await gateway.submit(bundle_of(CLOCK_POLICY), (0,), "first")
                 await gateway.results(0)
                 workers.start("old", "old-code")
-                why = "evopolicy-worker cheats there, old here"
+                why = "1.1+old here"
                 await eventually(lambda: why in workers.said("old"), "it is told why")
                 await gateway.submit(bundle_of(CLOCK_POLICY), (0, 1, 2), "second")
                 await gateway.results(1)

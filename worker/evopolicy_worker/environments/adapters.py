@@ -23,7 +23,17 @@ _ROOT = Path(evopolicy_worker.__path__[0])
 _SHARED = (
     *(
         f"environments/{name}.py"
-        for name in ("actions", "base", "gymnasium_adapter", "info", "observations", "settings", "spaces")
+        for name in (
+            "actions",
+            "base",
+            "gymnasium_adapter",
+            "info",
+            "observations",
+            "rewards",
+            "settings",
+            "spaces",
+            "wrappers",
+        )
     ),
     "episodes/*.py",
     "sandbox/inside/*.py",
