@@ -63,7 +63,7 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Which held-out episodes of the selected checkpoint are recorded as video for people; None: as `video`."""
     limits: ResourceLimits = ResourceLimits()
     notes: Named[Text] = {}
-    """The operator's own labels; kept in `run.json`."""
+    """The operator's own labels, such as the name of a sweep; kept in the coordinator's database, not in `run.json`."""
     hidden_cases: HiddenCases = "shared"
     simulation: SimulationRule = "forbidden"
     finish: FinishRule = "early"
