@@ -54,7 +54,7 @@ def test_results_that_nobody_reads_end_their_commands_quietly(tmp_path: Path) ->
         "evopolicy data check splits",
         "evopolicy-coordinator certs issue worker gpu-7 --state state --out issued",
         "evopolicy-coordinator certs list --state state",
-        "evopolicy random --env toy/line --cases 0,1",
+        "evopolicy random --env toy/line --cases 0,1 --fresh",
     ):
         assert closed(*command.split(), cwd=tmp_path) == (READER_GONE, ""), command
 
