@@ -1,5 +1,6 @@
 # make demo   installs into .venv, then plays a whole run
-# make test   installs, then runs every test
+# make test   installs, then runs the tests of every layer, but for:
+# make test-system  those that play many whole runs on clusters of their own
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
 # make docs   the documentation as a site in build/site
@@ -22,7 +23,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web faults sim clean
+.PHONY: help install paper-worker demo test test-system check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -49,10 +50,16 @@ paper-worker:
 demo: install
 	@$(BIN)/evopolicy demo
 
-# One process more than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
-test: install
+# More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
+PROCESSES := $$(( $$(nproc) < 4 ? $$(nproc) + 2 : 6 ))
+
+# ARGS that name files play those, of whatever layer.
+test: LAYERS = not system
+test-system: LAYERS = system
+test test-system: install
 	@bash deploy/setup-host.sh --tests
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $$(( $$(nproc) < 4 ? $$(nproc) + 1 : 5 )) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" $(ARGS); status=$$?; \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" \
+	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
 check: install

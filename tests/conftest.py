@@ -12,6 +12,34 @@ import hypothesis
 import pytest
 
 
+_SYSTEM = (
+    "conformance/cheats/test_golden_traffic.py",
+    "conformance/cheats/test_hidden_isolation.py",
+    "conformance/cheats/test_parting_cheats.py",
+    "conformance/cheats/test_worker_forges_returns.py",
+    "conformance/environments/test_accelerations.py",
+    "conformance/protocol/test_published_agents.py",
+    "conformance/protocol/test_run_artifacts.py",
+    "faults",
+    "integration/coordinator/test_foreign_environments_on_a_cluster.py",
+    "integration/coordinator/test_published_results.py",
+    "integration/coordinator/test_verify_command.py",
+    "integration/gateway/test_cancelled_run.py",
+    "integration/gateway/test_hostile_home.py",
+    "integration/gateway/test_one_state.py",
+    "integration/gateway/test_run_restarts.py",
+    "integration/gateway/test_suite_command.py",
+    "integration/gateway/test_waiting_commands.py",
+    "integration/install",
+    "integration/multihost",
+    "integration/python",
+    "integration/report/test_recordings.py",
+    "integration/report/test_tutorial.py",
+    "integration/web",
+)
+"""Files and folders that play many whole runs on clusters of their own: half of the time of all tests."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--fault-seeds",
@@ -26,6 +54,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first, unit tests last, else in the order of their paths.
 
@@ -33,11 +62,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     time. By itself xdist begins with the files of most tests, and the longest tests, alone in their files, come last.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
-    unit = Path(__file__).parent / "unit"
+    tests = Path(__file__).parent
+    system = [tests / name for name in _SYSTEM]
+    for item in items:
+        if any(item.path.is_relative_to(each) for each in system):
+            item.add_marker("system")
+    unit = tests / "unit"
     items.sort(key=lambda item: (item.path not in slow, item.path.is_relative_to(unit)))
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    missing = [name for name in _SYSTEM if not (Path(__file__).parent / name).exists()]
+    if missing:
+        raise pytest.UsageError(f"tests/conftest.py names files that are missing: {', '.join(missing)}")
     # Local commands share one state per user: not the developer's, and another for each process of tests.
     os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="evp-state-")
     # A shell ignores Ctrl-C for what it starts in the background, and children inherit that: tests that press it could

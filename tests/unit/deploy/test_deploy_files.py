@@ -182,7 +182,11 @@ def test_the_dockerfile_copies_what_there_is_and_installs_what_was_tested() -> N
     install = next(rest for name, rest in instructions() if "pip install" in rest)
     extras = re.search(r"'\.\[(.+)\]'", install)
     assert extras is not None
-    assert set(extras[1].split(",")) == set(project["project"]["optional-dependencies"]) - {"dev", "docs"}
+    assert set(extras[1].split(",")) == set(project["project"]["optional-dependencies"]) - {
+        "dev",
+        "docs",
+        "local",
+    }
     assert "-c constraints.txt" in install
     for name, rest in instructions():
         if name == "CMD":
@@ -263,7 +267,8 @@ def test_the_commands_of_the_readme_are_taken() -> None:
 def test_the_readme_names_every_file_and_no_other() -> None:
     told = set(
         re.findall(
-            r"`([\w@.-]+\.(?:service|env|conf|yaml|sh|txt)|Dockerfile)`", (DEPLOY / "README.md").read_text()
+            r"`([\w@.-]+\.(?:service|env|conf|yaml|sh|txt|json)|Dockerfile)`",
+            (DEPLOY / "README.md").read_text(),
         )
     )
     there = {path.name for path in DEPLOY.iterdir()}
