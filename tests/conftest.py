@@ -11,7 +11,6 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-
 _SYSTEM = (
     "conformance/cheats/test_golden_traffic.py",
     "conformance/cheats/test_hidden_isolation.py",

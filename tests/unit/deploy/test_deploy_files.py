@@ -267,7 +267,7 @@ def test_the_commands_of_the_readme_are_taken() -> None:
 def test_the_readme_names_every_file_and_no_other() -> None:
     told = set(
         re.findall(
-            r"`([\w@.-]+\.(?:service|env|conf|yaml|sh|txt|json)|Dockerfile)`",
+            r"`([\w@.-]+\.(?:service|env|conf|yaml|sh|txt)|grafana-dashboard\.json|Dockerfile)`",
             (DEPLOY / "README.md").read_text(),
         )
     )
