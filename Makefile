@@ -51,7 +51,7 @@ demo: install
 	@$(BIN)/evopolicy demo
 
 # More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
-PROCESSES := $$(( $$(nproc) < 4 ? $$(nproc) + 2 : 6 ))
+PROCESSES := $$(( $$(nproc) < 4 ? 3 * $$(nproc) : $$(nproc) + 4 ))
 
 # ARGS that name files play those, of whatever layer.
 test: LAYERS = not system

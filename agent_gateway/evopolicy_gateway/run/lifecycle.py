@@ -242,7 +242,9 @@ class RunLifecycle:
         finally:
             tasks = [task for task in (serving, following, keeping, spent) if task is not None]
             for task in tasks:
-                task.cancel()
+                # At the loop's end they are being cancelled too. A second time would interrupt their clean-up.
+                if not task.cancelling():
+                    task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             for child in (self._supervisor, self._gateway):
                 if child is not None:

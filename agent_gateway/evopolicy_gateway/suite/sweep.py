@@ -79,7 +79,9 @@ class Sweep(ABC):
                         self._ended(name, task)
         finally:
             for task in self._active.values():
-                task.cancel()
+                # At the loop's end they are being cancelled too. A second time would interrupt their clean-up.
+                if not task.cancelling():
+                    task.cancel()
             await asyncio.gather(*self._active.values(), return_exceptions=True)
 
     # Overridden by the kinds of sweep.

@@ -215,7 +215,8 @@ async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] |
         await work
     finally:
         if not work.done():
-            work.cancel()
+            if not work.cancelling():
+                work.cancel()
             await asyncio.gather(work, return_exceptions=True)
 
 

@@ -239,7 +239,7 @@ def test_a_report_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
     report = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **mark})
     assert report.stdout is not None
     assert report.stdout.readline() == b"1\n"
-    assert len(alive()) >= 3
+    assert len(alive()) >= 2  # the report, and at least one of the processes that read for it
     report.kill()
     report.communicate()
     wait_until(lambda: not alive())
