@@ -125,7 +125,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                 page.until(f"{TEXT}.includes('watched') && {TEXT}.includes('training')")
                 assert "<b>careful" in page.run(TEXT)
                 page.until("document.querySelectorAll('#run-rows tr').length === 2")
-                page.until("document.querySelector('#run-rows tr td:nth-child(6)').textContent === '1'")
+                page.until("document.querySelector('#run-rows tr td:nth-child(6)')?.textContent === '1'")
                 assert page.violations() == []
                 page.visit(page.run("document.querySelector('#run-rows a').href"))
                 page.until("document.querySelectorAll('#submit-rows tr').length === 1")
@@ -135,19 +135,21 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
 
                 # A worker is killed and comes back.
                 page.visit(f"http://127.0.0.1:{web}/cluster")
-                page.until("document.querySelector('#worker-rows td:nth-child(3)').textContent === 'active'")
+                page.until("document.querySelector('#worker-rows td:nth-child(3)')?.textContent === 'active'")
                 assert page.violations() == []
                 assert page.problems == []
                 os.kill(worker.pid, signal.SIGKILL)
-                page.until("!document.querySelector('#facts b').textContent.startsWith('1 of 1')")
+                page.until("document.querySelector('#facts b')?.textContent.startsWith('1 of 1') === false")
                 with process(log, *works):
-                    page.until("document.querySelector('#facts b').textContent.startsWith('1 of ')")
+                    page.until("document.querySelector('#facts b')?.textContent.startsWith('1 of ')")
 
                     # The coordinator restarts, and the page says so meanwhile.
                     coordinator.kill()
-                    page.until("document.querySelector('#notices').innerText.includes('does not answer')")
+                    page.until("document.querySelector('#notices')?.innerText.includes('does not answer')")
                     coordinator = Coordinator(tmp_path / "s", *options)
-                    page.until("!document.querySelector('#notices').innerText.includes('does not answer')")
+                    page.until(
+                        "document.querySelector('#notices')?.innerText.includes('does not answer') === false"
+                    )
                     assert page.problems == []
 
                     # The view restarts, and the page reconnects by itself.
@@ -181,7 +183,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                         for folder in workspaces():
                             (folder / "go").touch()
                         assert sweep.wait() == 0, sweep.err
-                        page.until("document.querySelector('#facts b').textContent.startsWith('2 of 2')")
+                        page.until("document.querySelector('#facts b')?.textContent.startsWith('2 of 2')")
                         page.until(
                             "![...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
                         )
