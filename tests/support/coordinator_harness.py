@@ -27,6 +27,7 @@ from evopolicy_common.records import bundles
 from evopolicy_common.records.bundles import Bundle, BundleFile
 from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link, connect
 
@@ -222,8 +223,14 @@ class GatewayClient:
         return (await self.ask.until_answered("state", message, gateway.StateReply)).state
 
     async def submit(self, bundle: Bundle, ids: tuple[int, ...], key: str) -> gateway.SubmitAccepted:
-        await self.ask.upload(self.run, self.token, bundle.digest, bundle.packed)
-        return await self.submit_digest(bundle.digest, ids, key)
+        while True:
+            await self.ask.upload(self.run, self.token, bundle.digest, bundle.packed)
+            try:
+                return await self.submit_digest(bundle.digest, ids, key)
+            except RefusedError as error:
+                # As a gateway does: a coordinator that was killed in between has forgotten who uploaded the bundle.
+                if error.status != Refusal.MISSING_BUNDLE:
+                    raise
 
     async def submit_digest(
         self, digest: str | None, ids: tuple[int, ...], key: str
