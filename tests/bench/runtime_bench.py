@@ -208,7 +208,9 @@ def agent_told(env: str, n: int, budget: int, *options: str, how: str = "", **en
 
 
 def measure(env: str, seconds: float, most: int, *, submits: bool) -> dict[str, Any]:
-    bare = json.loads(quietly([sys.executable, str(HERE / "bare_loop.py"), env, str(seconds), str(most)]))
+    # The last line: what comes before it, a simulator has printed.
+    printed = quietly([sys.executable, str(HERE / "bare_loop.py"), env, str(seconds), str(most)])
+    bare = json.loads(printed.splitlines()[-1])
     n = int(bare["episodes"])
     row: dict[str, Any] = {"env": env, "episodes": n, "steps": bare["steps"], "bare_s": bare["seconds"]}
     row |= {name: bare[name] for name in PACES if name in bare}

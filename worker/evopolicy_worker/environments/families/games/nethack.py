@@ -123,7 +123,8 @@ class _Game:
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self._raw.step(action)
         # At its step limit a game is given up, and says that it has ended.
-        return obs, reward, terminated and info["end_status"].name != "ABORTED", truncated, _told(info)
+        aborted = info["end_status"].name == "ABORTED"
+        return obs, reward, terminated and not aborted, truncated or aborted, _told(info)
 
     def render(self) -> NDArray[np.uint8]:
         raw = self._raw
